@@ -1,0 +1,30 @@
+#include "dispatch.h"
+#include "parallel.h"
+
+#include <nanobind/nanobind.h>
+
+#include <stdexcept>
+#include <string>
+
+namespace nb = nanobind;
+
+void bind_raster(nb::module_ &module);
+void bind_image(nb::module_ &module);
+
+NB_MODULE(_native, module) {
+    module.doc() = "CPU kernels of polarguide.";
+    module.def("thread_count", &polarguide::thread_count, "Number of threads the kernels use.");
+    module.def("set_thread_count", &polarguide::set_thread_count, nb::arg("threads"),
+               "Use this many threads; 0 restores the default.");
+    module.def("simd", [] { return std::string(polarguide::isa_name(polarguide::active_isa())); },
+               "Name of the instruction set in use.");
+    module.def(
+        "select_simd",
+        [](const std::string &name) {
+            if (!polarguide::select_isa(name.c_str()))
+                throw std::invalid_argument("instruction set '" + name + "' is not available on this processor");
+        },
+        nb::arg("name"), "Choose 'auto', 'baseline', 'avx2' or 'avx512'.");
+    bind_raster(module);
+    bind_image(module);
+}

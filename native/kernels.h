@@ -1,0 +1,31 @@
+// The table of functions that each instruction set provides. Plain pointers only: see CMakeLists.txt.
+#pragma once
+#include "dispatch.h"
+
+namespace polarguide {
+
+// Declares `name` in the namespace of every instruction set this build has, and picks the active one at run time.
+#if defined(POLARGUIDE_X86)
+#define POLARGUIDE_DISPATCH(name)                                                                                      \
+    (::polarguide::active_isa() == ::polarguide::Isa::avx512 ? ::polarguide::avx512::name                              \
+     : ::polarguide::active_isa() == ::polarguide::Isa::avx2 ? ::polarguide::avx2::name                                \
+                                                             : ::polarguide::baseline::name)
+#define POLARGUIDE_DECLARE(declaration)                                                                                \
+    namespace baseline {                                                                                               \
+    declaration;                                                                                                       \
+    }                                                                                                                  \
+    namespace avx2 {                                                                                                   \
+    declaration;                                                                                                       \
+    }                                                                                                                  \
+    namespace avx512 {                                                                                                 \
+    declaration;                                                                                                       \
+    }
+#else
+#define POLARGUIDE_DISPATCH(name) (::polarguide::baseline::name)
+#define POLARGUIDE_DECLARE(declaration)                                                                                \
+    namespace baseline {                                                                                               \
+    declaration;                                                                                                       \
+    }
+#endif
+
+} // namespace polarguide

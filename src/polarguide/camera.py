@@ -1,0 +1,70 @@
+"""A pinhole camera with a pose: the one camera type of the project.
+
+OpenCV axes (x right, y down, z forward), world-to-camera pose ``x_cam = R x_world + t``, and the centre of the
+top-left pixel at (0.5, 0.5), as in COLMAP.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera.
+
+    Attributes:
+        width, height: picture size in pixels.
+        fx, fy, cx, cy: focal lengths and principal point in pixels.
+        rotation: world-to-camera rotation, [3, 3] float64 on the CPU.
+        translation: world-to-camera translation, [3] float64 on the CPU.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: Tensor
+    translation: Tensor
+
+    @property
+    def centre(self) -> Tensor:
+        """Camera centre in the world, [3] float64."""
+        return -self.rotation.T @ self.translation
+
+    def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+        """Unit rays through the pixel centres in camera axes, [height, width, 3]."""
+        x = (torch.arange(self.width, dtype=dtype, device=device) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=dtype, device=device) + 0.5 - self.cy) / self.fy
+        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+        directions = torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1)
+        return torch.nn.functional.normalize(directions, dim=-1)
+
+    def world_rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+        """Unit rays through the pixel centres in world axes, [height, width, 3]."""
+        return self.rays(dtype=dtype, device=device) @ self.rotation.to(dtype=dtype, device=device)
+
+    def to_world(self, vectors: Tensor) -> Tensor:
+        """Turn direction vectors [..., 3] from camera axes into world axes."""
+        return vectors @ self.rotation.to(dtype=vectors.dtype, device=vectors.device)
+
+    def to_camera(self, vectors: Tensor) -> Tensor:
+        """Turn direction vectors [..., 3] from world axes into camera axes."""
+        return vectors @ self.rotation.to(dtype=vectors.dtype, device=vectors.device).T
+
+    def downscaled(self, factor: int) -> Camera:
+        """The camera of the same view averaged over ``factor`` x ``factor`` pixel boxes (remainders are cut)."""
+        return replace(
+            self,
+            width=self.width // factor,
+            height=self.height // factor,
+            fx=self.fx / factor,
+            fy=self.fy / factor,
+            cx=self.cx / factor,
+            cy=self.cy / factor,
+        )
