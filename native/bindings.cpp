@@ -2,6 +2,7 @@
 #include "parallel.h"
 
 #include <nanobind/nanobind.h>
+#include <nanobind/stl/string.h>
 
 #include <stdexcept>
 #include <string>
