@@ -1,1 +1,74 @@
+"""Polarization optics: pure functions on tensors of any batch shape, float dtype and device.
 
+They are differentiable, and value and gradient stay finite at every degenerate point (no light, no
+polarization, normal and grazing incidence).
+"""
+
+from .frames import azimuth, lens_frame, normal_from_angles, zenith
+from .fresnel import (
+    brewster,
+    diffuse_dolp,
+    diffuse_dolp_limit,
+    diffuse_zenith,
+    dolp_slopes,
+    reflectances,
+    reflectances_from_cosine,
+    specular_dolp,
+    specular_zeniths,
+    transmittances,
+)
+from .normals import (
+    Candidates,
+    Disambiguated,
+    PhysicalCandidates,
+    disambiguate,
+    dolp_noise,
+    paper_candidates,
+    physical_candidates,
+    polarization_mask,
+)
+from .separation import (
+    Separation,
+    exact_separation,
+    paper_intensities,
+    paper_separation,
+    predicted_stokes,
+)
+from .stokes import ANGLES_DEG, aolp, dolp, intensity, luminance, photograph, stokes
+
+__all__ = [
+    "ANGLES_DEG",
+    "Candidates",
+    "Disambiguated",
+    "PhysicalCandidates",
+    "Separation",
+    "aolp",
+    "azimuth",
+    "brewster",
+    "diffuse_dolp",
+    "diffuse_dolp_limit",
+    "diffuse_zenith",
+    "disambiguate",
+    "dolp",
+    "dolp_noise",
+    "dolp_slopes",
+    "exact_separation",
+    "intensity",
+    "lens_frame",
+    "luminance",
+    "normal_from_angles",
+    "paper_candidates",
+    "paper_intensities",
+    "paper_separation",
+    "photograph",
+    "physical_candidates",
+    "polarization_mask",
+    "predicted_stokes",
+    "reflectances",
+    "reflectances_from_cosine",
+    "specular_dolp",
+    "specular_zeniths",
+    "stokes",
+    "transmittances",
+    "zenith",
+]

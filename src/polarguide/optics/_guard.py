@@ -1,0 +1,56 @@
+"""Arithmetic whose value and gradient stay finite at the points where the plain operation is singular.
+
+Polarization is full of them: the angle of an unpolarized pixel, the azimuth of a normal that looks at the
+camera, the square root in a zenith at zero degree of polarization. At such a point the value is the limit (or
+zero where there is none) and the gradient is zero, so that one pixel cannot poison a whole optimisation step.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def safe_sqrt(x: Tensor) -> Tensor:
+    """Square root; value and gradient are zero where ``x <= 0``."""
+    positive = x > 0
+    root = torch.sqrt(torch.where(positive, x, torch.ones_like(x)))
+    return torch.where(positive, root, torch.zeros_like(x))
+
+
+def safe_atan2(y: Tensor, x: Tensor) -> Tensor:
+    """``atan2(y, x)`` in radians; value and gradient are zero where both are (below the smallest normal)."""
+    y, x = torch.broadcast_tensors(y, x)
+    size = torch.maximum(y.abs(), x.abs()).detach()
+    live = size > torch.finfo(size.dtype).tiny
+    # Scaling by the larger of the two keeps their squares, which the gradient divides by, from underflowing.
+    size = torch.where(live, size, torch.ones_like(size))
+    y = torch.where(live, y, torch.zeros_like(y)) / size
+    x = torch.where(live, x, torch.ones_like(x)) / size
+    return torch.atan2(y, x)
+
+
+def safe_normalize(vectors: Tensor) -> Tensor:
+    """Unit vectors along the last axis; zero (gradient too) where the length is below machine epsilon."""
+    length = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    live = length > torch.finfo(vectors.dtype).eps
+    return torch.where(live, vectors, torch.zeros_like(vectors)) / torch.where(
+        live, length, torch.ones_like(length)
+    )
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Scalar product over the last axis."""
+    return (a * b).sum(dim=-1)
+
+
+def check_leading(tensor: Tensor, count: int, name: str) -> None:
+    """Raise ValueError unless the first axis of ``tensor`` has ``count`` entries."""
+    if tensor.ndim == 0 or tensor.shape[0] != count:
+        raise ValueError(f"{name}: expected shape [{count}, ...], found {list(tensor.shape)}")
+
+
+def check_index(index: float | Tensor) -> None:
+    """Raise ValueError unless a refractive index given as a number exceeds 1 (tensors are not read)."""
+    if not isinstance(index, Tensor) and not index > 1.0:
+        raise ValueError(f"refractive index: expected more than 1, found {index}")

@@ -1,0 +1,84 @@
+"""Directions about a view ray: the lens frame, and normals as zenith and azimuth in it.
+
+All vectors are in camera axes (OpenCV: x right, y down, z forward). ``rays`` are unit vectors from the camera
+into the scene and broadcast against the other arguments. A polarization angle is measured in the lens frame
+of its pixel: the frame that an ideal rotationally symmetric lens carries from the optical axis to that
+pixel's ray.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ._guard import dot, safe_atan2
+
+
+def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Image right and image up, carried from the optical axis to each ray by the smallest rotation.
+
+    ``x_ref``, ``up_ref`` and ``-ray`` form a right-handed orthonormal basis. On the axis they are (1, 0, 0)
+    and (0, -1, 0).
+
+    Args:
+        rays: [..., 3] unit.
+
+    Returns:
+        (x_ref, up_ref), each [..., 3] unit.
+    """
+    x, y, z = rays.unbind(-1)
+    # A ray straight back has no smallest rotation; the clamp gives it a frame all the same.
+    scale = 1 / (1 + z).clamp(min=torch.finfo(rays.dtype).eps)
+    mixed = x * y * scale
+    x_ref = torch.stack((1 - x * x * scale, -mixed, -x), dim=-1)
+    up_ref = torch.stack((mixed, y * y * scale - 1, y), dim=-1)
+    return x_ref, up_ref
+
+
+def azimuth(vectors: Tensor, rays: Tensor) -> Tensor:
+    """Azimuth of a vector about the ray: ``atan2(v . up_ref, v . x_ref)``.
+
+    Args:
+        vectors: [..., 3], any length.
+        rays: [..., 3] unit.
+
+    Returns:
+        [...] radians in [-pi, pi]; 0, with zero gradient, where the vector is parallel to the ray.
+    """
+    x_ref, up_ref = lens_frame(rays)
+    return safe_atan2(dot(vectors, up_ref), dot(vectors, x_ref))
+
+
+def zenith(normals: Tensor, rays: Tensor) -> Tensor:
+    """Angle between a normal and the direction back to the camera, ``-ray``.
+
+    Args:
+        normals: [..., 3], any length.
+        rays: [..., 3] unit.
+
+    Returns:
+        [...] radians in [0, pi]; more than pi/2 where the normal faces away, 0 for a zero normal. The
+        gradient is 0 where the normal is parallel to the ray (an arc cosine would give infinity there).
+    """
+    along = dot(normals, rays)
+    across = torch.linalg.vector_norm(normals - along[..., None] * rays, dim=-1)
+    return safe_atan2(across, -along)
+
+
+def normal_from_angles(zenith: Tensor, azimuth: Tensor, rays: Tensor) -> Tensor:
+    """Unit normal with a given zenith and azimuth about the ray.
+
+    ``-cos(zenith) ray + sin(zenith) (cos(azimuth) x_ref + sin(azimuth) up_ref)``; it faces the camera for
+    zeniths below pi/2.
+
+    Args:
+        zenith, azimuth: [...] radians.
+        rays: [..., 3] unit.
+
+    Returns:
+        [..., 3] unit.
+    """
+    x_ref, up_ref = lens_frame(rays)
+    sine = torch.sin(zenith)
+    across = (sine * torch.cos(azimuth))[..., None] * x_ref + (sine * torch.sin(azimuth))[..., None] * up_ref
+    return across - torch.cos(zenith)[..., None] * rays

@@ -1,0 +1,219 @@
+"""Normals from polarization: candidates, the choice among them, and the pixels worth asking.
+
+The polarization of one pixel leaves a surface normal ambiguous: the angle of polarization gives the azimuth
+up to a half turn, plus a quarter turn because specular and diffuse light are polarized at right angles.
+Zenith and azimuth are relative to the view ray of the pixel (see ``frames``); all normals are in camera axes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ._guard import check_leading, dot, safe_normalize
+from .frames import normal_from_angles
+from .fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
+from .stokes import aolp, dolp
+
+
+class Candidates(NamedTuple):
+    """The paper's four candidates.
+
+    Attributes:
+        normals: [..., 4, 3] unit: n, -n, R n, -R n, where R turns by 90 degrees about the view axis.
+        zenith: [...] radians, of n.
+        azimuth: [...] radians, of n.
+    """
+
+    normals: Tensor
+    zenith: Tensor
+    azimuth: Tensor
+
+
+class PhysicalCandidates(NamedTuple):
+    """The six normals that Fresnel's equations allow for a pixel of one pure lobe.
+
+    Attributes:
+        normals: [..., 6, 3] unit, all facing the camera: two diffuse, two specular below Brewster's angle,
+            two specular above it; within each pair the azimuths are half a turn apart.
+        valid: [..., 6] bool: False for the diffuse pair where the degree of polarization exceeds what diffuse
+            light can have, and for all six where S0 is not positive.
+        specular: [6] bool: which candidates explain the pixel by specular light.
+    """
+
+    normals: Tensor
+    valid: Tensor
+    specular: Tensor
+
+
+class Disambiguated(NamedTuple):
+    """The chosen candidates.
+
+    Attributes:
+        normal: [..., 3] unit.
+        choice: [...] int64, position among the candidates.
+        cosine: [...] between the chosen normal and the guide, in [-1, 1].
+    """
+
+    normal: Tensor
+    choice: Tensor
+    cosine: Tensor
+
+
+def paper_candidates(stokes: Tensor, rays: Tensor, index: float | Tensor = 1.5) -> Candidates:
+    """Four candidate normals as the PolarGuide-GSDR paper lists them: n, -n, R n, -R n.
+
+    n has the angle of polarization as azimuth and the diffuse zenith of the degree of polarization. (The
+    paper's closed form for the zenith inverts no Fresnel curve; the exact inverse stands in its place.) Two
+    of the four face away from the camera.
+
+    Args:
+        stokes: [3, ...] of the luminance.
+        rays: [..., 3] unit camera rays.
+        index: refractive index, a number or [...].
+
+    Returns:
+        Candidates.
+
+    Raises:
+        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+    """
+    polar, turn = diffuse_zenith(dolp(stokes), index), aolp(stokes)
+    normal = normal_from_angles(polar, turn, rays)
+    rotated = normal_from_angles(polar, turn + math.pi / 2, rays)
+    return Candidates(torch.stack((normal, -normal, rotated, -rotated), dim=-2), polar, turn)
+
+
+def physical_candidates(stokes: Tensor, rays: Tensor, index: float | Tensor = 1.5) -> PhysicalCandidates:
+    """Six candidate normals that face the camera: the exact inverses of both lobes.
+
+    Diffuse zenith at azimuth AoLP and AoLP + pi; the two specular zeniths at AoLP + pi/2 and AoLP - pi/2.
+
+    Args:
+        stokes: [3, ...] of the luminance.
+        rays: [..., 3] unit camera rays.
+        index: refractive index, a number or [...].
+
+    Returns:
+        PhysicalCandidates. Candidates that are not valid hold the clamped value.
+
+    Raises:
+        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+    """
+    degree, angle = dolp(stokes), aolp(stokes)
+    below, above = specular_zeniths(degree, index)
+    polar = torch.stack((diffuse_zenith(degree, index), below, above), dim=-1).repeat_interleave(2, dim=-1)
+    turns = torch.tensor((0.0, 1.0, 0.5, -0.5, 0.5, -0.5), dtype=angle.dtype, device=angle.device) * math.pi
+    normals = normal_from_angles(polar, angle[..., None] + turns, rays[..., None, :])
+    specular = torch.tensor((False, False, True, True, True, True), device=angle.device)
+    possible = specular | (degree <= diffuse_dolp_limit(index))[..., None]
+    return PhysicalCandidates(normals, possible & (stokes[0] > 0)[..., None], specular)
+
+
+def disambiguate(
+    candidates: Candidates | PhysicalCandidates | Tensor,
+    guide: Tensor,
+    rays: Tensor | None = None,
+    *,
+    azimuth_weight: float = 0.0,
+) -> Disambiguated:
+    """Choose the candidate nearest to a guide normal (the cosine rule of the PolarGuide-GSDR paper).
+
+    The score of a candidate is its cosine with the guide. With ``azimuth_weight`` w it becomes
+    ``(1 - w s) cosine + w s cos(difference of azimuths)``, s the sine of the guide's zenith: a wrong
+    refractive index or a mixture of lobes shifts the zenith of a candidate and leaves its azimuth, which
+    therefore is the better evidence wherever the guide has an azimuth at all. Candidates marked not valid are
+    chosen only if all are.
+
+    Args:
+        candidates: candidates, or their normals [..., K, 3] in camera axes.
+        guide: [..., 3] camera axes; only the direction matters. Detach it if it is being trained.
+        rays: [..., 3] unit camera rays; needed for ``azimuth_weight > 0``.
+        azimuth_weight: in [0, 1].
+
+    Returns:
+        Disambiguated.
+
+    Raises:
+        ValueError: ``azimuth_weight`` outside [0, 1], or positive without ``rays``.
+    """
+    if not 0.0 <= azimuth_weight <= 1.0:
+        raise ValueError(f"azimuth_weight: expected a number in [0, 1], found {azimuth_weight}")
+    normals = candidates if isinstance(candidates, Tensor) else candidates.normals
+    guide = safe_normalize(guide)[..., None, :]
+    cosines = dot(normals, guide)
+    score = cosines
+    if azimuth_weight > 0.0:
+        if rays is None:
+            raise ValueError("rays: expected the camera rays, since azimuth_weight is positive, found None")
+        axis = rays[..., None, :]
+        guide_across = guide - dot(guide, axis)[..., None] * axis
+        across = safe_normalize(normals - dot(normals, axis)[..., None] * axis)
+        weight = azimuth_weight * torch.linalg.vector_norm(guide_across, dim=-1)
+        # |guide_across| is the sine of the zenith, so the second term below is w * s * cos(difference of
+        # azimuths).
+        score = (1 - weight) * cosines + azimuth_weight * dot(across, guide_across)
+    if isinstance(candidates, PhysicalCandidates):
+        score = torch.where(candidates.valid, score, score - 4)
+    choice = score.argmax(dim=-1)
+    normal = torch.take_along_dim(normals, choice[..., None, None], dim=-2).squeeze(-2)
+    cosine = torch.take_along_dim(cosines, choice[..., None], dim=-1).squeeze(-1)
+    return Disambiguated(normal, choice, cosine)
+
+
+def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
+    """Standard deviation of the degree of polarization d under independent noise on the four intensities.
+
+    With standard deviation ``sigma`` per intensity, S1 and S2 have ``sqrt(2) sigma``, S0 has ``sigma``, and
+    S0 is uncorrelated with both; to first order ``sigma sqrt(2 + d^2) / S0``, which is ``sqrt(2) sigma / S0``
+    for weakly polarized light. Without any polarization the measured d is not zero but Rayleigh-distributed
+    with this scale (mean 1.25 of it; 1.1 % of such pixels exceed 3).
+
+    Args:
+        stokes: [3, ...].
+        noise_sigma: of one of the four intensities in the units of ``stokes``, a number or [...]. For the
+            mean over three colours with independent noise, 1/sqrt(3) of one channel's.
+
+    Returns:
+        [...]; infinite where S0 <= 0 and the noise is positive.
+    """
+    check_leading(stokes, 3, "stokes")
+    s0 = stokes[0].clamp(min=0)
+    spread = noise_sigma * torch.sqrt(2 + dolp(stokes) ** 2)
+    return torch.where(s0 > 0, spread / torch.where(s0 > 0, s0, torch.ones_like(s0)), spread * math.inf)
+
+
+def polarization_mask(
+    stokes: Tensor,
+    *,
+    threshold: float = 0.05,
+    invalid: Tensor | None = None,
+    noise_sigma: float | Tensor = 0.0,
+    snr: float = 3.0,
+    saturated: Tensor | None = None,
+) -> Tensor:
+    """Pixels whose polarization is strong and certain enough to say something about the normal.
+
+    Args:
+        stokes: [3, ...] of the luminance.
+        threshold: least degree of polarization (exclusive).
+        invalid: [...] bool, pixels without data.
+        noise_sigma: standard deviation of one of the four intensities, see ``dolp_noise``; 0 switches the
+            noise test off.
+        snr: least ratio of the degree of polarization to its noise (exclusive).
+        saturated: [...] bool, pixels where any of the four images clips.
+
+    Returns:
+        [...] bool; False where S0 <= 0.
+    """
+    degree = dolp(stokes)
+    mask = (degree > threshold) & (stokes[0] > 0)
+    if isinstance(noise_sigma, Tensor) or noise_sigma > 0:
+        mask = mask & (degree > snr * dolp_noise(stokes, noise_sigma))
+    for bad in (invalid, saturated):
+        if bad is not None:
+            mask = mask & ~bad
+    return mask

@@ -1,0 +1,184 @@
+"""Separating specular from diffuse light, and predicting the polarization of their sum.
+
+Both layers are in units of S0, like the first Stokes component: what a photograph shows of a layer is half of
+it. The light that falls on the surface is taken to be unpolarized and the surface to be a smooth dielectric.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ._guard import check_leading, dot, safe_normalize, safe_sqrt
+from .frames import lens_frame
+from .fresnel import dolp_slopes, reflectances, transmittances
+
+
+class Separation(NamedTuple):
+    """Two layers of one picture.
+
+    Attributes:
+        specular: [..., C] reflected at the surface, units of S0.
+        diffuse: [..., C] from below the surface, units of S0.
+        conditioned: [...] bool, where the values can be trusted. One per pixel, without the colour axis.
+    """
+
+    specular: Tensor
+    diffuse: Tensor
+    conditioned: Tensor
+
+
+def _plane(normals: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """cos(zenith) and ``sin^2(zenith) * (cos, sin)(2 azimuth)``, all [...], finite and smooth everywhere."""
+    unit = safe_normalize(normals)
+    x_ref, up_ref = lens_frame(rays)
+    x, y = dot(unit, x_ref), dot(unit, up_ref)
+    return -dot(unit, rays), x * x - y * y, 2 * x * y
+
+
+def exact_separation(
+    stokes: Tensor,
+    normals: Tensor,
+    rays: Tensor,
+    index: float | Tensor = 1.5,
+    *,
+    minimum_contrast: float = 0.05,
+) -> Separation:
+    """Solve S1 and S2 for both layers, given the normal.
+
+    Specular light is polarized perpendicular to the plane of incidence with degree rho_s, diffuse light in
+    the plane with degree rho_d (Fresnel's equations). With P the part of (S1, S2) along the perpendicular,
+    ``P = rho_s specular - rho_d diffuse`` and ``S0 = specular + diffuse``, so
+    ``specular = (P + rho_d S0) / (rho_s + rho_d)``, limited to [0, S0], each colour on its own.
+
+    Args:
+        stokes: [3, ..., C] with the colours last.
+        normals: [..., 3] camera axes; only the direction matters.
+        rays: [..., 3] unit camera rays.
+        index: refractive index, a number or [...].
+        minimum_contrast: least ``rho_s + rho_d`` that counts as well-conditioned. The default excludes
+            zeniths below about 11 degrees at n = 1.5. Below it the divisor is held at this value, so that
+            noise is amplified at most 1 / minimum_contrast times and the specular layer fades to 0 at normal
+            incidence.
+
+    Returns:
+        Separation in units of S0. ``conditioned`` is also False where the normal faces away or is zero.
+
+    Raises:
+        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+    """
+    check_leading(stokes, 3, "stokes")
+    cosine, plane_cos, plane_sin = _plane(normals, rays)
+    specular_slope, diffuse_slope = dolp_slopes(cosine, index)
+    sine2 = 1 - cosine.clamp(0, 1) ** 2
+    contrast = (specular_slope + diffuse_slope) * sine2
+    # Makes a unit direction of the plane. Where there is none the contrast is small as well.
+    length = safe_sqrt(plane_cos**2 + plane_sin**2)
+    inverse = 1 / length.clamp(min=torch.finfo(length.dtype).eps)
+    s0, s1, s2 = stokes.unbind(0)
+    s0 = s0.clamp(min=0)
+    perpendicular = -(s1 * (plane_cos * inverse)[..., None] + s2 * (plane_sin * inverse)[..., None])
+    specular = perpendicular + (diffuse_slope * sine2)[..., None] * s0
+    specular = specular / contrast.clamp(min=minimum_contrast)[..., None]
+    specular = torch.minimum(specular.clamp(min=0), s0)
+    return Separation(specular, s0 - specular, (contrast >= minimum_contrast) & (cosine > 0))
+
+
+def paper_separation(stokes: Tensor, zenith: Tensor, index: float | Tensor = 1.5) -> Separation:
+    """The reflection cue of the PolarGuide-GSDR paper, averaged over the four polarizer angles.
+
+    The paper sends the observed S0 through Fresnel's equations: specular ``S0 R``, and the rest
+    ``S0 (1 - R)`` transmitted once more, ``S0 (1 - R) T``, with R and T the means over s and p. The average
+    over the polarizer angles does not change when the camera rolls. It is a coarse cue: the share of the
+    specular layer depends on the zenith alone, and the layers do not add up to S0.
+
+    Args:
+        stokes: [3, ..., C] with the colours last.
+        zenith: [...] radians.
+        index: refractive index, a number or [...].
+
+    Returns:
+        Separation in units of S0, ``conditioned`` True everywhere.
+
+    Raises:
+        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+    """
+    check_leading(stokes, 3, "stokes")
+    (rs, rp), (ts, tp) = reflectances(zenith, index), transmittances(zenith, index)
+    s0 = stokes[0].clamp(min=0)
+    reflected = ((rs + rp) / 2)[..., None]
+    specular = s0 * reflected
+    diffuse = s0 * (1 - reflected) * ((ts + tp) / 2)[..., None]
+    return Separation(specular, diffuse, torch.ones_like(zenith, dtype=torch.bool))
+
+
+def paper_intensities(
+    stokes: Tensor,
+    zenith: Tensor,
+    s_direction: Tensor,
+    polarizer: float | Tensor,
+    index: float | Tensor = 1.5,
+) -> tuple[Tensor, Tensor]:
+    """The paper's cue behind a polarizer: both layers as functions of the polarizer angle.
+
+    ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - s_direction)`` with Imax, Imin = ``S0 / 2``
+    times Rs, Rp; for the diffuse layer the p-direction, the light left over, and Tp, Ts. (The paper writes
+    ``cos 2 theta`` with the angle from the image's x axis, which would change when the camera rolls.) The
+    mean over the four polarizer angles is half of ``paper_separation``.
+
+    Args:
+        stokes: [3, ..., C] with the colours last.
+        zenith: [...] radians.
+        s_direction: [...] radians, the direction perpendicular to the plane of incidence: azimuth + pi/2.
+        polarizer: radians, a number or [...].
+        index: refractive index, a number or [...].
+
+    Returns:
+        (specular, diffuse) intensities, each [..., C].
+
+    Raises:
+        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+    """
+    check_leading(stokes, 3, "stokes")
+    (rs, rp), (ts, tp) = reflectances(zenith, index), transmittances(zenith, index)
+    wave = torch.cos(2 * (polarizer - s_direction))
+    s0 = stokes[0].clamp(min=0)
+    left = s0 * (1 - (rs + rp) / 2)[..., None]
+    specular = s0 / 4 * (rs + rp + (rs - rp) * wave)[..., None]
+    # In the p-direction the cosine changes sign.
+    diffuse = left / 4 * (tp + ts - (tp - ts) * wave)[..., None]
+    return specular, diffuse
+
+
+def predicted_stokes(
+    specular: Tensor, diffuse: Tensor, normals: Tensor, rays: Tensor, index: float | Tensor = 1.5
+) -> Tensor:
+    """Stokes vector that a camera measures of two layers on a surface with a known normal.
+
+    ``S0 = specular + diffuse`` and
+    ``(S1, S2) = (rho_s specular - rho_d diffuse) (cos, sin)(2 (azimuth + pi/2))`` with both degrees of
+    polarization from Fresnel's equations. It inverts ``exact_separation``. Value and gradient are smooth
+    where the normal is parallel to the ray (no polarization); a zero normal gives no polarization, and one
+    that faces away counts as grazing.
+
+    Args:
+        specular, diffuse: [..., C] units of S0, the colours last.
+        normals: [..., 3] camera axes; only the direction matters.
+        rays: [..., 3] unit camera rays.
+        index: refractive index, a number or [...].
+
+    Returns:
+        [3, ..., C].
+
+    Raises:
+        ValueError: ``index`` is a number not above 1.
+    """
+    cosine, plane_cos, plane_sin = _plane(normals, rays)
+    specular_slope, diffuse_slope = dolp_slopes(cosine, index)
+    # The slopes lack the factor sin^2 that the components of the plane carry.
+    polarized = diffuse_slope[..., None] * diffuse - specular_slope[..., None] * specular
+    total = specular + diffuse
+    s1, s2 = torch.broadcast_tensors(polarized * plane_cos[..., None], polarized * plane_sin[..., None])
+    return torch.stack((total.expand(s1.shape), s1, s2))
