@@ -1,2 +1,141 @@
+#include "parallel.h"
+#include "rasteriser.h"
+
 #include <nanobind/nanobind.h>
-void bind_raster(nanobind::module_ &) {}
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <chrono>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+
+namespace nb = nanobind;
+using namespace polarguide;
+
+namespace {
+
+using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+
+void expect_shape(const Array &array, const char *name, std::initializer_list<int64_t> shape) {
+    bool same = array.ndim() == shape.size();
+    std::string wanted, found;
+    size_t axis = 0;
+    for (int64_t n : shape) {
+        if (same && int64_t(array.shape(axis)) != n) same = false;
+        wanted += (axis++ ? ", " : "") + std::to_string(n);
+    }
+    if (same) return;
+    for (size_t i = 0; i < array.ndim(); ++i) found += (i ? ", " : "") + std::to_string(array.shape(i));
+    throw std::invalid_argument(std::string(name) + ": expected shape [" + wanted + "], found [" + found + "]");
+}
+
+GaussianInputs inputs(const Array &means, const Array &quats, const Array &scales, const Array &opacities,
+                      const Array &features) {
+    int64_t n = int64_t(means.ndim() ? means.shape(0) : 0);
+    expect_shape(means, "means", {n, 3}), expect_shape(quats, "quats", {n, 4}), expect_shape(scales, "scales", {n, 3});
+    expect_shape(opacities, "opacities", {n});
+    if (features.ndim() != 2) throw std::invalid_argument("features: expected two axes [N, D]");
+    int d = int(features.shape(1));
+    expect_shape(features, "features", {n, d});
+    if (d < 1 || d > max_channels)
+        throw std::invalid_argument("features: expected 1 to " + std::to_string(max_channels) + " channels, found " +
+                                    std::to_string(d));
+    return {n, d, means.data(), quats.data(), scales.data(), opacities.data(), features.data()};
+}
+
+struct Wrapped {
+    Rasteriser rasteriser;
+    int width, height, channels;
+};
+
+} // namespace
+
+void bind_raster(nb::module_ &module) {
+    nb::class_<Wrapped>(module, "Rasteriser", "One picture: the forward pass and what its backward pass needs.")
+        .def(
+            "__init__",
+            [](Wrapped *self, const std::vector<float> &rotation, const std::vector<float> &translation,
+               const std::vector<float> &intrinsics, int width, int height, float near_plane,
+               const std::vector<int32_t> &permutation, int statistic_channels) {
+                if (rotation.size() != 9 || translation.size() != 3 || intrinsics.size() != 4)
+                    throw std::invalid_argument("camera: expected 9 + 3 + 4 numbers");
+                if (width < 1 || height < 1) throw std::invalid_argument("camera: expected a picture of at least one pixel");
+                PinholeCamera c{};
+                for (size_t i = 0; i < 9; ++i) c.rotation[i] = rotation[i];
+                for (size_t i = 0; i < 3; ++i) c.translation[i] = translation[i];
+                c.fx = intrinsics[0], c.fy = intrinsics[1], c.cx = intrinsics[2], c.cy = intrinsics[3];
+                c.width = width, c.height = height, c.near_plane = near_plane;
+                new (self) Wrapped{Rasteriser(c, permutation, statistic_channels), width, height, int(permutation.size())};
+            },
+            nb::arg("rotation"), nb::arg("translation"), nb::arg("intrinsics"), nb::arg("width"), nb::arg("height"),
+            nb::arg("near_plane"), nb::arg("permutation"), nb::arg("statistic_channels"))
+        .def(
+            "forward",
+            [](Wrapped &self, const Array &means, const Array &quats, const Array &scales, const Array &opacities,
+               const Array &features, Array out, Array alpha, Array radius, bool count_pairs) {
+                GaussianInputs in = inputs(means, quats, scales, opacities, features);
+                expect_shape(features, "features", {in.count, self.channels});
+                expect_shape(out, "out", {self.height, self.width, self.channels});
+                expect_shape(alpha, "alpha", {self.height, self.width});
+                expect_shape(radius, "radius", {in.count});
+                nb::gil_scoped_release release;
+                self.rasteriser.forward(in, out.data(), alpha.data(), radius.data(), count_pairs);
+            },
+            nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
+            nb::arg("out"), nb::arg("alpha"), nb::arg("radius"), nb::arg("count_pairs") = false)
+        .def(
+            "backward",
+            [](Wrapped &self, const Array &means, const Array &quats, const Array &scales, const Array &opacities,
+               const Array &features, const Array &out, const Array &grad_out, const Array &grad_alpha, Array d_means,
+               Array d_quats, Array d_scales, Array d_opacities, Array d_features, std::optional<Array> statistic) {
+                GaussianInputs in = inputs(means, quats, scales, opacities, features);
+                for (const Array *a : {&out, &grad_out})
+                    expect_shape(*a, "out or its gradient", {self.height, self.width, self.channels});
+                expect_shape(grad_alpha, "grad_alpha", {self.height, self.width});
+                inputs(d_means, d_quats, d_scales, d_opacities, d_features);
+                expect_shape(d_means, "d_means", {in.count, 3});
+                if (statistic) expect_shape(*statistic, "statistic", {in.count, 2});
+                nb::gil_scoped_release release;
+                self.rasteriser.backward(in, out.data(), grad_out.data(), grad_alpha.data(),
+                                         {d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(),
+                                          d_features.data(), statistic ? statistic->data() : nullptr});
+            },
+            nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
+            nb::arg("out"), nb::arg("grad_out"), nb::arg("grad_alpha"), nb::arg("d_means"), nb::arg("d_quats"),
+            nb::arg("d_scales"), nb::arg("d_opacities"), nb::arg("d_features"), nb::arg("statistic").none())
+        .def_prop_ro("pairs", [](const Wrapped &self) { return self.rasteriser.pairs(); },
+                     "Contributing pixel-Gaussian pairs of the last forward pass that counted them.")
+        .def_prop_ro("instances", [](const Wrapped &self) { return self.rasteriser.instances(); },
+                     "Gaussian-tile pairs of the last forward pass.");
+    module.def(
+        "first_not_finite",
+        [](const Array &array) { return POLARGUIDE_DISPATCH(first_not_finite)(array.data(), int64_t(array.size())); },
+        nb::arg("array"), "Flat index of the first NaN or infinity, or -1.");
+    module.attr("MAX_CHANNELS") = max_channels;
+    module.def(
+        "fma_peak",
+        [](double seconds) {
+            nb::gil_scoped_release release;
+            const int threads = thread_count();
+            std::vector<float> sink(size_t(threads), 0.0f);
+            double best = 0.0, spent = 0.0;
+            while (spent < seconds) {
+                constexpr int64_t rounds = 20000;
+                auto burst = [&](int64_t b, int64_t e, int w) {
+                    for (int64_t i = b; i < e; ++i) sink[size_t(w)] += POLARGUIDE_DISPATCH(fma_burst)(rounds);
+                };
+                auto start = std::chrono::steady_clock::now();
+                parallel_chunks(threads, 1, burst);
+                double t = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+                best = std::max(best, double(rounds) * double(fma_burst_flops) * threads / t);
+                spent += t;
+            }
+            return best;
+        },
+        nb::arg("seconds") = 0.5, "Best single-precision flop/s seen: independent fused multiply-adds on all threads.");
+}

@@ -1,1 +1,16 @@
+"""Splatting of Gaussians with any channels: one interface, a slow twin, and fast backends."""
 
+from polarguide.raster.backends import Backend, DeviceName, choose_backend
+from polarguide.raster.interface import Rasterise, Rasterised, ScreenStatistic
+from polarguide.raster.reference import quaternions_to_rotations, rasterise_reference
+
+__all__ = [
+    "Backend",
+    "DeviceName",
+    "Rasterise",
+    "Rasterised",
+    "ScreenStatistic",
+    "choose_backend",
+    "quaternions_to_rotations",
+    "rasterise_reference",
+]

@@ -1,0 +1,95 @@
+// Splatting of 3D Gaussians with D feature channels: the data that passes between the stages.
+//
+// Definition (the same as the plain-torch twin, src/polarguide/raster/reference.py): EWA projection with a 0.3 px^2
+// blur, alpha = min(0.99, opacity * exp(-quadratic / 2)), contributions below 1/255 are dropped, a pixel ends before
+// the Gaussian that would bring its transmittance under 1e-4, Gaussians in order of camera depth (ties: by index).
+#pragma once
+#include "kernels.h"
+
+#include <stdint.h>
+
+namespace polarguide {
+
+constexpr int tile_size = 16;   // pixels; a tile is 4 x 4 blocks of 4 x 4 pixels, and one block is one vector
+constexpr int max_channels = 32;
+constexpr int screen_values = 6; // per Gaussian: x, y, and the exponent's factors (see ProjectArgs)
+constexpr int instance_extra = 8; // per instance, behind the D feature gradients: x y, conic a b c, opacity, statistic x y
+
+struct PinholeCamera {
+    float rotation[9], translation[3]; // world to camera, row-major
+    float fx, fy, cx, cy;
+    int width, height;
+    float near_plane;
+};
+
+struct ProjectArgs {
+    int64_t count;
+    const float *means, *quats, *scales, *opacities; // [N,3] [N,4] [N,3] [N]
+    PinholeCamera camera;
+    // Out. `screen` rows: x, y (pixels), A, B, C, L with log2(alpha) = A dx^2 + B dx dy + C dy^2 + L.
+    float *screen;  // [N,6]
+    float *depth;   // [N]
+    float *radius;  // [N] three standard deviations of the wider axis in pixels, 0 where culled
+    int32_t *box;   // [N,4] first and last-plus-one tile in x and y; empty where culled
+};
+
+struct TileEmitArgs {
+    const float *screen;
+    const int32_t *box;
+    const int64_t *offset;  // [N] where this Gaussian's candidates begin
+    int tiles_x;
+    int32_t *tiles;         // [candidates] the tiles it really touches, packed from its offset on
+    int32_t *touched;       // [N] how many
+};
+
+struct RasterArgs {
+    int channels;     // D of this instantiation (padded)
+    int channels_real;
+    int width, height, tiles_x, tiles_y;
+    const float *screen;            // [N,6]
+    const float *features;          // [N, channels_real]
+    const int32_t *permutation;     // [channels_real] statistic channels first
+    const int64_t *tile_begin;      // [tiles + 1]
+    const int32_t *gaussians;       // [instances] by tile, in depth order
+    const int64_t *instances;       // [instances] row in the instance gradient buffer
+    // Forward, out
+    float *out;                     // [H,W,channels_real]
+    float *alpha;                   // [H,W]
+    float *transmittance;           // [H,W]
+    int64_t *pairs;                 // optional [tiles]: contributing pixel-Gaussian pairs
+    // Backward, in (out and transmittance are read)
+    const float *grad_out, *grad_alpha; // [H,W,channels_real], [H,W]
+    int statistic_channels;
+    float *grad_instances;          // [instances, channels + instance_extra]
+};
+
+struct ProjectBackwardArgs {
+    ProjectArgs forward;
+    int channels, channels_real;
+    const int32_t *permutation;
+    const int64_t *instance_begin; // [N + 1]
+    const float *grad_instances;
+    float *grad_means, *grad_quats, *grad_scales, *grad_opacities, *grad_features;
+    float *statistic; // [N,2] or null
+};
+
+// Scratch of one worker, sized for the longest tile list.
+struct RasterScratch {
+    float *rows;      // [n, channels + 6] Gaussians of the tile
+    int32_t *lists;   // [16, n]
+    float *moments;   // [n, channels + 9]
+};
+
+POLARGUIDE_DECLARE(void project(const ProjectArgs &args, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void raster_forward(const RasterArgs &args, int64_t tile, const RasterScratch &scratch))
+POLARGUIDE_DECLARE(void raster_backward(const RasterArgs &args, int64_t tile, const RasterScratch &scratch))
+POLARGUIDE_DECLARE(void project_backward(const ProjectBackwardArgs &args, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(int64_t first_not_finite(const float *values, int64_t count)) // index, or -1
+POLARGUIDE_DECLARE(float fma_burst(int64_t rounds)) // 512 fused multiply-adds of 16 lanes a round
+constexpr int64_t fma_burst_flops = 2 * 16 * 512;
+
+// The smallest compiled channel count that holds `channels`, or 0.
+int padded_channels(int channels);
+
+} // namespace polarguide

@@ -1,0 +1,122 @@
+// Sixteen-lane vectors with GNU vector types: one source for every instruction set. The compiler splits a vector
+// into as many registers as the target needs (one on AVX-512, two on AVX2, four on SSE2 and NEON).
+#pragma once
+#include <stdint.h>
+
+#if defined(__AVX512F__) || defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+#define POLARGUIDE_INLINE static inline __attribute__((always_inline))
+
+namespace polarguide {
+namespace POLARGUIDE_ISA {
+namespace {
+
+constexpr int lanes = 16;
+typedef float vf __attribute__((vector_size(64), may_alias));
+typedef int32_t vi __attribute__((vector_size(64), may_alias));
+typedef float vf_unaligned __attribute__((vector_size(64), aligned(4), may_alias));
+typedef float v4f __attribute__((vector_size(16), aligned(4), may_alias));
+
+POLARGUIDE_INLINE vf splat(float x) { return vf{} + x; }
+POLARGUIDE_INLINE vf load(const float *p) { return *reinterpret_cast<const vf_unaligned *>(p); }
+POLARGUIDE_INLINE void store(float *p, vf x) { *reinterpret_cast<vf_unaligned *>(p) = x; }
+POLARGUIDE_INLINE vf as_float(vi x) { return reinterpret_cast<vf &>(x); }
+POLARGUIDE_INLINE vi as_int(vf x) { return reinterpret_cast<vi &>(x); }
+POLARGUIDE_INLINE vf min(vf a, vf b) { return a < b ? a : b; }
+POLARGUIDE_INLINE vf max(vf a, vf b) { return a > b ? a : b; }
+POLARGUIDE_INLINE vf clamp(vf x, vf low, vf high) { return max(low, min(x, high)); }
+
+// Bit l is set where lane l of a comparison result is true.
+POLARGUIDE_INLINE uint32_t bits(vi mask) {
+#if defined(__AVX512F__)
+    return _mm512_cmplt_epi32_mask(reinterpret_cast<__m512i &>(mask), _mm512_setzero_si512());
+#elif defined(__AVX2__)
+    struct Halves {
+        __m256 low, high;
+    } h = reinterpret_cast<Halves &>(mask);
+    return uint32_t(_mm256_movemask_ps(h.low)) | uint32_t(_mm256_movemask_ps(h.high)) << 8;
+#else
+    uint32_t result = 0;
+    for (int l = 0; l < lanes; ++l) result |= uint32_t(mask[l] != 0) << l;
+    return result;
+#endif
+}
+POLARGUIDE_INLINE bool any(vi mask) {
+#if defined(__AVX512F__) || defined(__AVX2__)
+    return bits(mask) != 0;
+#else
+    typedef int64_t v2l __attribute__((vector_size(16), may_alias));
+    const v2l *q = reinterpret_cast<const v2l *>(&mask);
+    v2l o = (q[0] | q[1]) | (q[2] | q[3]);
+    return (o[0] | o[1]) != 0;
+#endif
+}
+
+// 1/x to about 1e-7 relative; x in a normal range.
+POLARGUIDE_INLINE vf reciprocal(vf x) {
+#if defined(__AVX512F__)
+    __m512 v = reinterpret_cast<__m512 &>(x);
+    __m512 r = _mm512_rcp14_ps(v);
+    r = _mm512_mul_ps(r, _mm512_fnmadd_ps(v, r, _mm512_set1_ps(2.0f)));
+    return reinterpret_cast<vf &>(r);
+#else
+    return 1.0f / x;
+#endif
+}
+
+// 2^x for x in [-120, 120], relative error about 1e-7 (a fifth-degree minimax polynomial on [-1/2, 1/2]).
+POLARGUIDE_INLINE vf exp2(vf x) {
+    const float magic = 12582912.0f; // 1.5 * 2^23: adding it rounds to the nearest integer
+    vf shifted = x + magic;
+    vf f = x - (shifted - magic);
+    vf p = ((((splat(0.00132764719f) * f + 0.00967553685f) * f + 0.0555071325f) * f + 0.240221197f) * f + 0.693146967f) *
+               f +
+           1.00000007f;
+    return as_float(as_int(p) + (as_int(shifted) << 23));
+}
+
+// out[c][r] = in[r][c] for 16 x 16 floats.
+POLARGUIDE_INLINE void transpose16(const float *in, float *out) {
+#if defined(__AVX512F__)
+    __m512 r[16], t[16];
+    for (int i = 0; i < 16; ++i) r[i] = _mm512_loadu_ps(in + 16 * i);
+    for (int i = 0; i < 16; i += 2) {
+        t[i] = _mm512_unpacklo_ps(r[i], r[i + 1]);
+        t[i + 1] = _mm512_unpackhi_ps(r[i], r[i + 1]);
+    }
+    for (int i = 0; i < 16; i += 4)
+        for (int j = 0; j < 2; ++j) {
+            __m512d a = _mm512_castps_pd(t[i + j]), b = _mm512_castps_pd(t[i + j + 2]);
+            r[i + 2 * j] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, b));
+            r[i + 2 * j + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, b));
+        }
+    // r[4 * g + c] holds, in its 128-bit piece q, rows 4g..4g+3 of column 4q + c.
+    for (int c = 0; c < 4; ++c) {
+        __m512 x = _mm512_shuffle_f32x4(r[c], r[4 + c], 0x88), y = _mm512_shuffle_f32x4(r[8 + c], r[12 + c], 0x88);
+        __m512 z = _mm512_shuffle_f32x4(r[c], r[4 + c], 0xdd), w = _mm512_shuffle_f32x4(r[8 + c], r[12 + c], 0xdd);
+        _mm512_storeu_ps(out + 16 * c, _mm512_shuffle_f32x4(x, y, 0x88));
+        _mm512_storeu_ps(out + 16 * (c + 4), _mm512_shuffle_f32x4(z, w, 0x88));
+        _mm512_storeu_ps(out + 16 * (c + 8), _mm512_shuffle_f32x4(x, y, 0xdd));
+        _mm512_storeu_ps(out + 16 * (c + 12), _mm512_shuffle_f32x4(z, w, 0xdd));
+    }
+#else
+    typedef float v4 __attribute__((vector_size(16), aligned(4), may_alias));
+    for (int i = 0; i < 16; i += 4)
+        for (int j = 0; j < 16; j += 4) {
+            v4 a = *(const v4 *)(in + 16 * i + j), b = *(const v4 *)(in + 16 * (i + 1) + j);
+            v4 c = *(const v4 *)(in + 16 * (i + 2) + j), d = *(const v4 *)(in + 16 * (i + 3) + j);
+            v4 ab0 = __builtin_shufflevector(a, b, 0, 4, 1, 5), ab1 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+            v4 cd0 = __builtin_shufflevector(c, d, 0, 4, 1, 5), cd1 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+            *(v4 *)(out + 16 * j + i) = __builtin_shufflevector(ab0, cd0, 0, 1, 4, 5);
+            *(v4 *)(out + 16 * (j + 1) + i) = __builtin_shufflevector(ab0, cd0, 2, 3, 6, 7);
+            *(v4 *)(out + 16 * (j + 2) + i) = __builtin_shufflevector(ab1, cd1, 0, 1, 4, 5);
+            *(v4 *)(out + 16 * (j + 3) + i) = __builtin_shufflevector(ab1, cd1, 2, 3, 6, 7);
+        }
+#endif
+}
+
+} // namespace
+} // namespace POLARGUIDE_ISA
+} // namespace polarguide

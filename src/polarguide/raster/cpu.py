@@ -1,0 +1,84 @@
+"""The CPU backend: the native kernels (``native/``) as a differentiable torch function, float32."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from polarguide import _native
+from polarguide.camera import Camera
+from polarguide.raster.interface import NEAR_PLANE, Rasterised, ScreenStatistic, check_shapes, refuse_not_finite
+
+
+def native_rasteriser(camera: Camera, channels: int, statistic: ScreenStatistic | None) -> Any:
+    """A native rasteriser for one picture with ``channels`` channels, those of the statistic first."""
+    chosen = list(statistic.channels) if statistic else []
+    permutation = chosen + [k for k in range(channels) if k not in chosen]
+    return _native.Rasteriser(
+        camera.rotation.flatten().tolist(),
+        camera.translation.tolist(),
+        [camera.fx, camera.fy, camera.cx, camera.cy],
+        camera.width,
+        camera.height,
+        NEAR_PLANE,
+        permutation,
+        len(chosen),
+    )
+
+
+class _Rasterise(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        camera: Camera,
+        statistic: ScreenStatistic | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        inputs = [t.detach().contiguous() for t in (means, quats, scales, opacities, features)]
+        for name, tensor in zip(("means", "quats", "scales", "opacities", "features"), inputs, strict=True):
+            bad = _native.first_not_finite(tensor)
+            if bad >= 0:
+                raise refuse_not_finite(name, bad // max(1, tensor[0].numel()))
+        rasteriser = native_rasteriser(camera, features.shape[1], statistic)
+        out = torch.empty(camera.height, camera.width, features.shape[1])
+        alpha = torch.empty(camera.height, camera.width)
+        radii = torch.empty(means.shape[0])
+        rasteriser.forward(*inputs, out, alpha, radii)
+        ctx.mark_non_differentiable(radii)
+        ctx.save_for_backward(*inputs, out)
+        ctx.rasteriser = rasteriser
+        ctx.statistic = statistic
+        return out, alpha, radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor, grad_alpha: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, out = ctx.saved_tensors
+        gradients = [torch.empty_like(t) for t in inputs]
+        screen = torch.empty(inputs[0].shape[0], 2) if ctx.statistic else None
+        ctx.rasteriser.backward(*inputs, out, grad_out.contiguous(), grad_alpha.contiguous(), *gradients, screen)
+        if ctx.statistic:
+            ctx.statistic.gradient = screen
+        return (*gradients, None, None)
+
+
+def rasterise_cpu(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+    *,
+    statistic: ScreenStatistic | None = None,
+) -> Rasterised:
+    """See ``polarguide.raster.interface``. CPU tensors, float32; deterministic for any number of threads."""
+    check_shapes(means, quats, scales, opacities, features, statistic)
+    return Rasterised(*_Rasterise.apply(means, quats, scales, opacities, features, camera, statistic))

@@ -1,0 +1,120 @@
+"""The slow twin: the definition of the rasteriser in plain torch, for any dtype and device.
+
+Every Gaussian is evaluated at every pixel, so memory grows as N x H x W: for tests and tiny pictures.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from polarguide.camera import Camera
+from polarguide.raster.interface import (
+    BLUR,
+    JACOBIAN_MARGIN,
+    MAXIMUM_ALPHA,
+    MINIMUM_ALPHA,
+    MINIMUM_TRANSMITTANCE,
+    NEAR_PLANE,
+    Rasterised,
+    ScreenStatistic,
+    check_shapes,
+    refuse_not_finite,
+)
+
+
+def quaternions_to_rotations(quats: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalised first."""
+    w, x, y, z = normalize(quats, dim=-1, eps=1e-12).unbind(-1)
+    entries = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in entries], dim=-2)
+
+
+def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Projected means [N, 2], covariances [N, 2, 2] with the blur, and camera depths [N]."""
+    rotation = camera.rotation.to(means)
+    local = means @ rotation.T + camera.translation.to(means)
+    depth = local[:, 2]
+    safe = torch.where(depth > NEAR_PLANE, depth, torch.ones_like(depth))
+    x, y = local[:, 0] / safe, local[:, 1] / safe
+    means2d = torch.stack((camera.fx * x + camera.cx, camera.fy * y + camera.cy), dim=-1)
+    margin_x = JACOBIAN_MARGIN * camera.width / camera.fx
+    margin_y = JACOBIAN_MARGIN * camera.height / camera.fy
+    x = x.clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    y = y.clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    zero = torch.zeros_like(depth)
+    jacobian = torch.stack(
+        (
+            torch.stack((camera.fx / safe, zero, -camera.fx * x / safe), dim=-1),
+            torch.stack((zero, camera.fy / safe, -camera.fy * y / safe), dim=-1),
+        ),
+        dim=-2,
+    )
+    half = jacobian @ rotation @ quaternions_to_rotations(quats) * scales[:, None, :]
+    return means2d, half @ half.mT + BLUR * torch.eye(2).to(means), depth
+
+
+def rasterise_reference(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+    *,
+    statistic: ScreenStatistic | None = None,
+) -> Rasterised:
+    """See ``polarguide.raster.interface``; differentiable by autograd, exact but slow."""
+    check_shapes(means, quats, scales, opacities, features, statistic)
+    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
+    for name, tensor in named.items():
+        bad = (~torch.isfinite(tensor)).reshape(tensor.shape[0], -1).any(dim=1).nonzero()
+        if len(bad):
+            raise refuse_not_finite(name, int(bad[0]))
+    means2d, covariances, depth = _project(means, quats, scales, camera)
+    determinant = torch.linalg.det(covariances)
+    visible = (depth > NEAR_PLANE) & (opacities >= MINIMUM_ALPHA) & (determinant > 0)
+    order = torch.argsort(depth.detach(), stable=True)
+    order = order[visible[order]]
+    centres = (torch.arange(max(camera.width, camera.height)).to(means)) + 0.5
+    pixels = torch.cartesian_prod(centres[: camera.height], centres[: camera.width]).flip(-1)
+    offset = pixels[None] - means2d[order][:, None]
+    conics = torch.linalg.inv(covariances[order])
+    quadratic = torch.einsum("npi,nij,npj->np", offset, conics, offset)
+    alpha = (opacities[order][:, None] * torch.exp(-0.5 * quadratic)).clamp(max=MAXIMUM_ALPHA)
+    alpha = torch.where(alpha >= MINIMUM_ALPHA, alpha, torch.zeros_like(alpha))
+    after = torch.cumprod(1 - alpha, dim=0)
+    ended = (after < MINIMUM_TRANSMITTANCE).cummax(dim=0).values if len(order) else after > 1
+    alpha = torch.where(ended, torch.zeros_like(alpha), alpha)
+    after = torch.cumprod(1 - alpha, dim=0)
+    before = torch.cat((torch.ones_like(after[:1]), after[:-1]))
+    blended = (alpha * before).mT @ features[order]
+    coverage = 1 - after[-1] if len(order) else torch.zeros_like(pixels[:, 0])
+    shape = (camera.height, camera.width)
+    image = blended.reshape(*shape, features.shape[1])
+    if statistic is not None and image.requires_grad:
+        _watch(image, means2d, statistic)
+    with torch.no_grad():
+        middle = 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
+        radii = 3 * torch.sqrt(middle + torch.sqrt((middle**2 - determinant).clamp(min=0.1)))
+        touches = torch.zeros_like(visible)
+        touches[order] = (quadratic <= 2 * torch.log(255 * opacities[order])[:, None]).any(dim=1)
+        radii = torch.where(touches, radii, torch.zeros_like(radii))
+    return Rasterised(image, coverage.reshape(shape), radii)
+
+
+def _watch(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> None:
+    """Fill the statistic when the picture's gradient arrives."""
+
+    def fill(gradient: Tensor) -> None:
+        chosen = torch.zeros_like(gradient)
+        chosen[..., list(statistic.channels)] = gradient[..., list(statistic.channels)]
+        with torch.enable_grad():
+            (statistic.gradient,) = torch.autograd.grad(image, means2d, chosen, retain_graph=True)
+
+    image.register_hook(fill)
