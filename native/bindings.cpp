@@ -13,6 +13,7 @@ void bind_raster(nb::module_ &module);
 void bind_image(nb::module_ &module);
 
 NB_MODULE(_native, module) {
+    nb::set_leak_warnings(false); // autograd graphs may outlive the interpreter
     module.doc() = "CPU kernels of polarguide.";
     module.def("thread_count", &polarguide::thread_count, "Number of threads the kernels use.");
     module.def("set_thread_count", &polarguide::set_thread_count, nb::arg("threads"),

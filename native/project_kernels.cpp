@@ -101,6 +101,9 @@ void project(const ProjectArgs &p, int64_t begin, int64_t end) {
         // alpha >= 1/255 inside the ellipse d^T conic d <= reach
         const float reach = 2.0f * natural * (screen[5] + 7.99435344f);
         const float half_x = sqrtf(reach * o.a), half_y = sqrtf(reach * o.c);
+        if (!(screen[0] + half_x > 0.0f) || !(screen[0] - half_x < p.camera.width) || !(screen[1] + half_y > 0.0f) ||
+            !(screen[1] - half_y < p.camera.height))
+            continue;
         const int x0 = clamp_tile(screen[0] - half_x, tiles_x), x1 = clamp_tile(screen[0] + half_x + tile_size, tiles_x);
         const int y0 = clamp_tile(screen[1] - half_y, tiles_y), y1 = clamp_tile(screen[1] + half_y + tile_size, tiles_y);
         if (x0 >= x1 || y0 >= y1) continue;

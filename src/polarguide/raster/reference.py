@@ -98,23 +98,26 @@ def rasterise_reference(
     shape = (camera.height, camera.width)
     image = blended.reshape(*shape, features.shape[1])
     if statistic is not None and image.requires_grad:
-        _watch(image, means2d, statistic)
+        image = _watched(image, means2d, statistic)
     with torch.no_grad():
         middle = 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
         radii = 3 * torch.sqrt(middle + torch.sqrt((middle**2 - determinant).clamp(min=0.1)))
-        touches = torch.zeros_like(visible)
-        touches[order] = (quadratic <= 2 * torch.log(255 * opacities[order])[:, None]).any(dim=1)
-        radii = torch.where(touches, radii, torch.zeros_like(radii))
+        reach = 2 * torch.log(opacities.clamp(min=MINIMUM_ALPHA) / MINIMUM_ALPHA)
+        half = torch.sqrt(reach[:, None] * torch.stack((covariances[:, 0, 0], covariances[:, 1, 1]), dim=-1))
+        size = torch.tensor([camera.width, camera.height]).to(means)
+        seen = visible & ((means2d + half > 0) & (means2d - half < size)).all(dim=1)
+        radii = torch.where(seen, radii, torch.zeros_like(radii))
     return Rasterised(image, coverage.reshape(shape), radii)
 
 
-def _watch(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> None:
-    """Fill the statistic when the picture's gradient arrives."""
+def _watched(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> Tensor:
+    """The same picture; when its gradient arrives, the statistic is filled."""
 
     def fill(gradient: Tensor) -> None:
         chosen = torch.zeros_like(gradient)
         chosen[..., list(statistic.channels)] = gradient[..., list(statistic.channels)]
-        with torch.enable_grad():
-            (statistic.gradient,) = torch.autograd.grad(image, means2d, chosen, retain_graph=True)
+        (statistic.gradient,) = torch.autograd.grad(image, means2d, chosen, retain_graph=True)
 
-    image.register_hook(fill)
+    result = image.clone()  # a node of its own, so that the hook does not call itself
+    result.register_hook(fill)
+    return result
