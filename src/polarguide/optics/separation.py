@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ._guard import check_leading, dot, safe_normalize, safe_sqrt
+from ._guard import check_leading, dot, safe_normalize
 from .frames import lens_frame
 from .fresnel import dolp_slopes, reflectances, transmittances
 
@@ -30,12 +30,11 @@ class Separation(NamedTuple):
     conditioned: Tensor
 
 
-def _plane(normals: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """cos(zenith) and ``sin^2(zenith) * (cos, sin)(2 azimuth)``, all [...], finite and smooth everywhere."""
+def _components(normals: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Components of the unit normal: towards the camera (cos(zenith)), image right, image up."""
     unit = safe_normalize(normals)
     x_ref, up_ref = lens_frame(rays)
-    x, y = dot(unit, x_ref), dot(unit, up_ref)
-    return -dot(unit, rays), x * x - y * y, 2 * x * y
+    return -dot(unit, rays), dot(unit, x_ref), dot(unit, up_ref)
 
 
 def exact_separation(
@@ -59,9 +58,8 @@ def exact_separation(
         rays: [..., 3] unit camera rays.
         index: refractive index, a number or [...].
         minimum_contrast: least ``rho_s + rho_d`` that counts as well-conditioned. The default excludes
-            zeniths below about 11 degrees at n = 1.5. Below it the divisor is held at this value, so that
-            noise is amplified at most 1 / minimum_contrast times and the specular layer fades to 0 at normal
-            incidence.
+            zeniths below about 11 degrees at n = 1.5. The divisor itself is held above a tenth of it, which
+            bounds the amplification of noise.
 
     Returns:
         Separation in units of S0. ``conditioned`` is also False where the normal faces away or is zero.
@@ -70,18 +68,18 @@ def exact_separation(
         ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
     """
     check_leading(stokes, 3, "stokes")
-    cosine, plane_cos, plane_sin = _plane(normals, rays)
+    cosine, x, y = _components(normals, rays)
     specular_slope, diffuse_slope = dolp_slopes(cosine, index)
     sine2 = 1 - cosine.clamp(0, 1) ** 2
     contrast = (specular_slope + diffuse_slope) * sine2
-    # Makes a unit direction of the plane. Where there is none the contrast is small as well.
-    length = safe_sqrt(plane_cos**2 + plane_sin**2)
-    inverse = 1 / length.clamp(min=torch.finfo(length.dtype).eps)
     s0, s1, s2 = stokes.unbind(0)
     s0 = s0.clamp(min=0)
-    perpendicular = -(s1 * (plane_cos * inverse)[..., None] + s2 * (plane_sin * inverse)[..., None])
+    # Cosine and sine of twice the azimuth. Without an azimuth they are 0, and so is the contrast.
+    across = (x * x + y * y).clamp(min=torch.finfo(x.dtype).eps)
+    double_cos, double_sin = (x * x - y * y) / across, 2 * x * y / across
+    perpendicular = -(s1 * double_cos[..., None] + s2 * double_sin[..., None])
     specular = perpendicular + (diffuse_slope * sine2)[..., None] * s0
-    specular = specular / contrast.clamp(min=minimum_contrast)[..., None]
+    specular = specular / contrast.clamp(min=minimum_contrast / 10)[..., None]
     specular = torch.minimum(specular.clamp(min=0), s0)
     return Separation(specular, s0 - specular, (contrast >= minimum_contrast) & (cosine > 0))
 
@@ -175,10 +173,10 @@ def predicted_stokes(
     Raises:
         ValueError: ``index`` is a number not above 1.
     """
-    cosine, plane_cos, plane_sin = _plane(normals, rays)
+    cosine, x, y = _components(normals, rays)
     specular_slope, diffuse_slope = dolp_slopes(cosine, index)
-    # The slopes lack the factor sin^2 that the components of the plane carry.
+    # sin^2 times the cosine and sine of twice the azimuth; the slopes lack just that factor.
+    double_cos, double_sin = x * x - y * y, 2 * x * y
     polarized = diffuse_slope[..., None] * diffuse - specular_slope[..., None] * specular
-    total = specular + diffuse
-    s1, s2 = torch.broadcast_tensors(polarized * plane_cos[..., None], polarized * plane_sin[..., None])
-    return torch.stack((total.expand(s1.shape), s1, s2))
+    s1, s2 = polarized * double_cos[..., None], polarized * double_sin[..., None]
+    return torch.stack(torch.broadcast_tensors(specular + diffuse, s1, s2))

@@ -1,0 +1,186 @@
+"""Fresnel's equations against the textbook forms, their limits, and their inverses."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from polarguide import optics
+
+HALF_PI = math.pi / 2
+indices = st.floats(1.1, 3.0)
+zeniths = st.floats(0.0, HALF_PI)
+oblique = st.floats(0.02, HALF_PI - 0.02)
+
+
+def scalar(value: float, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    return torch.tensor(value, dtype=dtype)
+
+
+def textbook(i: float, n: float) -> tuple[float, float]:
+    """(Rs, Rp) in the sine and tangent form."""
+    r = math.asin(math.sin(i) / n)
+    return (math.sin(i - r) / math.sin(i + r)) ** 2, (math.tan(i - r) / math.tan(i + r)) ** 2
+
+
+@given(i=oblique, n=indices)
+def test_reflectances_follow_fresnel(i: float, n: float) -> None:
+    rs, rp = optics.reflectances(scalar(i), n)
+    assert (float(rs), float(rp)) == pytest.approx(textbook(i, n), rel=1e-9, abs=1e-12)
+
+
+@given(i=zeniths, n=indices)
+def test_energy_is_conserved(i: float, n: float) -> None:
+    for reflected, transmitted in zip(
+        optics.reflectances(scalar(i), n), optics.transmittances(scalar(i), n), strict=True
+    ):
+        assert float(reflected + transmitted) == pytest.approx(1.0, abs=1e-14)
+        assert 0 <= float(reflected) <= 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("n", [1.33, 1.5, 2.4])
+def test_normal_incidence(n: float, dtype: torch.dtype) -> None:
+    expected = ((n - 1) / (n + 1)) ** 2
+    for reflectance in optics.reflectances(scalar(0.0, dtype), n):
+        assert float(reflectance) == pytest.approx(expected, rel=8 * torch.finfo(dtype).eps)
+    assert float(optics.specular_dolp(scalar(0.0, dtype), n)) == 0
+    assert float(optics.diffuse_dolp(scalar(0.0, dtype), n)) == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("zenith", [HALF_PI, 1.8, math.pi])
+def test_grazing_incidence_and_beyond(zenith: float, dtype: torch.dtype) -> None:
+    for reflectance in optics.reflectances(scalar(zenith, dtype), 1.5):
+        assert float(reflectance) == pytest.approx(1.0, abs=8 * torch.finfo(dtype).eps)
+        assert float(reflectance) <= 1
+    assert float(optics.specular_dolp(scalar(zenith, dtype), 1.5)) == pytest.approx(0.0, abs=1e-6)
+    limit = float(optics.diffuse_dolp_limit(1.5))
+    assert limit == pytest.approx(1.25 / 3.25, abs=1e-15)
+    assert float(optics.diffuse_dolp(scalar(zenith, dtype), 1.5)) == pytest.approx(limit, rel=1e-6)
+
+
+@given(n=indices)
+def test_brewster_angle_extinguishes_p(n: float) -> None:
+    angle = optics.brewster(n)
+    assert float(angle) == pytest.approx(math.atan(n), abs=1e-15)
+    assert float(optics.reflectances(angle, n)[1]) < 1e-28
+    assert float(optics.specular_dolp(angle, n)) == pytest.approx(1.0, abs=1e-14)
+
+
+@given(i=oblique, n=indices)
+def test_degrees_of_polarization_are_those_of_the_reflectances(i: float, n: float) -> None:
+    rs, rp = textbook(i, n)
+    assert float(optics.specular_dolp(scalar(i), n)) == pytest.approx((rs - rp) / (rs + rp), abs=1e-9)
+    expected = (rs - rp) / (2 - rs - rp)
+    assert float(optics.diffuse_dolp(scalar(i), n)) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("i", "d"), [(30, 0.01698), (50, 0.05771), (60, 0.09594), (70, 0.15508), (80, 0.24643)]
+)
+def test_diffuse_check_values(i: float, d: float) -> None:
+    assert float(optics.diffuse_dolp(scalar(math.radians(i)), 1.5)) == pytest.approx(d, abs=5e-6)
+    assert math.degrees(optics.diffuse_zenith(scalar(d), 1.5)) == pytest.approx(i, abs=0.02)
+
+
+@pytest.mark.parametrize(("i", "wrong"), [(10, 44), (15, 60), (20, 72), (25, 82)])
+def test_diffuse_inverse_of_specular_light_is_badly_wrong(i: float, wrong: float) -> None:
+    d = optics.specular_dolp(scalar(math.radians(i)), 1.5)
+    assert math.degrees(optics.diffuse_zenith(d, 1.5)) == pytest.approx(wrong, abs=0.6)
+
+
+@pytest.mark.parametrize(("n", "read"), [(1.3, 48), (1.8, 70)])
+def test_wrong_index_shifts_the_zenith(n: float, read: float) -> None:
+    d = optics.diffuse_dolp(scalar(math.radians(60)), n)
+    assert math.degrees(optics.diffuse_zenith(d, 1.5)) == pytest.approx(read, abs=0.6)
+
+
+@given(i=zeniths, n=indices)
+def test_diffuse_round_trip(i: float, n: float) -> None:
+    assert float(optics.diffuse_zenith(optics.diffuse_dolp(scalar(i), n), n)) == pytest.approx(i, abs=1e-7)
+
+
+@given(d=st.floats(0.0, 1.0), n=indices)
+def test_specular_round_trip(d: float, n: float) -> None:
+    below, above = optics.specular_zeniths(scalar(d), n)
+    assert 0 <= float(below) <= float(optics.brewster(n)) + 1e-15
+    assert float(optics.brewster(n)) - 1e-15 <= float(above) <= HALF_PI + 1e-15
+    assert float(optics.specular_dolp(below, n)) == pytest.approx(d, abs=1e-12)
+    assert float(optics.specular_dolp(above, n)) == pytest.approx(d, abs=1e-12)
+
+
+@given(i=oblique, n=indices)
+def test_one_specular_root_is_the_true_zenith(i: float, n: float) -> None:
+    below, above = optics.specular_zeniths(optics.specular_dolp(scalar(i), n), n)
+    # Near Brewster's angle the inverse has a square-root singularity and halves the digits.
+    assert min(abs(float(below) - i), abs(float(above) - i)) < 1e-6
+
+
+def test_inverses_at_the_ends() -> None:
+    ends = torch.tensor((-0.5, 0.0, 1.0, 1.5), dtype=torch.float64)
+    grazing, brewster = HALF_PI, math.atan(1.5)
+    below, above = optics.specular_zeniths(ends, 1.5)
+    assert below.tolist() == pytest.approx([0, 0, brewster, brewster], abs=1e-12)
+    assert above.tolist() == pytest.approx([grazing, grazing, brewster, brewster], abs=1e-12)
+    assert optics.diffuse_zenith(ends, 1.5).tolist() == pytest.approx([0, 0, grazing, grazing], abs=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("end", [0.0, 1e-30, 1.25 / 3.25, 1.0 - 1e-9, 1.0, HALF_PI, 2.0])
+def test_gradient_is_finite_at_the_ends(end: float, dtype: torch.dtype) -> None:
+    functions = (
+        optics.reflectances,
+        optics.transmittances,
+        optics.specular_dolp,
+        optics.diffuse_dolp,
+        optics.diffuse_zenith,
+        optics.specular_zeniths,
+        optics.dolp_slopes,
+        optics.reflectances_from_cosine,
+    )
+    for function in functions:
+        leaf = torch.tensor(end, dtype=dtype, requires_grad=True)
+        index = torch.tensor(1.5, dtype=dtype, requires_grad=True)
+        values = function(leaf, index)
+        total = sum(values) if isinstance(values, tuple) else values
+        total.backward()
+        assert torch.isfinite(total), function
+        assert torch.isfinite(leaf.grad), function
+        assert index.grad is not None
+        assert torch.isfinite(index.grad), function
+
+
+def test_gradients_away_from_the_ends_are_exact() -> None:
+    zenith = torch.linspace(0.1, 1.4, 7, dtype=torch.float64, requires_grad=True)
+    degree = torch.linspace(0.02, 0.35, 7, dtype=torch.float64, requires_grad=True)
+    index = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
+    for forward in (optics.reflectances, optics.specular_dolp, optics.diffuse_dolp, optics.dolp_slopes):
+        assert torch.autograd.gradcheck(forward, (zenith, index))
+    for inverse in (optics.diffuse_zenith, optics.specular_zeniths):
+        assert torch.autograd.gradcheck(inverse, (degree, index))
+
+
+@given(
+    shape=st.lists(st.integers(0, 3), max_size=3).map(tuple),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_index_per_pixel_over_any_shape(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    torch.manual_seed(0)
+    zenith = torch.rand(shape, dtype=dtype) * HALF_PI
+    index = 1.2 + torch.rand(shape, dtype=dtype)
+    for value in (*optics.reflectances(zenith, index), optics.diffuse_dolp(zenith, index)):
+        assert value.shape == shape
+        assert value.dtype == dtype
+        assert ((value >= 0) & (value <= 1)).all()
+    back = optics.diffuse_zenith(optics.diffuse_dolp(zenith, index), index)
+    assert torch.allclose(back, zenith, atol=0.01)
+
+
+def test_index_must_exceed_one() -> None:
+    with pytest.raises(ValueError, match=r"more than 1, found 1\.0"):
+        optics.reflectances(scalar(0.3), 1.0)
+    with pytest.raises(ValueError, match="refractive index"):
+        optics.specular_zeniths(scalar(0.3), 0.7)
