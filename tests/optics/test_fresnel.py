@@ -56,6 +56,8 @@ def test_grazing_incidence_and_beyond(zenith: float, dtype: torch.dtype) -> None
     for reflectance in optics.reflectances(scalar(zenith, dtype), 1.5):
         assert float(reflectance) == pytest.approx(1.0, abs=8 * torch.finfo(dtype).eps)
         assert float(reflectance) <= 1
+    for transmittance in optics.transmittances(scalar(zenith, dtype), 1.5):
+        assert 0 <= float(transmittance) <= 8 * torch.finfo(dtype).eps
     assert float(optics.specular_dolp(scalar(zenith, dtype), 1.5)) == pytest.approx(0.0, abs=1e-6)
     limit = float(optics.diffuse_dolp_limit(1.5))
     assert limit == pytest.approx(1.25 / 3.25, abs=1e-15)
@@ -126,6 +128,14 @@ def test_inverses_at_the_ends() -> None:
     assert below.tolist() == pytest.approx([0, 0, brewster, brewster], abs=1e-12)
     assert above.tolist() == pytest.approx([grazing, grazing, brewster, brewster], abs=1e-12)
     assert optics.diffuse_zenith(ends, 1.5).tolist() == pytest.approx([0, 0, grazing, grazing], abs=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_diffuse_zenith_never_passes_grazing(dtype: torch.dtype) -> None:
+    index = torch.linspace(1.1, 3.0, 1000, dtype=dtype)
+    assert (
+        optics.diffuse_zenith(torch.ones(1000, dtype=dtype), index) <= torch.tensor(HALF_PI, dtype=dtype)
+    ).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -124,6 +124,11 @@ def test_average_stokes_vectors_never_angles() -> None:
     assert float(optics.aolp(light).mean()) > 1.0
 
 
+def test_luminance_is_the_mean_over_the_colours() -> None:
+    light = torch.tensor([[0.1, 0.2, 0.6], [0.0, 0.1, 0.2], [-0.3, 0.0, 0.0]], dtype=torch.float64)
+    assert optics.luminance(light).tolist() == pytest.approx([0.3, 0.1, -0.1])
+
+
 @given(shape=shapes, dtype=dtypes)
 def test_any_batch_shape_and_dtype(shape: tuple[int, ...], dtype: torch.dtype) -> None:
     torch.manual_seed(0)
