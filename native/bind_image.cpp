@@ -1,2 +1,165 @@
+#include "image.h"
+#include "parallel.h"
+
 #include <nanobind/nanobind.h>
-void bind_image(nanobind::module_ &) {}
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <vector>
+
+namespace nb = nanobind;
+using namespace polarguide;
+
+namespace {
+
+using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
+
+void expect_size(const Array &array, const char *name, int64_t size) {
+    if (int64_t(array.size()) != size)
+        throw std::invalid_argument(std::string(name) + ": expected " + std::to_string(size) + " numbers, found " +
+                                    std::to_string(array.size()));
+}
+
+constexpr int64_t row_chunk = 4, item_chunk = 2048;
+constexpr int maximum_width = 4096;
+
+std::tuple<double, double> photometric(const Array &prediction, const Array &target, std::optional<Array> weight,
+                                       double weight_sum, float ssim_weight, std::optional<Array> gradient) {
+    if (prediction.ndim() != 3 || prediction.shape(2) != 3)
+        throw std::invalid_argument("prediction: expected shape [H, W, 3]");
+    PhotometricArgs a{};
+    a.height = int(prediction.shape(0)), a.width = int(prediction.shape(1));
+    if (a.width > maximum_width) throw std::invalid_argument("prediction: expected a width of at most 4096");
+    const int64_t pixels = int64_t(a.width) * a.height;
+    expect_size(target, "target", pixels * 3);
+    if (weight) expect_size(*weight, "weight", pixels);
+    if (gradient) expect_size(*gradient, "gradient", pixels * 3);
+    nb::gil_scoped_release release;
+    // Planes are read sixteen columns at a time: room behind the last.
+    const int64_t plane = 3 * pixels, room = plane + 16;
+    std::vector<float> memory(size_t(room) * 11, 0.0f);
+    float *next = memory.data();
+    auto take = [&] {
+        float *p = next;
+        next += room;
+        return p;
+    };
+    a.shown = take(), a.slope = take(), a.goal = take();
+    for (float *&p : a.rows) p = take();
+    for (float *&p : a.parts) p = take();
+    std::vector<double> l1(size_t(a.height), 0.0), ssim(size_t(a.height), 0.0);
+    a.row_l1 = l1.data(), a.row_ssim = ssim.data();
+    a.prediction = prediction.data(), a.target = target.data(), a.weight = weight ? weight->data() : nullptr;
+    a.gradient = gradient ? gradient->data() : nullptr;
+    a.ssim_weight = ssim_weight, a.inverse_count = float(1.0 / (3.0 * weight_sum));
+    auto show = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_show)(a, b, e); };
+    auto statistics = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_statistics)(a, b, e); };
+    auto spread = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_spread)(a, b, e); };
+    auto derive = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_gradient)(a, b, e); };
+    parallel_chunks(a.height, row_chunk, show);
+    parallel_chunks(a.height, row_chunk, statistics);
+    if (gradient) {
+        parallel_chunks(a.height, row_chunk, spread);
+        parallel_chunks(a.height, row_chunk, derive);
+    }
+    double sum_l1 = 0.0, sum_ssim = 0.0;
+    for (double x : l1) sum_l1 += x;
+    for (double x : ssim) sum_ssim += x;
+    return {sum_l1 / (3.0 * weight_sum), sum_ssim / (3.0 * weight_sum)};
+}
+
+CubemapArgs cubemap_args(const Array &texture, const Indices &border, const Array &directions) {
+    if (texture.ndim() != 4 || texture.shape(0) != 6 || texture.shape(1) != texture.shape(2))
+        throw std::invalid_argument("texture: expected shape [6, R, R, C]");
+    CubemapArgs a{};
+    a.resolution = int(texture.shape(1)), a.channels = int(texture.shape(3));
+    int64_t side = a.resolution + 2;
+    if (int64_t(border.size()) != 6 * side * side) throw std::invalid_argument("border: expected [6, R + 2, R + 2]");
+    if (directions.ndim() != 2 || directions.shape(1) != 3)
+        throw std::invalid_argument("directions: expected shape [P, 3]");
+    a.texture = texture.data(), a.border = border.data(), a.directions = directions.data();
+    return a;
+}
+
+HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest) {
+    const int64_t n = int64_t(means.shape(0));
+    if (degree < 0 || degree > 3) throw std::invalid_argument("degree: expected 0 to 3");
+    expect_size(means, "means", 3 * n), expect_size(centre, "centre", 3), expect_size(dc, "dc", 3 * n);
+    expect_size(rest, "rest", 45 * n);
+    HarmonicsArgs a{};
+    a.degree = degree, a.means = means.data(), a.centre = centre.data(), a.dc = dc.data(), a.rest = rest.data();
+    return a;
+}
+
+} // namespace
+
+void bind_image(nb::module_ &module) {
+    module.def("photometric", &photometric, nb::arg("prediction"), nb::arg("target"), nb::arg("weight").none(),
+               nb::arg("weight_sum"), nb::arg("ssim_weight"), nb::arg("gradient").none(),
+               "Mean absolute difference and mean SSIM of shown pictures; fills the gradient of their mix.");
+    module.def(
+        "cubemap_forward",
+        [](const Array &texture, const Indices &border, const Array &directions, Array out) {
+            CubemapArgs a = cubemap_args(texture, border, directions);
+            const int64_t count = int64_t(directions.shape(0));
+            expect_size(out, "out", count * a.channels);
+            a.out = out.data();
+            nb::gil_scoped_release release;
+            auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(cubemap_forward)(a, b, e); };
+            parallel_chunks(count, item_chunk, body);
+        },
+        nb::arg("texture"), nb::arg("border"), nb::arg("directions"), nb::arg("out"));
+    module.def(
+        "cubemap_backward",
+        [](const Array &texture, const Indices &border, const Array &directions, const Array &grad_out,
+           std::optional<Array> grad_texture, std::optional<Array> grad_directions) {
+            CubemapArgs a = cubemap_args(texture, border, directions);
+            const int64_t count = int64_t(directions.shape(0));
+            expect_size(grad_out, "grad_out", count * a.channels);
+            a.grad_out = grad_out.data();
+            if (grad_texture) expect_size(*grad_texture, "grad_texture", int64_t(texture.size()));
+            if (grad_directions) expect_size(*grad_directions, "grad_directions", 3 * count);
+            a.grad_texture = grad_texture ? grad_texture->data() : nullptr;
+            a.grad_directions = grad_directions ? grad_directions->data() : nullptr;
+            nb::gil_scoped_release release;
+            auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(cubemap_backward_directions)(a, b, e); };
+            if (grad_directions) parallel_chunks(count, item_chunk, body);
+            if (grad_texture) POLARGUIDE_DISPATCH(cubemap_backward_texture)(a, 0, count); // one thread: one order of sums
+        },
+        nb::arg("texture"), nb::arg("border"), nb::arg("directions"), nb::arg("grad_out"),
+        nb::arg("grad_texture").none(), nb::arg("grad_directions").none());
+    module.def(
+        "harmonics_forward",
+        [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest, Array out) {
+            HarmonicsArgs a = harmonics_args(degree, means, centre, dc, rest);
+            const int64_t n = int64_t(means.shape(0));
+            expect_size(out, "out", 3 * n);
+            a.out = out.data();
+            nb::gil_scoped_release release;
+            auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_forward)(a, b, e); };
+            parallel_chunks(n, item_chunk, body);
+        },
+        nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"));
+    module.def(
+        "harmonics_backward",
+        [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest,
+           const Array &grad_out, Array grad_means, Array grad_dc, Array grad_rest) {
+            HarmonicsArgs a = harmonics_args(degree, means, centre, dc, rest);
+            const int64_t n = int64_t(means.shape(0));
+            expect_size(grad_out, "grad_out", 3 * n), expect_size(grad_means, "grad_means", 3 * n);
+            expect_size(grad_dc, "grad_dc", 3 * n), expect_size(grad_rest, "grad_rest", 45 * n);
+            a.grad_out = grad_out.data(), a.grad_means = grad_means.data(), a.grad_dc = grad_dc.data();
+            a.grad_rest = grad_rest.data();
+            nb::gil_scoped_release release;
+            auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_backward)(a, b, e); };
+            parallel_chunks(n, item_chunk, body);
+        },
+        nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("grad_out"),
+        nb::arg("grad_means"), nb::arg("grad_dc"), nb::arg("grad_rest"));
+}

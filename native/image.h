@@ -1,0 +1,53 @@
+// Kernels of pictures and colours: photometric loss, cubemap look-up, spherical harmonics.
+#pragma once
+#include "kernels.h"
+
+#include <stdint.h>
+
+namespace polarguide {
+
+// Photometric loss of one picture, in passes over rows. Planes are [3][height][width].
+struct PhotometricArgs {
+    int width, height;
+    const float *prediction; // [H,W,3] linear
+    const float *target;     // [H,W,3] shown
+    const float *weight;     // [H,W] or null
+    float ssim_weight, inverse_count; // 1 / (3 * sum of weights)
+    float *shown, *slope;    // planes: sRGB of the clipped prediction; its derivative
+    float *goal;             // planes: target
+    float *rows[5];          // planes: horizontally blurred x, y, xx, yy, xy; then, backward, three of them
+    float *parts[3];         // planes: derivative of the SSIM sum with respect to the mean, xx and xy
+    double *row_l1, *row_ssim; // [height]
+    float *gradient;         // [H,W,3]
+};
+POLARGUIDE_DECLARE(void photometric_show(const PhotometricArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void photometric_statistics(const PhotometricArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void photometric_spread(const PhotometricArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void photometric_gradient(const PhotometricArgs &a, int64_t begin, int64_t end))
+
+// Seamless bilinear look-up. `border` maps (face, row + 1, column + 1), one texel beyond each edge, to a flat texel.
+struct CubemapArgs {
+    int resolution, channels;
+    const float *texture;     // [6,R,R,C]
+    const int32_t *border;    // [6,R+2,R+2]
+    const float *directions;  // [P,3]
+    float *out;               // [P,C]
+    const float *grad_out;    // [P,C]
+    float *grad_directions;   // [P,3]
+    float *grad_texture;      // [6,R,R,C], added to
+};
+POLARGUIDE_DECLARE(void cubemap_forward(const CubemapArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void cubemap_backward_directions(const CubemapArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void cubemap_backward_texture(const CubemapArgs &a, int64_t begin, int64_t end))
+
+struct HarmonicsArgs {
+    int degree;
+    const float *means, *centre, *dc, *rest; // [N,3] [3] [N,3] [N,15,3]
+    float *out;                              // [N,3]
+    const float *grad_out;
+    float *grad_means, *grad_dc, *grad_rest;
+};
+POLARGUIDE_DECLARE(void harmonics_forward(const HarmonicsArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void harmonics_backward(const HarmonicsArgs &a, int64_t begin, int64_t end))
+
+} // namespace polarguide

@@ -1,0 +1,21 @@
+"""``polarguide`` and ``python -m polarguide``."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+# Threads that wait should sleep: torch's OpenMP workers must not fight the kernels' threads for cores by spinning.
+# OpenMP reads this when it is loaded, so it has to be said before torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+from polarguide.cli.app import run
+
+
+def main() -> None:
+    """Entry point of the command line."""
+    sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""The command line: one verb a file, and the one place where errors are printed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import tyro
+from rich.console import Console
+
+from polarguide import __version__
+from polarguide.cli.demo import demo
+from polarguide.cli.evaluate import evaluate
+from polarguide.cli.priors import priors
+from polarguide.cli.render import render_views
+from polarguide.cli.train import train
+from polarguide.errors import PolarguideError
+
+VERBS = {
+    "demo": demo,
+    "train": train,
+    "eval": evaluate,
+    "render": render_views,
+    "priors": priors,
+}
+DESCRIPTION = (
+    "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "
+    "normals and diffuse colour."
+)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input)."""
+    errors = Console(stderr=True, highlight=False, soft_wrap=True)
+    if list(arguments) == ["--version"]:
+        print(f"polarguide {__version__}")
+        return 0
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            VERBS, prog="polarguide", description=DESCRIPTION, args=arguments, sort_subcommands=False
+        )
+    except PolarguideError as error:
+        errors.print("[bold red]error:[/] ", end="")
+        errors.print(str(error), markup=False)
+        return 2
+    except KeyboardInterrupt:
+        errors.print("stopped.")
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+    return 0

@@ -1,0 +1,108 @@
+"""What several verbs share: the console, loading with a progress bar, opening a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from polarguide import _native
+from polarguide.capture import Scene, View, load_scene
+from polarguide.errors import PolarguideError
+from polarguide.raster import Backend, DeviceName, choose_backend
+from polarguide.recipes import RECIPES
+from polarguide.shading.render import render
+from polarguide.shading.result import RenderResult
+from polarguide.training.run import RunConfiguration, load_checkpoint
+from polarguide.training.stages import Recipe
+from polarguide.training.state import TrainingState
+
+Transfer = Literal["linear", "srgb"]
+
+console = Console(highlight=False, soft_wrap=True)
+
+
+def use_threads(threads: int) -> None:
+    """Use this many threads everywhere; 0 leaves the defaults."""
+    if threads < 0:
+        raise PolarguideError("--threads", expected="0 or more", found=str(threads), remedy="Give a count.")
+    if threads:
+        _native.set_thread_count(threads)
+        torch.set_num_threads(threads)
+
+
+def read_scene(path: Path, *, downscale: int, transfer: Transfer) -> Scene:
+    """Load a scene with a progress bar and print its warnings."""
+    if downscale < 1:
+        raise PolarguideError("--downscale", expected="1 or more", found=str(downscale), remedy="Give a whole factor.")
+    with Progress(
+        TextColumn("reading {task.fields[name]}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=console, transient=True,
+    ) as progress:
+        task = progress.add_task("", name=path.name, total=None)
+
+        def report(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        scene = load_scene(path, downscale=downscale, transfer=transfer, progress=report)
+    for warning in scene.warnings:
+        console.print("[yellow]warning:[/] ", end="")
+        console.print(warning, markup=False)
+    return scene
+
+
+def recipe_named(name: str) -> Recipe:
+    """A recipe by name, or a clear error."""
+    if name not in RECIPES:
+        raise PolarguideError(
+            "recipe", expected="one of " + ", ".join(RECIPES), found=name, remedy="Train again with this version."
+        )
+    return RECIPES[name]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenRun:
+    """A trained run with its scene."""
+
+    folder: Path
+    configuration: RunConfiguration
+    scene: Scene
+    recipe: Recipe
+    state: TrainingState
+    backend: Backend
+
+    @torch.no_grad()
+    def render(self, view: View, *, depth: bool = False) -> RenderResult:
+        """All layers of a view."""
+        environment = self.state.environment
+        return render(
+            self.state.rows,
+            view.camera,
+            self.backend.rasterise,
+            environment=environment.texels if environment else None,
+            depth=depth,
+        )
+
+
+def open_run(folder: Path, *, device: DeviceName = "auto") -> OpenRun:
+    """Open a run folder and the scene it was trained on."""
+    configuration = RunConfiguration.load(folder)
+    recipe = recipe_named(configuration.recipe)
+    state = load_checkpoint(folder, recipe)
+    transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
+    scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
+    if scene.digest != configuration.scene_digest:
+        console.print(f"[yellow]warning:[/] {configuration.scene} has changed since {folder} was trained on it.")
+    return OpenRun(folder, configuration, scene, recipe, state, choose_backend(device))
+
+
+def select_views(scene: Scene, choice: str) -> tuple[View, ...]:
+    """The views that ``--views`` names: ``test``, ``train``, ``all``, or names separated by commas."""
+    groups = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}
+    if choice in groups:
+        return groups[choice]
+    return tuple(scene.view(name.strip()) for name in choice.split(",") if name.strip())

@@ -1,0 +1,124 @@
+"""``polarguide render``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.capture import View
+from polarguide.cli.common import OpenRun, console, open_run, select_views, use_threads
+from polarguide.errors import PolarguideError
+from polarguide.evaluation import figures
+from polarguide.raster import DeviceName
+from polarguide.shading.result import RenderResult
+
+Picture = NDArray[np.uint8]
+LAYERS = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth", "alpha")
+SHEET_VIEWS = 8
+
+
+def render_views(
+    run: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    views: str = "test",
+    layers: str = "final,base,reflection,specular,diffuse,strength,normal,depth",
+    out: Path | None = None,
+    device: DeviceName = "auto",
+    threads: int = 0,
+) -> None:
+    """Render a run's layers to PNG, with a contact sheet beside the ground truth.
+
+    specular and diffuse are the contributions that add up to final; normals are in camera space, blue facing the
+    camera.
+
+    Args:
+        run: Run folder.
+        views: test, train, all, or names separated by commas.
+        layers: Any of final, base, reflection, specular, diffuse, strength, normal, depth, alpha.
+        out: Folder to write; RUN/render by default.
+        device: What to compute on.
+        threads: Threads to use; 0 takes all cores.
+    """
+    use_threads(threads)
+    names = [name.strip() for name in layers.split(",") if name.strip()]
+    for name in names:
+        if name not in LAYERS:
+            raise PolarguideError(
+                "--layers", expected="any of " + ", ".join(LAYERS), found=name, remedy="Correct the name."
+            )
+    opened = open_run(run, device=device)
+    render_run(opened, select_views(opened.scene, views), names, out or run / "render")
+
+
+def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out: Path) -> Path:
+    """Write the layers of some views and their contact sheet; returns the sheet's path."""
+    out.mkdir(parents=True, exist_ok=True)
+    if not views:
+        raise PolarguideError("--views", expected="at least one view", found="none", remedy="Name a view.")
+    rows: list[list[Picture | None]] = []
+    labels: list[str] = []
+    missing: set[str] = set()
+    for view in views:
+        result = opened.render(view, depth=True)
+        pictures = {name: layer_picture(result, name, view.camera) for name in layers}
+        for name, picture in pictures.items():
+            if picture is None:
+                missing.add(name)
+            else:
+                figures.write_png(out / f"{view.name}_{name}.png", picture)
+        truth = _truth_pictures(view)
+        if len(rows) < 2 * SHEET_VIEWS:
+            rows.append([pictures[name] for name in layers])
+            rows.append([truth.get(name) for name in layers])
+            labels += [view.name, f"{view.name} true"]
+    sheet = out / "contact_sheet.png"
+    figures.write_png(sheet, figures.contact_sheet(rows, labels, layers))
+    if missing:
+        console.print(f"this recipe has no layer {', '.join(sorted(missing))}")
+    console.print(f"pictures: {out}   contact sheet: {sheet}")
+    return sheet
+
+
+def layer_picture(result: RenderResult, name: str, camera: Camera) -> Picture | None:
+    """One layer as an 8-bit picture, or None where the recipe has no such layer."""
+    values: Tensor | None = getattr(result, name)
+    if values is None:
+        return None
+    draw: dict[str, Callable[[Tensor], Picture]] = {
+        "normal": lambda v: figures.normal_to_rgb(v, camera),
+        "depth": lambda v: _depth_picture(v, result.alpha),
+        "strength": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
+        "alpha": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
+    }
+    return draw.get(name, figures.radiance_to_rgb)(values)
+
+
+def _depth_picture(depth: Tensor, alpha: Tensor) -> Picture:
+    seen = depth[alpha > 0.5]
+    if seen.numel() == 0:
+        return figures.scalar_to_rgb(depth, 0.0, 1.0)
+    near, far = float(seen.quantile(0.02)), float(seen.quantile(0.9))
+    return figures.scalar_to_rgb(depth, near, max(far, near + 1e-6))
+
+
+def _truth_pictures(view: View) -> dict[str, Picture]:
+    pictures = {"final": figures.radiance_to_rgb(view.photograph())}
+    truth = view.truth
+    if truth is None:
+        return pictures
+    if truth.normal is not None:
+        pictures["normal"] = figures.normal_to_rgb(truth.normal, view.camera)
+    for name, layer in (("specular", truth.specular), ("diffuse", truth.diffuse)):
+        if layer is not None:
+            pictures[name] = figures.radiance_to_rgb(layer / 2)
+    if truth.depth is not None and truth.mask is not None:
+        pictures["depth"] = _depth_picture(truth.depth, truth.mask.float())
+    return pictures

@@ -1,0 +1,209 @@
+"""``polarguide train``."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Literal
+
+import tyro
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from polarguide.cli.common import Transfer, console, read_scene, recipe_named, use_threads
+from polarguide.errors import PolarguideError
+from polarguide.export import write_run_ply
+from polarguide.raster import DeviceName, choose_backend
+from polarguide.training.run import (
+    CHECKPOINT,
+    CONFIGURATION,
+    PLY,
+    RunConfiguration,
+    RunLog,
+    load_checkpoint,
+    recipe_data,
+    save_checkpoint,
+)
+from polarguide.training.stopwatch import Stopwatch
+from polarguide.training.trainer import StepReport, Trainer, TrainSettings
+
+RecipeName = Literal["3dgs", "3dgs-dr", "polarguide", "polarguide-paper"]
+LOG_EVERY = 10
+
+
+def train(
+    scene: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    out: Path,
+    recipe: RecipeName = "polarguide",
+    steps: int = 5000,
+    downscale: int = 1,
+    seed: int = 0,
+    refractive_index: float = 1.5,
+    transfer: Transfer = "linear",
+    device: DeviceName = "auto",
+    threads: int = 0,
+    checkpoint_every: int = 500,
+    resume: bool = False,
+) -> None:
+    """Train a recipe on a scene.
+
+    Can be stopped with Ctrl-C at any time: the state is saved, and --resume goes on to the same result.
+
+    Args:
+        scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
+            model in sparse/0.
+        out: Run folder to write (configuration, checkpoint, log, PLY).
+        recipe: Which method: the plain baselines 3dgs and 3dgs-dr ignore polarization.
+        steps: Optimiser steps in all. 3,000 show the scene, 5,000 and more settle it.
+        downscale: Average the pictures over boxes of this many pixels first.
+        seed: Seed of every random draw.
+        refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water.
+        transfer: How the files encode radiance. Polarization needs linear; srgb undoes the display curve of JPEGs.
+        device: What to compute on.
+        threads: Threads to use; 0 takes all cores.
+        checkpoint_every: Steps between two checkpoints: a kill loses at most as many.
+        resume: Go on with the run in --out.
+    """
+    use_threads(threads)
+    for name, value in (("--steps", steps), ("--checkpoint-every", checkpoint_every)):
+        if value < 1:
+            raise PolarguideError(name, expected="1 or more", found=str(value), remedy="Give a positive count.")
+    if not 1.0 < refractive_index < 4.0:
+        raise PolarguideError(
+            "--refractive-index", expected="between 1 and 4", found=str(refractive_index), remedy="1.5 suits most."
+        )
+    _check_out(out, resume)
+    backend = choose_backend(device)
+    loaded = read_scene(scene, downscale=downscale, transfer=transfer)
+    settings = TrainSettings(steps, seed, refractive_index)
+    chosen = recipe_named(recipe)
+    configuration = RunConfiguration(
+        scene=str(scene.resolve()),
+        scene_digest=loaded.digest,
+        recipe=recipe,
+        recipe_data=recipe_data(chosen),
+        settings=settings,
+        downscale=downscale,
+        transfer=transfer,
+        device=str(backend.device),
+    )
+    state = None
+    if resume:
+        _check_same(RunConfiguration.load(out), configuration, out)
+        state = load_checkpoint(out, chosen) if (out / CHECKPOINT).exists() else None
+    out.mkdir(parents=True, exist_ok=True)
+    configuration.save(out)
+    trainer = Trainer(loaded, chosen, settings, backend, state)
+    train_run(trainer, out, checkpoint_every=checkpoint_every)
+    console.print(f"trained: {out}   next: polarguide eval {out}   polarguide render {out}")
+
+
+def _check_out(out: Path, resume: bool) -> None:
+    has_run = (out / CONFIGURATION).exists()
+    if resume and not has_run:
+        raise PolarguideError(
+            out, expected="a run to resume", found="no run.json", remedy="Leave out --resume, or give the right --out."
+        )
+    if not resume and has_run:
+        raise PolarguideError(
+            out, expected="a new folder", found="a run", remedy="Add --resume to go on with it, or give another --out."
+        )
+
+
+def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
+    for field in ("scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer"):
+        a, b = getattr(old, field), getattr(new, field)
+        if a != b:
+            raise PolarguideError(
+                f"{out}/{CONFIGURATION} ({field})",
+                expected=json.dumps(a, default=str)[:120],
+                found=json.dumps(b, default=str)[:120],
+                remedy="Resume with the same scene, flags and program version, or train into a new folder.",
+            )
+
+
+class _Interrupt:
+    """Turns the first Ctrl-C (or SIGTERM) into a flag that the loop looks at between two steps."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._old = {s: signal.signal(s, self._ask) for s in (signal.SIGINT, signal.SIGTERM)}
+
+    def _ask(self, number: int, _: FrameType | None) -> None:
+        if self.asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def restore(self) -> None:
+        """Put the previous handlers back."""
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+
+def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int) -> None:
+    """Train to the end with progress, checkpoints and a log; then write the PLY."""
+    log = RunLog(out)
+    log.cut(trainer.state.step)
+    stopwatch = Stopwatch(*log.elapsed())
+    interrupt = _Interrupt()
+    try:
+        with _progress() as progress:
+            task = progress.add_task("", total=trainer.settings.steps, completed=trainer.state.step, note="")
+            meter = _Meter(progress, task, log, stopwatch)
+            while trainer.state.step < trainer.settings.steps and not interrupt.asked:
+                meter.show(trainer.step())
+                if trainer.state.step % checkpoint_every == 0:
+                    with stopwatch.paused():
+                        save_checkpoint(out, trainer.state)
+        save_checkpoint(out, trainer.state)
+        if interrupt.asked:
+            console.print(f"stopped after step {trainer.state.step}; go on with the same command and --resume")
+            raise KeyboardInterrupt
+    finally:
+        interrupt.restore()
+    write_run_ply(out / PLY, trainer.state)
+
+
+def _progress() -> Progress:
+    return Progress(
+        BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn(), console=console
+    )
+
+
+class _Meter:
+    """Smooths what the steps report, shows it, and writes every tenth into the log."""
+
+    def __init__(self, progress: Progress, task: TaskID, log: RunLog, stopwatch: Stopwatch) -> None:
+        self._progress, self._task, self._log, self._stopwatch = progress, task, log, stopwatch
+        self._loss = self._psnr = math.nan
+        self._began, self._first = time.perf_counter(), -1
+
+    def show(self, report: StepReport) -> None:
+        """Take one step's report."""
+        if self._first < 0:
+            self._first = report.step
+        keep = 0.98
+        self._loss = report.loss if math.isnan(self._loss) else keep * self._loss + (1 - keep) * report.loss
+        self._psnr = report.psnr if math.isnan(self._psnr) else keep * self._psnr + (1 - keep) * report.psnr
+        rate = (report.step + 1 - self._first) / max(1e-9, time.perf_counter() - self._began)
+        note = (
+            f"{report.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  "
+            f"{report.gaussians:,} Gaussians  {rate:.1f} it/s"
+        )
+        self._progress.update(self._task, completed=report.step + 1, note=note)
+        if (report.step + 1) % LOG_EVERY == 0:
+            seconds, alone = self._stopwatch.read()
+            self._log.append(
+                step=report.step,
+                stage=report.stage,
+                loss=round(report.loss, 6),
+                psnr=round(report.psnr, 3),
+                gaussians=report.gaussians,
+                seconds=round(seconds, 3),
+                alone=alone,
+            )

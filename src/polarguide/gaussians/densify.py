@@ -1,0 +1,110 @@
+"""Adaptive density control (Kerbl et al. 2023, Sec. 5.2): clone, split and prune, and the statistics they need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from polarguide.gaussians.rows import GaussianRows
+from polarguide.raster.reference import quaternions_to_rotations
+
+
+@dataclass(frozen=True)
+class Densification:
+    """Thresholds of the density control.
+
+    Attributes:
+        every: steps between two rounds.
+        gradient: mean gradient of the loss with respect to the projected mean, in units of half a picture, above
+            which a Gaussian is cloned or split.
+        dense_share: a Gaussian wider than this share of the scene's extent is split, a smaller one cloned.
+        minimum_opacity: below it a Gaussian is pruned.
+        maximum_scale_share: wider than this share of the extent is pruned once opacities have been reset; far
+            surroundings are exempt in proportion to their distance.
+        limit: no more Gaussians than this.
+    """
+
+    every: int = 100
+    gradient: float = 2e-4
+    dense_share: float = 0.01
+    minimum_opacity: float = 0.005
+    maximum_scale_share: float = 0.1
+    limit: int = 3_000_000
+
+
+class DensityStatistics:
+    """Sums of the screen-space gradient norms over the steps in which each Gaussian was seen."""
+
+    def __init__(self, count: int) -> None:
+        self.gradient = torch.zeros(count)
+        self.seen = torch.zeros(count)
+
+    def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Count one picture. screen_gradient: [N, 2] per pixel; it is taken to units of half a picture."""
+        half_picture = torch.tensor([width / 2, height / 2])
+        self.gradient += (screen_gradient * half_picture).norm(dim=1)
+        self.seen += (radii > 0).to(self.seen)
+
+    def mean(self) -> Tensor:
+        """Mean gradient norm, [N]; 0 where never seen."""
+        return self.gradient / self.seen.clamp(min=1)
+
+    def clear(self, count: int) -> None:
+        """Start again with ``count`` Gaussians."""
+        self.gradient = torch.zeros(count)
+        self.seen = torch.zeros(count)
+
+
+@torch.no_grad()
+def densify(
+    rows: GaussianRows,
+    statistics: DensityStatistics,
+    settings: Densification,
+    *,
+    extent: float,
+    middle: Tensor,
+    prune_large: bool,
+    generator: torch.Generator,
+) -> None:
+    """One round: clone small Gaussians that pull hard, split large ones, prune the transparent and the huge.
+
+    Args:
+        extent: the scene's extent (``scene_extent``). middle: [3], the cameras' mean position.
+        prune_large: also prune the huge ones (after the first opacity reset).
+        generator: draws the positions of the split ones' children.
+    """
+    pulled = statistics.mean() >= settings.gradient
+    wide = rows["log_scales"].exp().amax(dim=1) > settings.dense_share * extent
+    room = max(0, settings.limit - len(rows))
+    if int(pulled.sum()) > room:
+        strongest = statistics.mean().argsort(descending=True)[:room]
+        pulled = torch.zeros_like(pulled)
+        pulled[strongest] = True
+    clone, split = pulled & ~wide, pulled & wide
+    children = _children(rows, split, generator)
+    clones = {name: rows[name].detach()[clone] for name in rows.names}
+    rows.append({name: torch.cat((clones[name], children[name])) for name in rows.names})
+    added = len(rows) - len(split)
+    rows.keep(torch.cat((~split, torch.ones(added, dtype=torch.bool))))
+    opacity = torch.sigmoid(rows["opacity_logits"])
+    doomed = opacity < settings.minimum_opacity
+    if prune_large:
+        distance = (rows["means"] - middle).norm(dim=1)
+        allowed = settings.maximum_scale_share * torch.maximum(distance, torch.tensor(extent))
+        doomed |= rows["log_scales"].exp().amax(dim=1) > allowed
+    if bool(doomed.all()):
+        doomed[opacity.argmax()] = False
+    rows.keep(~doomed)
+    statistics.clear(len(rows))
+
+
+def _children(rows: GaussianRows, split: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+    """Two children for each split Gaussian: drawn from it, 1.6 times smaller."""
+    values = {name: rows[name].detach()[split].repeat(2, *[1] * (rows[name].ndim - 1)) for name in rows.names}
+    offsets = torch.randn(values["means"].shape, generator=generator) * values["log_scales"].exp()
+    rotations = quaternions_to_rotations(values["quaternions"])
+    values["means"] = values["means"] + (rotations @ offsets[..., None])[..., 0]
+    values["log_scales"] = values["log_scales"] - torch.log(torch.tensor(1.6))
+    return values

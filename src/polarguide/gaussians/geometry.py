@@ -1,0 +1,25 @@
+"""What a Gaussian's shape says: its normal, and its values on the scale they are used."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+
+def shortest_axis_normals(means: Tensor, quaternions: Tensor, log_scales: Tensor, centre: Tensor) -> Tensor:
+    """Unit normals of flat Gaussians: the axis of the smallest scale, turned to face the camera.
+
+    Args:
+        means: [N, 3]. quaternions: [N, 4] (w, x, y, z), any length. log_scales: [N, 3]. centre: [3] camera centre.
+
+    Returns:
+        [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
+    """
+    q = normalize(quaternions, dim=-1, eps=1e-12)
+    axis = torch.nn.functional.one_hot(log_scales.detach().argmin(dim=-1), 3).to(q)
+    w, u = q[:, :1], q[:, 1:]
+    cross = torch.linalg.cross(u, axis)
+    normals = axis + 2 * (w * cross + torch.linalg.cross(u, cross))
+    facing = ((centre.to(means) - means.detach()) * normals.detach()).sum(dim=-1, keepdim=True)
+    return torch.where(facing >= 0, normals, -normals)

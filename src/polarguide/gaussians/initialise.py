@@ -1,0 +1,89 @@
+"""First Gaussians: on the SfM points, and where SfM has no points (inside the capture's space and far around it)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class Initialisation:
+    """How many Gaussians are added to the SfM points.
+
+    Attributes:
+        inside: random ones within the sphere that the cameras and the middle of the points span.
+        shell: ones on far shells around it, for surroundings that SfM does not triangulate.
+        shell_radii: nearest and farthest shell, in units of that sphere's radius.
+        opacity: first opacity of all.
+    """
+
+    inside: int = 4000
+    shell: int = 4000
+    shell_radii: tuple[float, float] = (3.0, 12.0)
+    opacity: float = 0.1
+
+
+def scene_extent(centres: Tensor) -> float:
+    """1.1 times the largest distance of a camera from the cameras' mean (Kerbl et al. 2023). centres: [V, 3]."""
+    return 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
+
+
+def neighbour_distance(points: np.ndarray) -> np.ndarray:
+    """Root mean squared distance of each point [M, 3] to its three nearest neighbours, [M]."""
+    neighbours = min(4, len(points))
+    distance, _ = cKDTree(points).query(points, k=neighbours)
+    distance = np.asarray(distance).reshape(len(points), -1)[:, 1:]
+    if distance.shape[1] == 0:
+        return np.full(len(points), 0.01)
+    return np.sqrt((distance**2).mean(axis=1)).clip(min=1e-7)
+
+
+def initial_rows(
+    points: Tensor, colours: Tensor, centres: Tensor, settings: Initialisation, *, seed: int
+) -> dict[str, Tensor]:
+    """The rows to begin with.
+
+    Args:
+        points: [M, 3] SfM points.
+        colours: [M, 3] linear colours in [0, 1].
+        centres: [V, 3] camera centres.
+        settings: how many are added.
+        seed: of the random positions and orientations.
+
+    Returns:
+        The tensors of ``CORE_ROWS``, float32.
+    """
+    random = np.random.default_rng(seed)
+    sfm = points.double().numpy()
+    cameras = centres.double().numpy()
+    middle = np.median(sfm, axis=0)
+    radius = float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
+    directions = random.normal(size=(settings.inside + settings.shell, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    reach = radius * random.random(settings.inside) ** (1 / 3)
+    near, far = (radius * r for r in settings.shell_radii)
+    # Evenly spaced in 1/distance, as parallax is.
+    away = 1 / (1 / near + (1 / far - 1 / near) * random.random(settings.shell))
+    added = middle + directions * np.concatenate((reach, away))[:, None]
+    means = np.concatenate((sfm, added))
+    grey = colours.double().mean(dim=0, keepdim=True).numpy() if len(sfm) else np.full((1, 3), 0.5)
+    rgb = np.concatenate((colours.double().numpy(), np.repeat(grey, len(added), axis=0)))
+    # Each kind measures its spacing among its own: a shell Gaussian must not shrink because SfM points are dense.
+    parts = (sfm, added[: settings.inside], added[settings.inside :])
+    spacing = np.concatenate([neighbour_distance(part) for part in parts if len(part)])
+    count = len(means)
+    rows = {
+        "means": means,
+        "quaternions": random.normal(size=(count, 4)),
+        "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1),
+        "opacity_logits": np.full(count, np.log(settings.opacity / (1 - settings.opacity))),
+        "sh_dc": (rgb - 0.5) / SH_C0,
+        "sh_rest": np.zeros((count, 15, 3)),
+    }
+    return {name: torch.from_numpy(values).float() for name, values in rows.items()}

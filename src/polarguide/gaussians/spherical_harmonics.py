@@ -1,0 +1,96 @@
+"""Real spherical harmonics to degree 3, in the order and with the signs of the 3DGS release."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import normalize
+
+from polarguide import _native
+
+SH_C0 = 0.28209479177387814
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """The basis functions at unit directions [..., 3]: [..., (degree + 1)^2], degree 0 to 3."""
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, SH_C0)]
+    if degree > 0:
+        basis += [-_C1 * y, _C1 * z, -_C1 * x]
+    xx, yy, zz = x * x, y * y, z * z
+    if degree > 1:
+        basis += [
+            _C2[0] * x * y,
+            _C2[1] * y * z,
+            _C2[2] * (2 * zz - xx - yy),
+            _C2[3] * x * z,
+            _C2[4] * (xx - yy),
+        ]
+    if degree > 2:
+        basis += [
+            _C3[0] * y * (3 * xx - yy),
+            _C3[1] * x * y * z,
+            _C3[2] * y * (4 * zz - xx - yy),
+            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            _C3[4] * x * (4 * zz - xx - yy),
+            _C3[5] * z * (xx - yy),
+            _C3[6] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def evaluate_sh_reference(means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
+    """The slow twin of ``evaluate_sh``: plain torch, any dtype and device."""
+    basis = sh_basis(normalize(means - centre, dim=-1, eps=1e-12), degree)
+    coefficients = torch.cat((dc[:, None], rest), dim=1)[:, : basis.shape[-1]]
+    return (basis[..., None] * coefficients).sum(dim=1)
+
+
+class _Harmonics(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
+        inputs = [t.detach().contiguous() for t in (means, centre, dc, rest)]
+        out = torch.empty_like(inputs[2])
+        _native.harmonics_forward(degree, *inputs, out)
+        ctx.save_for_backward(*inputs)
+        ctx.degree = degree
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        means, centre, dc, rest = ctx.saved_tensors
+        to_means, to_dc, to_rest = (torch.empty_like(t) for t in (means, dc, rest))
+        _native.harmonics_backward(ctx.degree, means, centre, dc, rest, grad.contiguous(), to_means, to_dc, to_rest)
+        return to_means, None, to_dc, to_rest, None
+
+
+def evaluate_sh(means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
+    """Sum of the harmonics towards each Gaussian (without the 0.5 that 3DGS adds to a colour).
+
+    Args:
+        means: [N, 3]. centre: [3] camera centre; the direction is from it to the mean.
+        dc: [N, 3] and rest: [N, 15, 3], coefficients of degree 0 and of degrees 1 to 3.
+        degree: 0 to 3; coefficients beyond it count as zero and get no gradient.
+
+    Returns:
+        [N, 3], differentiable in means, dc and rest.
+    """
+    if means.device.type == "cpu" and means.dtype == torch.float32:
+        result: Tensor = _Harmonics.apply(means, centre, dc, rest, degree)
+        return result
+    return evaluate_sh_reference(means, centre, dc, rest, degree)

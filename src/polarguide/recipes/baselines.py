@@ -1,0 +1,45 @@
+"""The baselines: 3DGS (Kerbl et al. 2023) and 3DGS-DR (Ye et al. 2024)."""
+
+from __future__ import annotations
+
+from polarguide.training.stages import Recipe, Repeat, Stage
+
+# Learning rates of the 3DGS release; that of the means is times the scene's extent.
+RATES_3DGS = {
+    "means": 1.6e-4,
+    "sh_dc": 2.5e-3,
+    "sh_rest": 2.5e-3 / 20,
+    "opacity_logits": 0.05,
+    "log_scales": 5e-3,
+    "quaternions": 1e-3,
+}
+RATES_REFLECTION = {**RATES_3DGS, "strength_logits": 6e-3}
+
+# 3,000 of 30,000 steps in the release; in short trainings a reset needs time to heal.
+RESET = Repeat("reset_opacity", fraction=0.1, minimum=700)
+
+RECIPE_3DGS = Recipe(
+    name="3dgs",
+    about="Plain 3D Gaussian splatting: no reflection, no polarization.",
+    stages=(
+        Stage("densify", 0.5, reflection=False, densify=True, repeats=(RESET,)),
+        Stage("refine", 0.5, reflection=False),
+    ),
+    rates=RATES_3DGS,
+)
+
+PROPAGATE = Repeat("propagate_normals", fraction=1 / 61, minimum=200)
+RESET_DR = Repeat("reset_opacity", fraction=3 / 61, minimum=700)
+
+RECIPE_3DGS_DR = Recipe(
+    name="3dgs-dr",
+    about="3DGS with deferred reflection and normal propagation: RGB alone.",
+    stages=(
+        Stage("plain", 0.1, reflection=False, densify=True),
+        Stage("propagate", 0.3, reflection=True, densify=True, repeats=(RESET_DR, PROPAGATE)),
+        Stage("densify", 0.1, reflection=True, densify=True),
+        Stage("refine", 0.5, reflection=True),
+    ),
+    rates=RATES_REFLECTION,
+    sh_fractions=(10 / 61, 11 / 61, 12 / 61),
+)

@@ -1,0 +1,112 @@
+"""From Gaussians to layers: one splat of the G-buffer, then deferred reflection per pixel (Ye et al. 2024)."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from polarguide.camera import Camera
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.gaussians.spherical_harmonics import evaluate_sh
+from polarguide.raster.interface import Rasterise, ScreenStatistic
+from polarguide.shading.cubemap import cubemap_lookup
+from polarguide.shading.result import RenderResult
+
+COLOUR_CHANNELS = (0, 1, 2)
+
+
+class Rows(Protocol):
+    """Named per-Gaussian tensors: the trainable rows, or a frozen copy of them."""
+
+    def __getitem__(self, name: str, /) -> Tensor: ...
+    def __contains__(self, name: object, /) -> bool: ...
+
+
+def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
+    """Linear base colours [N, 3] towards a camera centre [3], not negative."""
+    sh = evaluate_sh(rows["means"], centre, rows["sh_dc"], rows["sh_rest"], sh_degree)
+    return (sh + 0.5).clamp(min=0)
+
+
+def mirrored(rays: Tensor, normals: Tensor) -> Tensor:
+    """Directions of rays [..., 3] after reflection at unit normals [..., 3]."""
+    return rays - 2 * (rays * normals).sum(dim=-1, keepdim=True) * normals
+
+
+def reflect(base: Tensor, normal: Tensor, strength: Tensor, environment: Tensor, camera: Camera) -> dict[str, Tensor]:
+    """Deferred reflection: final = (1 - r) base + r sigmoid(environment(mirrored ray)) (Ye et al. 2024, Eq. 5).
+
+    Args:
+        base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
+
+    Returns:
+        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
+    """
+    rays = camera.world_rays(dtype=base.dtype, device=base.device)
+    directions = mirrored(rays, normalize(normal, dim=-1, eps=1e-3))
+    reflection = torch.sigmoid(cubemap_lookup(environment, directions.reshape(-1, 3)).reshape(base.shape))
+    specular = strength[..., None] * reflection
+    diffuse = (1 - strength[..., None]) * base
+    return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": reflection}
+
+
+def render(
+    rows: Rows,
+    camera: Camera,
+    rasterise: Rasterise,
+    *,
+    sh_degree: int = 3,
+    environment: Tensor | None = None,
+    normals: bool = True,
+    depth: bool = False,
+    statistic: ScreenStatistic | None = None,
+) -> RenderResult:
+    """Render one view.
+
+    Args:
+        rows: the Gaussians; with ``strength_logits`` when there is an environment.
+        sh_degree: SH degree of the base colour, 0 to 3.
+        environment: [6, R, R, 3] raw texels of the learned environment; None: no reflection.
+        normals: also splat normals (always done with an environment).
+        depth: also splat camera depth.
+        statistic: see ``ScreenStatistic``; the colour channels come first.
+    """
+    centre = camera.centre.to(rows["means"])
+    channels = [base_colours(rows, centre, sh_degree)]
+    if normals or environment is not None:
+        channels.append(shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], centre))
+    if environment is not None:
+        channels.append(torch.sigmoid(rows["strength_logits"])[:, None])
+    if depth:
+        axis = camera.rotation[2].to(rows["means"])
+        channels.append(((rows["means"] - centre) @ axis)[:, None])
+    picture = rasterise(
+        rows["means"],
+        rows["quaternions"],
+        rows["log_scales"].exp(),
+        torch.sigmoid(rows["opacity_logits"]),
+        torch.cat(channels, dim=1),
+        camera,
+        statistic=statistic,
+    )
+    base = picture.features[..., :3]
+    normal = picture.features[..., 3:6] if normals or environment is not None else None
+    strength = picture.features[..., 6] if environment is not None else None
+    layers = {"final": base}
+    if environment is not None and normal is not None and strength is not None:
+        layers = reflect(base, normal, strength, environment, camera)
+    return RenderResult(
+        final=layers["final"],
+        specular=layers.get("specular"),
+        diffuse=layers.get("diffuse"),
+        base=base,
+        reflection=layers.get("reflection"),
+        strength=strength,
+        normal=normal,
+        depth=picture.features[..., -1] / picture.alpha.clamp(min=1e-6) if depth else None,
+        alpha=picture.alpha,
+        radii=picture.radii,
+    )

@@ -1,0 +1,36 @@
+"""The one render result, the same in every stage and recipe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class RenderResult:
+    """All layers of one view. Radiance is linear, on the scale of S0/2; [H, W, 3] unless said otherwise.
+
+    Attributes:
+        final: the picture; ``specular + diffuse``.
+        specular: what reflection adds to it; None for a recipe without reflection.
+        diffuse: what the base colour adds to it; None for a recipe without reflection.
+        base: blended base colour.
+        reflection: the environment seen along the mirrored ray; None without reflection.
+        strength: [H, W] reflection strength in [0, 1]; None without reflection.
+        normal: blended normal in world axes, not normalised; None where the stage does not splat it.
+        depth: [H, W] expected camera depth over alpha; None where not asked for.
+        alpha: [H, W] in [0, 1].
+        radii: [N] pixels, of the projected Gaussians; 0 where culled.
+    """
+
+    final: Tensor
+    specular: Tensor | None
+    diffuse: Tensor | None
+    base: Tensor
+    reflection: Tensor | None
+    strength: Tensor | None
+    normal: Tensor | None
+    depth: Tensor | None
+    alpha: Tensor
+    radii: Tensor

@@ -1,0 +1,51 @@
+"""What recipes can make happen between steps: resets and the normal propagation of 3DGS-DR."""
+
+from __future__ import annotations
+
+import torch
+
+from polarguide.training.stages import Propagation
+from polarguide.training.state import TrainingState
+
+RESET_OPACITY = 0.01
+RESET_STRENGTH = 1e-3
+# Steps for which opacities do not train after a propagation (Ye et al. 2024, release).
+OPACITY_REST = 200
+
+
+def _logit(value: float) -> float:
+    return float(torch.logit(torch.tensor(value, dtype=torch.float64)))
+
+
+@torch.no_grad()
+def reset_opacity(state: TrainingState) -> None:
+    """Opacities down to at most 0.01, so that what is not needed stays transparent (Kerbl et al. 2023)."""
+    rows = state.rows
+    rows.overwrite("opacity_logits", rows["opacity_logits"].clamp(max=_logit(RESET_OPACITY)))
+    if "strength_logits" in rows:
+        rows.overwrite("strength_logits", rows["strength_logits"].clamp(min=_logit(RESET_STRENGTH)))
+    state.opacity_was_reset = True
+
+
+@torch.no_grad()
+def propagate_normals(state: TrainingState, settings: Propagation, generator: torch.Generator, rest: int) -> None:
+    """Let Gaussians with a right normal take over their neighbourhood (Ye et al. 2024, Sec. 3.3).
+
+    Opacities rise, matt Gaussians get noise on their colour (which hides what they explain by colour alone), and
+    glossy ones grow along their surface.
+    """
+    rows = state.rows
+    strength = torch.sigmoid(rows["strength_logits"])
+    rows.overwrite("opacity_logits", rows["opacity_logits"].clamp(min=_logit(settings.opacity)))
+    noise = (torch.rand(rows["sh_dc"].shape, generator=generator) * 2 - 1) * settings.colour_noise
+    matt = (strength <= settings.matt)[:, None]
+    # The release adds the noise to the SH coefficient itself; so do we.
+    rows.overwrite("sh_dc", rows["sh_dc"] + torch.where(matt, noise, torch.zeros_like(noise)))
+    scales = rows["log_scales"]
+    longer = torch.ones_like(scales).scatter(1, scales.argmin(dim=1, keepdim=True), 0.0)
+    grow = (strength >= settings.glossy)[:, None] * longer * torch.log(torch.tensor(settings.widen))
+    rows.overwrite("log_scales", scales + grow)
+    state.opacity_frozen_until = state.step + rest
+
+
+__all__ = ["OPACITY_REST", "propagate_normals", "reset_opacity"]

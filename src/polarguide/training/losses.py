@@ -1,0 +1,71 @@
+"""The loss of one step: each term a small function, summed by a stage's weights."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from polarguide.shading.result import RenderResult
+from polarguide.training.photometric import photometric_loss
+from polarguide.training.priors import ViewPriors
+from polarguide.training.stages import Weights
+
+
+def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
+    """Mean of 1 - cos(normal, target) over the weighted pixels (the paper's normal term).
+
+    Args:
+        normal: [H, W, 3] blended normals, world axes, any length.
+    """
+    cosine = (normalize(normal, dim=-1, eps=1e-2) * priors.normal).sum(dim=-1)
+    return ((1 - cosine) * priors.weight).sum() / priors.weight.sum().clamp(min=1)
+
+
+def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
+    """Mean distance of the normal from the plane of incidence that the AoLP names, |n . e|.
+
+    Unlike the zenith of a pure-lobe inversion, the plane does not depend on the index or on how lobes mix.
+    """
+    distance = (normalize(normal, dim=-1, eps=1e-2) * priors.plane).sum(dim=-1).abs()
+    return (distance * priors.weight).sum() / priors.weight.sum().clamp(min=1)
+
+
+def step_loss(
+    result: RenderResult,
+    shown: Tensor,
+    valid: Tensor | None,
+    weights: Weights,
+    priors: ViewPriors | None,
+    *,
+    ssim_weight: float,
+) -> tuple[Tensor, Tensor]:
+    """The weighted sum of a stage's terms, and its photometric term alone (for the display).
+
+    Args:
+        result: the rendered layers.
+        shown: [H, W, 3] the photograph as shown (sRGB).
+        valid: [H, W] 1 where the photograph counts; None: everywhere.
+        weights: of the stage.
+        priors: of the view; needed where a weight asks for them.
+        ssim_weight: lambda of the image terms.
+    """
+    photometric = photometric_loss(result.final, shown, valid, ssim_weight)
+    total = weights.photometric * photometric
+    if priors is None:
+        return total, photometric
+    if weights.specular and result.specular is not None:
+        total = total + weights.specular * photometric_loss(
+            result.specular, priors.specular, priors.separated, ssim_weight
+        )
+    if weights.diffuse and result.diffuse is not None:
+        total = total + weights.diffuse * photometric_loss(
+            result.diffuse, priors.diffuse, priors.separated, ssim_weight
+        )
+    if weights.normal and result.normal is not None:
+        total = total + weights.normal * normal_loss(result.normal, priors)
+    if weights.azimuth and result.normal is not None:
+        total = total + weights.azimuth * azimuth_loss(result.normal, priors)
+    if not torch.isfinite(total):
+        raise FloatingPointError("the loss is not finite")
+    return total, photometric

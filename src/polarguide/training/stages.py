@@ -1,0 +1,199 @@
+"""Recipes are data: a list of stages, each saying what is rendered, what is compared, and what happens when.
+
+Nothing in the loop compares a step with a constant: boundaries are fractions of the total number of steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from polarguide.gaussians.densify import Densification
+from polarguide.gaussians.initialise import Initialisation
+
+Action = Literal[
+    "reset_opacity",
+    "propagate_normals",
+    "refresh_priors",
+]
+Candidates = Literal["paper", "physical"]
+Separation = Literal["paper", "exact"]
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """Something that happens every so often.
+
+    Attributes:
+        action: what.
+        fraction: of all steps, the distance between two of them.
+        minimum: never closer than this many steps.
+    """
+
+    action: Action
+    fraction: float
+    minimum: int = 1
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the loss terms; a term with weight 0 is not computed.
+
+    Attributes:
+        photometric: final picture against S0/2.
+        specular, diffuse: the two contributions against the separated pictures.
+        normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
+        azimuth: squared distance of the normal from the plane of incidence that the AoLP names (azimuth alone).
+    """
+
+    photometric: float = 1.0
+    specular: float = 0.0
+    diffuse: float = 0.0
+    normal: float = 0.0
+    azimuth: float = 0.0
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One phase of training.
+
+    Attributes:
+        name: shown while it runs.
+        fraction: its share of all steps.
+        reflection: whether the picture is shaded with deferred reflection.
+        weights: of the losses.
+        densify: whether the density control runs.
+        repeats: what happens every so often in it.
+        on_enter: what happens at its first step.
+    """
+
+    name: str
+    fraction: float
+    reflection: bool
+    weights: Weights = field(default_factory=Weights)
+    densify: bool = False
+    repeats: tuple[Repeat, ...] = ()
+    on_enter: tuple[Action, ...] = ()
+
+
+@dataclass(frozen=True)
+class Priors:
+    """How polarization priors are computed from the frozen Gaussians.
+
+    Attributes:
+        candidates: which polarization normals are considered.
+        separation: which separation supervises the layers.
+        threshold: DoLP above which a pixel's normal is used.
+        azimuth_weight: in [0, 1], how much the choice among candidates trusts azimuth over zenith.
+    """
+
+    candidates: Candidates = "physical"
+    separation: Separation = "exact"
+    threshold: float = 0.05
+    azimuth_weight: float = 0.5
+
+
+@dataclass(frozen=True)
+class Propagation:
+    """Normal propagation of 3DGS-DR (Ye et al. 2024, Sec. 3.3).
+
+    Attributes:
+        opacity: opacities are raised to at least this.
+        colour_noise: half-width of the noise on the base colour where strength is at most ``matt``.
+        matt, glossy: strengths that bound the two kinds of Gaussian.
+        widen: factor on the two longer scales where strength is at least ``glossy``.
+    """
+
+    opacity: float = 0.9
+    colour_noise: float = 0.4
+    matt: float = 0.05
+    glossy: float = 0.02
+    widen: float = 1.5
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that tells one method from another.
+
+    Attributes:
+        name: as given to ``--recipe``.
+        about: one line.
+        stages: in order; their fractions add up to 1.
+        rates: learning rates; that of the means is times the scene's extent.
+        means_decay: factor on the means' rate at the last step (exponential in between).
+        environment_rate: learning rate of the environment's texels.
+        environment_resolution: texels along a cube face's side.
+        sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
+        ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
+    """
+
+    name: str
+    about: str
+    stages: tuple[Stage, ...]
+    rates: dict[str, float]
+    means_decay: float = 0.01
+    environment_rate: float = 0.05
+    environment_resolution: int = 128
+    sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
+    ssim_weight: float = 0.2
+    densification: Densification = Densification()
+    initialisation: Initialisation = Initialisation()
+    priors: Priors = Priors()
+    propagation: Propagation = Propagation()
+
+    @property
+    def reflects(self) -> bool:
+        """Whether any stage has reflection (then Gaussians carry a strength)."""
+        return any(stage.reflection for stage in self.stages)
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a step lies: its stage, and which actions are due before it.
+
+    Attributes:
+        stage: the stage.
+        actions: due now, in order.
+    """
+
+    stage: Stage
+    actions: tuple[Action, ...]
+
+
+class Schedule:
+    """The stages of a recipe laid over a number of steps."""
+
+    def __init__(self, recipe: Recipe, steps: int) -> None:
+        self.recipe = recipe
+        self.steps = steps
+        self._starts: list[int] = []
+        share = 0.0
+        for stage in recipe.stages:
+            self._starts.append(round(share * steps))
+            share += stage.fraction
+        if abs(share - 1) > 1e-6:
+            raise ValueError(f"stages of {recipe.name} cover {share:.6f} of the steps, not 1")
+
+    def at(self, step: int) -> Position:
+        """The stage of a step (0-based) and the actions due before it."""
+        index = max(i for i, start in enumerate(self._starts) if start <= step)
+        stage, since = self.recipe.stages[index], step - self._starts[index]
+        if since == 0:
+            return Position(stage, stage.on_enter)
+        due = [r.action for r in stage.repeats if since % self.period(r) == 0]
+        # An opacity reset and a propagation would undo each other: the reset wins, as in the release.
+        if "reset_opacity" in due:
+            due = [a for a in due if a != "propagate_normals"]
+        return Position(stage, tuple(due))
+
+    def period(self, repeat: Repeat) -> int:
+        """Steps between two occurrences."""
+        return max(repeat.minimum, round(repeat.fraction * self.steps))
+
+    def sh_degree(self, step: int) -> int:
+        """SH degree in use at a step."""
+        return sum(step >= f * self.steps for f in self.recipe.sh_fractions)
+
+    def means_rate(self, step: int) -> float:
+        """Learning rate of the means at a step, before the scene's extent."""
+        return self.recipe.rates["means"] * self.recipe.means_decay ** (step / max(1, self.steps - 1))

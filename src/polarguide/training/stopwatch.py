@@ -1,0 +1,54 @@
+"""Training time, and whether the machine worked for anybody else meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator
+
+# Share of one core that others may use before a time is no longer worth quoting.
+FOREIGN_SHARE = 0.10
+
+
+def machine_busy_seconds() -> float | None:
+    """Processor seconds that the whole machine has been busy, or None where the system does not tell."""
+    try:
+        with open("/proc/stat") as file:
+            fields = [int(x) for x in file.readline().split()[1:]]
+    except (OSError, ValueError):
+        return None
+    user, nice, system, _, _, irq, softirq, *rest = fields
+    steal = rest[0] if rest else 0
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+
+
+class Stopwatch:
+    """Adds up wall time, and compares the machine's busy time with this process's own.
+
+    Args:
+        seconds: time already spent (before a resume). alone: whether that was spent alone.
+    """
+
+    def __init__(self, seconds: float = 0.0, alone: bool = True) -> None:
+        self._before, self._alone = seconds, alone
+        self._pause = 0.0
+        self._start = time.perf_counter()
+        self._own, self._machine = time.process_time(), machine_busy_seconds()
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Time inside does not count."""
+        begin = time.perf_counter()
+        yield
+        self._pause += time.perf_counter() - begin
+
+    def read(self) -> tuple[float, bool]:
+        """Seconds so far, and whether nothing else of weight ran beside."""
+        wall = time.perf_counter() - self._start
+        machine = machine_busy_seconds()
+        alone = self._alone and machine is not None and self._machine is not None
+        if alone and machine is not None and self._machine is not None:
+            foreign = (machine - self._machine) - (time.process_time() - self._own)
+            alone = foreign <= FOREIGN_SHARE * wall + 0.5
+        return self._before + wall - self._pause, alone
