@@ -1,0 +1,170 @@
+"""Layers as pictures for people, uint8 RGB [H, W, 3]: false colours, PNG files and contact sheets."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.errors import PolarguideError
+
+from .metrics import shown
+from .sheet import Picture, check_picture, contact_sheet
+
+__all__ = [
+    "COLOUR_MAPS",
+    "Picture",
+    "aolp_to_rgb",
+    "contact_sheet",
+    "depth_to_rgb",
+    "dolp_to_rgb",
+    "error_to_rgb",
+    "normal_to_rgb",
+    "radiance_to_rgb",
+    "scalar_to_rgb",
+    "write_png",
+]
+
+COLOUR_MAPS = {
+    "viridis": cv2.COLORMAP_VIRIDIS,
+    "turbo": cv2.COLORMAP_TURBO,
+    "magma": cv2.COLORMAP_MAGMA,
+    "inferno": cv2.COLORMAP_INFERNO,
+}
+"""Names that ``scalar_to_rgb`` knows."""
+
+
+def radiance_to_rgb(linear: Tensor) -> Picture:
+    """Linear radiance [H, W, 3] as a display shows it: clipped to [0, 1], sRGB. NaN is black."""
+    return _to_uint8(shown(linear.detach().nan_to_num(nan=0.0)))
+
+
+def normal_to_rgb(normals_world: Tensor, camera: Camera) -> Picture:
+    """World normals in the usual colours: camera-space (x, -y, -z) from [-1, 1] to [0, 255].
+
+    Right is red, up is green, towards the camera is blue.
+
+    Args:
+        normals_world: [H, W, 3] of any length.
+        camera: the view.
+
+    Returns:
+        uint8 [H, W, 3]; mid grey (128) where there is no normal (zero or not finite).
+    """
+    normals = camera.to_camera(normals_world.detach().to("cpu", torch.float64).nan_to_num(0.0, 0.0, 0.0))
+    length = torch.linalg.vector_norm(normals, dim=-1, keepdim=True)
+    there = length > 1e-8
+    unit = torch.where(there, normals / torch.where(there, length, 1.0), 0.0)
+    return _to_uint8((unit * unit.new_tensor([1.0, -1.0, -1.0]) + 1) / 2)
+
+
+def scalar_to_rgb(
+    values: Tensor,
+    low: float,
+    high: float,
+    colormap: str = "viridis",
+    *,
+    invert: bool = False,
+) -> Picture:
+    """A map of numbers in false colours.
+
+    Args:
+        values: [H, W].
+        low, high: the values at the two ends of the colour map, ``low < high``; beyond them colours saturate.
+        colormap: a name in ``COLOUR_MAPS``.
+        invert: give ``low`` the last colour and ``high`` the first, for example to make near depths bright.
+
+    Returns:
+        uint8 [H, W, 3]; black where the value is not finite.
+
+    Raises:
+        ValueError: an empty range.
+        PolarguideError: an unknown colour map.
+    """
+    if not low < high:
+        raise ValueError(f"range: expected low < high, found {low} and {high}")
+    if colormap not in COLOUR_MAPS:
+        raise PolarguideError(
+            "colormap",
+            expected=f"one of {', '.join(COLOUR_MAPS)}",
+            found=repr(colormap),
+            remedy="Choose one of these.",
+        )
+    numbers = values.detach().to("cpu", torch.float64)
+    place = ((numbers - low) / (high - low)).nan_to_num(0.0).clamp(0, 1)
+    colours = cv2.applyColorMap(_to_uint8(1 - place if invert else place), COLOUR_MAPS[colormap])
+    picture = np.ascontiguousarray(colours[..., ::-1], dtype=np.uint8)
+    picture[~numbers.isfinite().numpy()] = 0
+    return picture
+
+
+def depth_to_rgb(depth: Tensor, low: float, high: float) -> Picture:
+    """Depth [H, W] in turbo, near red and far blue; black where there is none (zero or not finite)."""
+    return scalar_to_rgb(torch.where(depth > 0, depth, math.nan), low, high, "turbo", invert=True)
+
+
+def dolp_to_rgb(dolp: Tensor, high: float = 1.0) -> Picture:
+    """Degree of linear polarization [H, W] in [0, 1]: black at 0 to bright at ``high``."""
+    return scalar_to_rgb(dolp, 0.0, high, "inferno")
+
+
+def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
+    """Angle of linear polarization as hue, which turns once in pi: 0 is red, pi/3 green, 2 pi/3 blue.
+
+    Args:
+        aolp: [H, W] radians, modulo pi.
+        dolp: [H, W] in [0, 1]; if given, it is the brightness, so that the noise of unpolarized pixels stays
+            dark.
+
+    Returns:
+        uint8 [H, W, 3]; black where a number is not finite.
+    """
+    angle = aolp.detach().to("cpu", torch.float64)
+    value = torch.ones_like(angle) if dolp is None else dolp.detach().to("cpu", torch.float64)
+    known = angle.isfinite() & value.isfinite()
+    third = 2 * math.pi / 3
+    hue = 2 * angle.nan_to_num(0.0, 0.0, 0.0)[..., None] - angle.new_tensor([0.0, third, 2 * third])
+    # Distance from each primary on the colour circle: a full third on, a full third off, linear between.
+    distance = (torch.remainder(hue + math.pi, 2 * math.pi) - math.pi).abs()
+    colour = (2 - distance / (math.pi / 3)).clamp(0, 1)
+    value = torch.where(known, value.nan_to_num(0.0).clamp(0, 1), 0.0)
+    return _to_uint8(colour * value[..., None])
+
+
+def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = 0.25) -> Picture:
+    """Absolute difference of two shown pictures, averaged over channels: black at 0 to bright at ``high``."""
+    true = shown(true_linear.detach().cpu())
+    return scalar_to_rgb((shown(pred_linear.detach().cpu()) - true).abs().mean(-1), 0.0, high, "inferno")
+
+
+def write_png(path: str | Path, rgb8: Picture) -> None:
+    """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
+
+    Raises:
+        ValueError: not such a picture.
+        PolarguideError: the folder does not exist.
+    """
+    check_picture(rgb8, "picture")
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise PolarguideError(
+            path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
+        )
+    encoded, data = cv2.imencode(".png", rgb8[..., ::-1])
+    if not encoded:
+        raise ValueError(f"{path}: the picture could not be encoded")
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(data.tobytes())
+    os.replace(partial, path)
+
+
+def _to_uint8(values: Tensor) -> Picture:
+    """[0, 1] to [0, 255], rounded half up, so that the middle is 128."""
+    scaled = torch.floor(values.to("cpu", torch.float64) * 255 + 0.5)
+    return scaled.clamp(0, 255).to(torch.uint8).numpy()

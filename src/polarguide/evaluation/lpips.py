@@ -1,0 +1,73 @@
+"""LPIPS (Zhang et al. 2018) with the VGG-16 network, where its weights are at hand.
+
+The network needs the torchvision package and its ImageNet weights (528 MB). Nothing is ever downloaded here:
+without them the metric is None, with a reason that says how to get them.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import torch
+from torch import Tensor
+
+from .metrics import shown
+
+FETCH_COMMAND = "python -c \"import torchvision; torchvision.models.vgg16(weights='DEFAULT')\""
+# Five halvings: below this the last layer of the network has no pixel.
+MINIMUM_SIZE = 32
+
+
+def lpips(
+    pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None
+) -> tuple[float | None, str | None]:
+    """Learned perceptual distance of two shown pictures.
+
+    The network looks at whole pictures, so pixels outside ``keep`` are set to the truth in both.
+
+    Args:
+        pred_linear, true_linear: [H, W, 3] linear radiance.
+        keep: [H, W] bool, the pixels that count; None counts all.
+
+    Returns:
+        (distance, None), the distance 0 for equal pictures and smaller for more alike ones; or (None, reason)
+        where the network is not available or a picture is smaller than 32 pixels.
+    """
+    if min(pred_linear.shape[:2]) < MINIMUM_SIZE:
+        return None, f"the picture is smaller than {MINIMUM_SIZE} x {MINIMUM_SIZE} pixels"
+    metric, reason = load_metric()
+    if metric is None:
+        return None, reason
+    device = pred_linear.device
+    true = true_linear.to(device)
+    if keep is not None:
+        counts = keep.to(device)[..., None]
+        true = torch.where(counts, true, true.nan_to_num())
+        pred_linear = torch.where(counts, pred_linear, true)
+    batches = (shown(picture).to(torch.float32).movedim(-1, 0)[None] for picture in (pred_linear, true))
+    with torch.no_grad():
+        distance = float(metric.to(device)(*batches))
+    metric.reset()  # it would keep the score of every picture
+    return distance, None
+
+
+@lru_cache(maxsize=1)
+def load_metric() -> tuple[Any, str | None]:
+    """The LPIPS metric of torchmetrics, loaded once per process: (metric, None), or (None, reason)."""
+    if find_spec("torchvision") is None:
+        return None, "torchvision is not installed"
+    try:
+        from torchvision.models import VGG16_Weights
+    except Exception as error:  # a torchvision built for another torch fails on import in many ways
+        return None, f"torchvision cannot be imported ({type(error).__name__}: {error})"
+    name = Path(urlsplit(VGG16_Weights.DEFAULT.url).path).name
+    if not (Path(torch.hub.get_dir()) / "checkpoints" / name).is_file():
+        return None, f"the VGG-16 weights {name} are not in torch's hub cache (fetch them: {FETCH_COMMAND})"
+    # Here, because torchmetrics takes seconds to import and most processes score nothing.
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    return LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True), None

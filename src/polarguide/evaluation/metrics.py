@@ -1,0 +1,222 @@
+"""The picture, layer and normal metrics: one definition each, so that two people get one number.
+
+Pictures are linear radiance [H, W, 3] on the exposure of the photograph (S0/2). "Shown" means clipped to [0,
+1] and sRGB-encoded; every picture metric compares shown pictures with peak 1. Pixels outside ``keep`` are
+left out of every metric, whatever they hold. All arithmetic is float64, on the device of the prediction.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+SSIM_WINDOW = 11
+SSIM_SIGMA = 1.5
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+REFLECTIVE_SHARE = 0.3
+CLOSE_NORMAL_DEG = 11.25
+
+
+def shown(linear: Tensor) -> Tensor:
+    """The picture as a display shows it: clipped to [0, 1], then the sRGB transfer (IEC 61966-2-1).
+
+    Args:
+        linear: [...] linear radiance.
+
+    Returns:
+        [...] in [0, 1], in the dtype given. NaN stays NaN.
+    """
+    clipped = linear.clamp(0.0, 1.0)
+    # The power's base is kept off zero: its slope there is infinite.
+    curve = 1.055 * clipped.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(clipped <= 0.0031308, 12.92 * clipped, curve)
+
+
+def psnr(pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio of shown pictures, ``-10 log10(mean squared error)``.
+
+    Args:
+        pred_linear, true_linear: [H, W, C] linear radiance.
+        keep: [H, W] bool, the pixels that count; None counts all.
+
+    Returns:
+        Decibels; infinity for equal pictures, NaN where no pixel counts.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    pred, true = _kept(pred_linear, true_linear, keep)
+    if pred.numel() == 0:
+        return math.nan
+    error = float(((shown(pred) - shown(true)) ** 2).mean())
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None) -> float:
+    """Structural similarity of shown pictures (Wang et al. 2004).
+
+    Gaussian window of 11 x 11 pixels, sigma 1.5, K1 = 0.01, K2 = 0.03, population covariance, windows
+    entirely inside the picture, mean over windows and channels: what scikit-image computes with
+        ``gaussian_weights=True, sigma=1.5,
+    use_sample_covariance=False, data_range=1``.
+
+    A pixel outside ``keep`` has no weight in any window (the weights of the others are normalised to one) and
+    the window around it does not count. Without such pixels this is the plain definition.
+
+    Args:
+        pred_linear, true_linear: [H, W, C] linear radiance, H and W at least 11.
+        keep: [H, W] bool, the pixels that count; None counts all.
+
+    Returns:
+        At most 1; NaN where no window counts.
+
+    Raises:
+        ValueError: shapes that do not fit, or a picture smaller than the window.
+    """
+    _check_pair(pred_linear, true_linear, keep)
+    height, width = pred_linear.shape[:2]
+    if min(height, width) < SSIM_WINDOW:
+        raise ValueError(
+            f"SSIM: expected at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, found {width} x {height}"
+        )
+    device = pred_linear.device
+    kept = torch.ones(height, width, dtype=torch.bool, device=device) if keep is None else keep.to(device)
+    x, y = (
+        torch.where(kept, shown(picture.to(device, torch.float64)).movedim(-1, 0), 0.0)
+        for picture in (pred_linear, true_linear)
+    )
+    margin = SSIM_WINDOW // 2
+    counted = kept[margin:-margin, margin:-margin]
+    if not counted.any():
+        return math.nan
+    weight = _blur(kept.to(torch.float64)[None]).clamp(min=torch.finfo(torch.float64).tiny)
+    mean_x, mean_y = _blur(x) / weight, _blur(y) / weight
+    variance_x = _blur(x * x) / weight - mean_x**2
+    variance_y = _blur(y * y) / weight - mean_y**2
+    covariance = _blur(x * y) / weight - mean_x * mean_y
+    similarity = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
+        (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
+    )
+    return float(similarity[:, counted].mean())
+
+
+def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
+    """Angle between two directions, in degrees.
+
+    Args:
+        pred, true: [..., 3] in the same axes, of any length.
+
+    Returns:
+        [...] float64 in [0, 180]. A prediction without a direction (zero, or not finite) counts as 90 degrees
+        off, so that holes are not free. NaN where the truth has none.
+    """
+    if pred.shape != true.shape or pred.shape[-1] != 3:
+        raise ValueError(
+            f"normals: expected equal shapes [..., 3], found {list(pred.shape)} and {list(true.shape)}"
+        )
+    a = torch.nan_to_num(pred.to(torch.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    b = true.to(a.device, torch.float64)
+    # atan2 of sine and cosine: accurate to the last digit near 0 and 180 degrees, where acos is not.
+    sine = torch.linalg.vector_norm(torch.linalg.cross(a, b, dim=-1), dim=-1)
+    angle = torch.rad2deg(torch.atan2(sine, (a * b).sum(-1)))
+    angle = torch.where(torch.linalg.vector_norm(a, dim=-1) > 1e-12, angle, 90.0)
+    return torch.where(torch.linalg.vector_norm(b, dim=-1) > 1e-12, angle, math.nan)
+
+
+def normal_mae_deg(pred: Tensor, true: Tensor, keep: Tensor | None = None) -> float:
+    """Mean angle between rendered and true normals in degrees (see ``normal_angles_deg``).
+
+    Args:
+        pred, true: [H, W, 3] in the same axes.
+        keep: [H, W] bool, the pixels that count; None counts all. Pixels without a true normal never count.
+
+    Returns:
+        Degrees; NaN where no pixel counts.
+    """
+    angles = _kept_angles(pred, true, keep)
+    return float(angles.mean()) if angles.numel() else math.nan
+
+
+def normal_within_11(pred: Tensor, true: Tensor, keep: Tensor | None = None) -> float:
+    """Share in [0, 1] of the pixels whose normal is under 11.25 degrees off; NaN where no pixel counts."""
+    angles = _kept_angles(pred, true, keep)
+    return float((angles < CLOSE_NORMAL_DEG).to(torch.float64).mean()) if angles.numel() else math.nan
+
+
+def layer_psnr(contribution: Tensor, true_s0: Tensor, keep: Tensor | None, *, aligned: bool = False) -> float:
+    """PSNR of one layer: what it adds to the final picture against half its true S0, both shown.
+
+    Args:
+        contribution: [H, W, 3] linear, the layer as it is added to the final picture (an S0/2).
+        true_s0: [H, W, 3] linear, the true S0 of the lobe.
+        keep: [H, W] bool, the pixels that count; None counts all.
+        aligned: first multiply each channel by the one factor that brings it closest to the truth in linear
+            least squares, so that a wrong overall brightness or tint costs nothing.
+
+    Returns:
+        Decibels, as ``psnr``.
+    """
+    pred, true = _kept(contribution, true_s0 / 2, keep)
+    if aligned:
+        pred = pred * _channel_scales(pred, true)
+    return psnr(pred[:, None], true[:, None])
+
+
+def reflective_mask(specular: Tensor, s0: Tensor, mask: Tensor) -> Tensor:
+    """The pixels that are mostly seen by their reflection.
+
+    Args:
+        specular: [H, W, 3] true linear S0 of the specular lobe.
+        s0: [H, W, 3] linear S0 of the photograph (twice the picture S0/2).
+        mask: [H, W] bool, foreground.
+
+    Returns:
+        [H, W] bool: foreground where the sum over channels of ``specular`` exceeds 0.3 times that of ``s0``.
+    """
+    return mask & (specular.to(torch.float64).sum(-1) > REFLECTIVE_SHARE * s0.to(torch.float64).sum(-1))
+
+
+def _channel_scales(pred: Tensor, true: Tensor) -> Tensor:
+    """[C] least-squares factors of [P, C] values; 1 for a channel that is black."""
+    energy = (pred * pred).sum(0)
+    live = energy > 0
+    return torch.where(live, (pred * true).sum(0) / torch.where(live, energy, 1.0), 1.0)
+
+
+def _kept_angles(pred: Tensor, true: Tensor, keep: Tensor | None) -> Tensor:
+    angles = normal_angles_deg(pred, true)
+    if keep is not None:
+        angles = angles[keep.to(angles.device)]
+    return angles[~angles.isnan()]
+
+
+def _kept(pred: Tensor, true: Tensor, keep: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The pixels that count as [P, C] float64."""
+    _check_pair(pred, true, keep)
+    pred, true = pred.to(torch.float64), true.to(pred.device, torch.float64)
+    if keep is None:
+        return pred.flatten(0, 1), true.flatten(0, 1)
+    keep = keep.to(pred.device)
+    return pred[keep], true[keep]
+
+
+def _check_pair(pred: Tensor, true: Tensor, keep: Tensor | None) -> None:
+    if pred.ndim != 3 or pred.shape != true.shape:
+        raise ValueError(
+            f"pictures: expected equal shapes [H, W, C], found {list(pred.shape)} and {list(true.shape)}"
+        )
+    if keep is not None and (keep.dtype != torch.bool or keep.shape != pred.shape[:2]):
+        raise ValueError(f"keep: expected bool {list(pred.shape[:2])}, found {keep.dtype} {list(keep.shape)}")
+
+
+def _blur(channels: Tensor) -> Tensor:
+    """[C, H, W] averaged under the Gaussian window, where it lies inside the picture: [C, H - 10, W - 10]."""
+    offset = torch.arange(SSIM_WINDOW, dtype=torch.float64, device=channels.device) - SSIM_WINDOW // 2
+    kernel = torch.exp(-(offset**2) / (2 * SSIM_SIGMA**2))
+    kernel = kernel / kernel.sum()
+    rows = functional.conv2d(channels[:, None], kernel.view(1, 1, -1, 1))
+    return functional.conv2d(rows, kernel.view(1, 1, 1, -1))[:, 0]
