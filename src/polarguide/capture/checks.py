@@ -1,0 +1,188 @@
+"""What the pictures themselves say about the capture: full scale, exposure, encoding, order of the files.
+
+Each view is measured once, while its pictures are in memory (``measure``); the findings of all views become a
+few sentences (``exposure_warnings``, ``polarization_warnings``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.view import FULL_CODE, listed
+
+TOP_SHARE = 0.02
+"""Share of the code range, counted from its top, whose histogram ``full_scale`` looks at."""
+_FULL_SHARE = 0.002
+_DARK = 0.01
+_BLOWN_SHARE = 0.1
+_LOW_CODE = FULL_CODE // 256
+_SAMPLES = 20_000
+_RESIDUAL = 0.05
+# Curvature (see Measures) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
+# +0.3; the gain differences of real sensors leave less than 0.1.
+_ENCODED_CURVATURE = -0.25
+_DECODED_CURVATURE = 0.2
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is measured on one view.
+
+    Attributes:
+        bright: 99th percentile of the linear intensities, in [0, 1].
+        residuals: median of |difference of the two pair sums| / S0 for the three ways to pair the pictures:
+            (0, 90 | 45, 135), (0, 45 | 90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
+        sums: for the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
+            ((I45 - I135) / S0)^2: number of pixels, sums of q, r, q q, q r. Linear data have slope 0 whatever
+            the gains of the four pictures; a concave encoding bends it down, a convex one up.
+    """
+
+    bright: float
+    residuals: tuple[float, float, float]
+    sums: NDArray[np.float64]
+
+
+def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_]) -> Measures:
+    """Measure one view.
+
+    Args:
+        codes: linear codes [4, H, W, 3].
+        usable: pixels that are neither saturated nor invalid, [H, W].
+    """
+    step = max(1, int(np.sqrt(usable.size / _SAMPLES)))
+    sample = codes[:, ::step, ::step].astype(np.float64)
+    bright = float(np.percentile(sample, 99.0)) / FULL_CODE
+    grey = sample.mean(axis=3)
+    angles = grey[:, usable[::step, ::step] & (grey.min(axis=0) > _LOW_CODE)]
+    if angles.shape[1] < 16:
+        return Measures(bright, (0.0, 0.0, 0.0), np.zeros(5))
+    i0, i45, i90, i135 = angles
+    s0 = (i0 + i45 + i90 + i135) / 2.0
+    differences = (i0 + i90 - i45 - i135, i0 + i45 - i90 - i135, i0 + i135 - i45 - i90)
+    first, second, third = (float(np.median(np.abs(difference) / s0)) for difference in differences)
+    r = differences[0] / s0
+    q = ((i0 - i90) / s0) ** 2 - ((i45 - i135) / s0) ** 2
+    sums = np.array([len(r), q.sum(), r.sum(), (q * q).sum(), (q * r).sum()])
+    return Measures(bright, (first, second, third), sums)
+
+
+def top_histogram(raw: NDArray[Any]) -> NDArray[np.int64]:
+    """Counts of the stored values in the top 2 % of their range, the last for the largest possible value."""
+    full = int(np.iinfo(raw.dtype).max)
+    low = full - int(full * TOP_SHARE)
+    return np.bincount(raw[raw >= low].astype(np.int64) - low, minlength=full - low + 1)
+
+
+def full_scale(histogram: NDArray[np.int64], full: int) -> int | None:
+    """The stored value at which a capture saturates, or None if nothing in it does.
+
+    That is the largest possible value where it occurs. A capture whose values are coarser (10 bits in 16)
+    ends a little below: then the largest value that occurs counts if it lies in the top 0.2 % of the range
+    and many more samples have it than any value near it.
+
+    Args:
+        histogram: sum of ``top_histogram`` over the capture.
+        full: the largest possible value, 255 or 65535.
+    """
+    occupied = np.flatnonzero(histogram)
+    if len(occupied) == 0:
+        return None
+    top = int(occupied[-1])
+    value = full - (len(histogram) - 1) + top
+    if value == full:
+        return value
+    near = int(histogram[:top].max(initial=0))
+    piled_up = histogram[top] >= 3 and histogram[top] > 3 * near
+    return value if value >= full * (1.0 - _FULL_SHARE) and piled_up else None
+
+
+def exposure_warnings(
+    names: Sequence[str], measures: Sequence[Measures], blown: Sequence[float], largest: int, full: int
+) -> list[str]:
+    """Sentences about dark and saturated pictures.
+
+    Args:
+        names: view names.
+        measures: their measures.
+        blown: their shares of pixels with an angle at full scale.
+        largest: the largest value stored in any picture.
+        full: the largest possible one.
+    """
+    warnings = []
+    if full == FULL_CODE and 0 < largest < 4096:
+        bits = 10 if largest < 1024 else 12
+        return [
+            f"The pictures are 16-bit files, yet no value exceeds {largest}: they look like {bits}-bit data "
+            f"that were not scaled. Multiply the values by {2 ** (16 - bits)}."
+        ]
+    dark = [name for name, found in zip(names, measures, strict=True) if found.bright < _DARK]
+    if dark:
+        warnings.append(
+            f"{len(dark)} of {len(names)} views are almost black: 99% of their values are under {_DARK:.0%} "
+            f"of full scale ({listed(dark)}). Expose longer, or leave them out."
+        )
+    over = [name for name, share in zip(names, blown, strict=True) if share > _BLOWN_SHARE]
+    if over:
+        warnings.append(
+            f"{len(over)} of {len(names)} views are heavily saturated: up to {max(blown):.0%} of the pixels "
+            f"are at full scale, where polarization is lost ({listed(over)}). Expose shorter."
+        )
+    return warnings
+
+
+def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], transfer: str) -> list[str]:
+    """Sentences about the order of the files and their encoding."""
+    off = [
+        (name, found.residuals)
+        for name, found in zip(names, measures, strict=True)
+        if _is_off(found.residuals)
+    ]
+    warnings = []
+    if off:
+        pairs = np.median([residuals for _, residuals in off], axis=0)
+        hint = "Probably files are swapped, or the transfer is wrong"
+        best = int(pairs.argmin())
+        if best:
+            swap = ("45 and 90 (or 0 and 135)", "90 and 135 (or 0 and 45)")[best - 1]
+            hint = f"The pictures at {swap} degrees are probably swapped"
+        warnings.append(
+            f"I0 + I90 differs from I45 + I135 by {pairs[0]:.1%} of S0 (median) in {len(off)} of "
+            f"{len(names)} views ({listed([name for name, _ in off])}); a sound capture stays under "
+            f"{_RESIDUAL:.0%}. {hint}."
+        )
+    slope = curvature(measures)
+    if len(off) * 2 > len(names) or slope is None:
+        return warnings
+    if transfer == "linear" and slope < _ENCODED_CURVATURE:
+        warnings.append(
+            f"The pictures look sRGB-encoded (curvature {slope:.2f}, linear ones have 0): "
+            "if they are, read them with transfer srgb."
+        )
+    if transfer == "srgb" and slope > _DECODED_CURVATURE:
+        warnings.append(
+            f"The pictures look linear already (curvature {slope:.2f} after decoding, 0 is right): "
+            "if they are, read them with transfer linear."
+        )
+    return warnings
+
+
+def curvature(measures: Sequence[Measures]) -> float | None:
+    """Slope of the regression described in ``Measures``, over all views; None if too little is polarized."""
+    count, q, r, qq, qr = np.sum([found.sums for found in measures], axis=0)
+    if count < 1000:
+        return None
+    spread = qq / count - (q / count) ** 2
+    if spread < 0.005**2:
+        return None
+    return float((qr / count - q / count * r / count) / spread)
+
+
+def _is_off(residuals: tuple[float, float, float]) -> bool:
+    """Far from zero, or clearly beaten by another pairing."""
+    right, *others = residuals
+    return right > _RESIDUAL or (right > 0.4 * _RESIDUAL and min(others) < 0.25 * right)

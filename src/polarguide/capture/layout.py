@@ -1,0 +1,211 @@
+"""Where the files of a capture lie: our own folder layout, and one folder per polarizer angle."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from polarguide.capture.pictures import SUFFIXES
+from polarguide.capture.view import ANGLES, listed, unknown_view
+from polarguide.errors import PolarguideError
+
+_PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
+_ANGLE_FOLDER = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
+_HINT = (
+    "Give a folder that holds polar/<view>_000.png, _045.png, _090.png and _135.png, or the four folders "
+    "I-00, I-45, I-90 and I-135 (also 0, 45, 90, 135) with equally named pictures."
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The files of a capture.
+
+    Attributes:
+        root: the folder.
+        pictures: view name -> angle in degrees -> file. Angles may be missing; ``require_complete`` checks.
+        masks, invalid, truth: view name -> file, for the views that have one.
+        warnings: files that were passed over.
+    """
+
+    root: Path
+    pictures: dict[str, dict[int, Path]]
+    masks: dict[str, Path]
+    invalid: dict[str, Path]
+    truth: dict[str, Path]
+    warnings: tuple[str, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """All view names, sorted."""
+        return sorted(self.pictures)
+
+
+def find_layout(root: Path) -> Layout:
+    """Look for the files of a capture.
+
+    Raises:
+        PolarguideError: there is no such folder, it has neither layout, or two files claim one place.
+    """
+    if not root.is_dir():
+        raise PolarguideError(
+            root,
+            expected="a capture folder",
+            found="a file" if root.exists() else "nothing",
+            remedy=_HINT,
+        )
+    warnings: list[str] = []
+    folders = _angle_folders(root)
+    if (root / "polar").is_dir():
+        pictures = _read_flat(root / "polar", warnings)
+    elif folders:
+        pictures = _read_folders(root, folders)
+    else:
+        raise PolarguideError(root, expected="a capture folder", found=_contents(root), remedy=_HINT)
+    if not pictures:
+        raise PolarguideError(root, expected="pictures of at least one view", found="none", remedy=_HINT)
+    sides: dict[str, dict[str, Path]] = {}
+    for folder, suffixes in (("masks", SUFFIXES), ("invalid", SUFFIXES), ("gt", (".npz",))):
+        files = _index(root / folder, suffixes)
+        strangers = sorted(files.keys() - pictures.keys())
+        if strangers:
+            warnings.append(
+                f"{folder}/ has {len(strangers)} files that belong to no view and are not used "
+                f"({listed(strangers)}): a file there is named like its view."
+            )
+        sides[folder] = files
+    without = sorted(pictures.keys() - sides["masks"].keys())
+    if sides["masks"] and without:
+        warnings.append(
+            f"masks/ has no file for {len(without)} of {len(pictures)} views ({listed(without)})."
+        )
+    return Layout(root, pictures, sides["masks"], sides["invalid"], sides["gt"], tuple(warnings))
+
+
+def select_views(layout: Layout, views: Sequence[str] | None) -> list[str]:
+    """The names to read, sorted: all, or those asked for.
+
+    Raises:
+        PolarguideError: a name is unknown, none is given, or a view lacks an angle.
+    """
+    if views is None:
+        names = layout.names
+    else:
+        for name in views:
+            if name not in layout.pictures:
+                raise unknown_view(f"{layout.root} (views)", name, layout.names)
+        names = sorted(set(views))
+        if not names:
+            raise PolarguideError(
+                "views",
+                expected="at least one view name",
+                found="an empty list",
+                remedy="Leave it out to read all views.",
+            )
+    _require_complete(layout, names)
+    return names
+
+
+def _require_complete(layout: Layout, names: list[str]) -> None:
+    incomplete = [name for name in names if len(layout.pictures[name]) < len(ANGLES)]
+    if not incomplete:
+        return
+    name = incomplete[0]
+    have = layout.pictures[name]
+    missing = next(angle for angle in ANGLES if angle not in have)
+    others = f" ({len(incomplete) - 1} other views are incomplete too)" if len(incomplete) > 1 else ""
+    raise PolarguideError(
+        _sibling(layout, have, missing),
+        expected=f"the picture of view {name} at {missing} degrees",
+        found=f"only {', '.join(str(angle) for angle in sorted(have))} degrees{others}",
+        remedy="Add the file, or remove the other pictures of the view.",
+    )
+
+
+def _sibling(layout: Layout, have: dict[int, Path], angle: int) -> Path:
+    """Where the picture at ``angle`` would lie, judged by another angle of the view."""
+    path = next(iter(have.values()))
+    if path.parent == layout.root / "polar":
+        return path.with_name(f"{path.stem[:-3]}{angle:03d}{path.suffix}")
+    folders = {at: file.parent for files in layout.pictures.values() for at, file in files.items()}
+    return folders.get(angle, path.parent) / path.name
+
+
+def _read_flat(folder: Path, warnings: list[str]) -> dict[str, dict[int, Path]]:
+    """``polar/<view>_<angle>.<suffix>``."""
+    pictures: dict[str, dict[int, Path]] = {}
+    strangers = []
+    for stem, path in _index(folder, SUFFIXES).items():
+        match = _PICTURE_STEM.fullmatch(stem)
+        if match is None:
+            strangers.append(path.name)
+        else:
+            pictures.setdefault(match["view"], {})[int(match["angle"])] = path
+    if strangers:
+        warnings.append(
+            f"polar/ has {len(strangers)} pictures whose names do not end in _000, _045, _090 or _135 and "
+            f"that are not used ({listed(strangers)})."
+        )
+    return pictures
+
+
+def _read_folders(root: Path, folders: dict[int, Path]) -> dict[str, dict[int, Path]]:
+    """One folder per angle, equally named pictures."""
+    missing = [angle for angle in ANGLES if angle not in folders]
+    if missing:
+        raise PolarguideError(
+            root,
+            expected="four folders, for 0, 45, 90 and 135 degrees",
+            found=f"none for {missing[0]} degrees beside {', '.join(p.name for p in folders.values())}",
+            remedy="Add the folder.",
+        )
+    pictures: dict[str, dict[int, Path]] = {}
+    for angle, folder in folders.items():
+        for stem, path in _index(folder, SUFFIXES).items():
+            pictures.setdefault(stem, {})[angle] = path
+    return pictures
+
+
+def _angle_folders(root: Path) -> dict[int, Path]:
+    """Folders named like a polarizer angle (I-00, I_45, 090, pol135, ...)."""
+    folders: dict[int, Path] = {}
+    for path in sorted(root.iterdir()):
+        match = _ANGLE_FOLDER.fullmatch(path.name)
+        if match is None or not path.is_dir() or int(match["angle"]) not in ANGLES:
+            continue
+        angle = int(match["angle"])
+        if angle in folders:
+            raise PolarguideError(
+                root,
+                expected=f"one folder for {angle} degrees",
+                found=f"{folders[angle].name} and {path.name}",
+                remedy="Remove or rename one of them.",
+            )
+        folders[angle] = path
+    return dict(sorted(folders.items()))
+
+
+def _index(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """Stem -> file for the files of a folder with one of the suffixes; empty if there is no such folder."""
+    files: dict[str, Path] = {}
+    if not folder.is_dir():
+        return files
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+            continue
+        if path.stem in files:
+            raise PolarguideError(
+                folder,
+                expected=f"one file called {path.stem}",
+                found=f"{files[path.stem].name} and {path.name}",
+                remedy="Remove the one that is not meant.",
+            )
+        files[path.stem] = path
+    return files
+
+
+def _contents(root: Path) -> str:
+    names = sorted(path.name for path in root.iterdir())
+    return f"one that holds {listed(names)}" if names else "an empty folder"

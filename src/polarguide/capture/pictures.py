@@ -1,0 +1,118 @@
+"""Picture files -> arrays: strict decoding, three channels in RGB order, linear 16-bit codes."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.integrity import find_damage
+from polarguide.capture.view import FULL_CODE
+from polarguide.errors import PolarguideError
+
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+TRANSFERS = ("linear", "srgb")
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        PolarguideError: the file cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise PolarguideError(
+            path,
+            expected="a readable file",
+            found=error.strerror or str(error),
+            remedy="Check that the file exists and may be read.",
+        ) from error
+
+
+def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
+    """Decode a photograph.
+
+    Args:
+        path: where ``data`` came from, for messages.
+        data: the whole file: PNG, JPEG or TIFF with 8 or 16 bits a channel, grey or colour. Alpha is dropped,
+            an orientation tag is not applied (poses belong to the stored pixels).
+
+    Returns:
+        [H, W, 3] uint8 or uint16, RGB, as stored. A grey picture becomes three equal channels.
+
+    Raises:
+        PolarguideError: the file is damaged, cut short, or of another kind.
+    """
+    pixels = _decode(path, data)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise PolarguideError(
+            path,
+            expected="a picture with 8 or 16 bits a channel",
+            found=f"values of type {pixels.dtype}",
+            remedy="Save it as 16-bit PNG with value 65535 for linear intensity 1.",
+        )
+    if pixels.ndim == 2:
+        return np.repeat(pixels[..., None], 3, axis=2)
+    return np.ascontiguousarray(pixels[..., 2::-1])
+
+
+def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_]:
+    """Decode a mask picture into [H, W] bool.
+
+    Args:
+        path: where ``data`` came from, for messages.
+        data: the whole file.
+        any_value: True where any channel is not zero; otherwise where it reaches half of the picture's
+            maximum, which reads masks of 0 and 1, of 0 and 255, and those with soft edges alike.
+
+    Raises:
+        PolarguideError: the file is damaged, cut short, or of another kind.
+    """
+    pixels = _decode(path, data)
+    grey = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
+    if any_value:
+        return np.asarray(grey > 0)
+    return np.asarray((grey > 0) & (2.0 * grey >= float(grey.max())))
+
+
+def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
+    """Stored 8- or 16-bit values -> round(65535 * linear intensity), same shape, uint16."""
+    if pixels.dtype == np.uint16 and transfer == "linear":
+        return pixels.astype(np.uint16, copy=False)
+    return _table(int(np.iinfo(pixels.dtype).max), transfer)[pixels]
+
+
+@functools.cache
+def _table(full: int, transfer: str) -> NDArray[np.uint16]:
+    """Linear code of every stored value in 0..full."""
+    shown = np.arange(full + 1) / full
+    if transfer == "srgb":
+        shown = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    return np.rint(shown * FULL_CODE).astype(np.uint16)
+
+
+def _decode(path: Path, data: bytes) -> NDArray[Any]:
+    """Decode with OpenCV, after a look at the file's structure."""
+    damage = find_damage(data)
+    pixels = None
+    if damage is None:
+        try:
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            pixels = None
+        if pixels is None:
+            damage = "one that cannot be decoded"
+    if damage is not None:
+        raise PolarguideError(
+            path,
+            expected="a complete PNG, JPEG or TIFF file",
+            found=damage,
+            remedy="Copy or export the file again.",
+        )
+    return np.asarray(pixels)

@@ -1,0 +1,142 @@
+"""The records a capture becomes: a view with its four polarizer angles, and the scene of all views."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.errors import PolarguideError
+
+ANGLES = (0, 45, 90, 135)
+"""Polarizer angles in degrees, in the order in which every stack of four stores them."""
+
+FULL_CODE = 65535
+"""The code of linear intensity 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """What is known exactly about a view, where the capture brings it. Any field may be None.
+
+    Attributes:
+        normal: unit surface normals in the world, zero where there is no surface, [H, W, 3] float32.
+        depth: camera z in world units, [H, W] float32.
+        mask: foreground, [H, W] bool.
+        specular, diffuse: first-surface lobes as linear S0, in the exposure of the pictures, [H, W, 3]
+            float32. Pictures are S0 / 2, so compare rendered layers with half of these.
+    """
+
+    normal: Tensor | None = None
+    depth: Tensor | None = None
+    mask: Tensor | None = None
+    specular: Tensor | None = None
+    diffuse: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One position of the camera: four pictures behind a polarizer, and what is known about their pixels.
+
+    Attributes:
+        name: name of the view, unique in its scene.
+        camera: pose and intrinsics at the size of the pictures.
+        codes: linear intensities behind the analyser at 0, 45, 90 and 135 degrees, coded as
+            round(65535 * intensity), [4, H, W, 3] uint16, RGB. Kept coded because big captures do not fit
+            into memory as floats.
+        invalid: pixels the capture itself declares unusable (``invalid/<view>.png``), [H, W] bool; all False
+            where it declares nothing. Metrics leave out these pixels and no others.
+        saturated: pixels found to carry no polarization information: one angle at full scale in any channel,
+            or all four black; [H, W] bool. For priors and losses.
+        mask: the user's foreground mask (``masks/<view>.png``), [H, W] bool, or None.
+        truth: ground truth, or None.
+    """
+
+    name: str
+    camera: Camera
+    codes: Tensor
+    invalid: Tensor
+    saturated: Tensor
+    mask: Tensor | None = None
+    truth: GroundTruth | None = None
+
+    def intensities(self) -> Tensor:
+        """Linear intensities in [0, 1] at 0, 45, 90, 135 degrees: [4, H, W, 3] float32."""
+        return self.codes.to(torch.float32) / FULL_CODE
+
+    def photograph(self) -> Tensor:
+        """The mean of the four pictures: linear S0 / 2 in [0, 1], [H, W, 3] float32."""
+        return self.codes.to(torch.float32).mean(dim=0) / FULL_CODE
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A capture as read: posed views, sparse points, and where it came from.
+
+    Attributes:
+        root: the folder that was read.
+        name: its name.
+        views: all views, sorted by name.
+        test_names: names of the views held out for evaluation, sorted.
+        points: sparse points in the world, [M, 3] float32.
+        point_colours: their colours as the COLMAP model gives them (display-encoded), [M, 3] uint8.
+        refractive_index: the one index that ``scene.json`` gives, or None if it gives none or several.
+        downscale: side of the pixel boxes that were averaged; 1 is full size.
+        transfer: "linear" or "srgb": how the files were taken to be encoded. The views are always linear.
+        digest: SHA-256 over the names and contents of all files that were read, as hexadecimal digits.
+        warnings: what looks wrong without preventing the use of the scene, one plain sentence or two each.
+    """
+
+    root: Path
+    name: str
+    views: tuple[View, ...]
+    test_names: tuple[str, ...]
+    points: Tensor
+    point_colours: Tensor
+    refractive_index: float | None
+    downscale: int
+    transfer: str
+    digest: str
+    warnings: tuple[str, ...]
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        """The views to learn from, sorted by name."""
+        return tuple(view for view in self.views if view.name not in self.test_names)
+
+    @property
+    def test_views(self) -> tuple[View, ...]:
+        """The views held out for evaluation, sorted by name."""
+        return tuple(view for view in self.views if view.name in self.test_names)
+
+    def view(self, name: str) -> View:
+        """The view called ``name``.
+
+        Raises:
+            PolarguideError: there is none; the message lists the names nearest to it.
+        """
+        for view in self.views:
+            if view.name == name:
+                return view
+        raise unknown_view(self.root, name, [view.name for view in self.views])
+
+
+def unknown_view(where: object, name: str, names: list[str]) -> PolarguideError:
+    """The error that ``name`` is not among the view names, with those nearest to it."""
+    near = difflib.get_close_matches(name, names, n=3, cutoff=0.4) or names[:3]
+    return PolarguideError(
+        where,
+        expected=f"the name of one of the {len(names)} views",
+        found=repr(name),
+        remedy=f"The nearest names are: {', '.join(near)}.",
+    )
+
+
+def listed(names: list[str], limit: int = 4) -> str:
+    """The first few names, and how many more there are: for messages."""
+    rest = len(names) - limit
+    return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")

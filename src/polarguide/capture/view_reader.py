@@ -1,0 +1,146 @@
+"""The files of one view -> its pixels, before the full scale of the whole capture is known."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polarguide.camera import Camera
+from polarguide.capture import boxes, checks
+from polarguide.capture.layout import Layout
+from polarguide.capture.pictures import decode_mask, decode_picture, linear_codes, read_file
+from polarguide.capture.truth import read_truth
+from polarguide.capture.view import ANGLES, GroundTruth, View
+from polarguide.errors import PolarguideError
+
+
+class Files:
+    """Reads files and keeps the SHA-256 of each: the provenance of what is made from them."""
+
+    def __init__(self) -> None:
+        self.digests: dict[Path, str] = {}
+
+    def read(self, path: Path) -> bytes:
+        """The bytes of a file."""
+        data = read_file(path)
+        self.digests[path] = hashlib.sha256(data).hexdigest()
+        return data
+
+
+@dataclass(frozen=True, eq=False)
+class ViewData:
+    """One view as read.
+
+    Attributes:
+        name, codes, invalid, mask, truth: as in ``View``, arrays instead of tensors.
+        size: width and height of the pictures as stored.
+        peak: largest stored value over angles, channels and the pixels of a box, [H, W].
+        black: whether some pixel of the box is 0 in all angles and channels, [H, W].
+        histogram: ``checks.top_histogram`` of the stored values.
+        digests: SHA-256 of every file that was read.
+    """
+
+    name: str
+    size: tuple[int, int]
+    codes: NDArray[np.uint16]
+    peak: NDArray[Any]
+    black: NDArray[np.bool_]
+    histogram: NDArray[np.int64]
+    invalid: NDArray[np.bool_]
+    mask: NDArray[np.bool_] | None
+    truth: GroundTruth | None
+    digests: dict[Path, str]
+
+    def saturated(self, scale: int | None) -> NDArray[np.bool_]:
+        """``View.saturated``, given the stored value at which the capture saturates (None: it does not)."""
+        return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
+
+    def view(self, camera: Camera, scale: int | None) -> View:
+        """The finished view."""
+        return View(
+            name=self.name,
+            camera=camera,
+            codes=torch.from_numpy(self.codes),
+            invalid=torch.from_numpy(self.invalid),
+            saturated=torch.from_numpy(self.saturated(scale)),
+            mask=None if self.mask is None else torch.from_numpy(self.mask),
+            truth=self.truth,
+        )
+
+
+def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewData:
+    """Read all files of one view, averaged over boxes of ``factor`` x ``factor`` pixels.
+
+    Raises:
+        PolarguideError: a file is damaged, or the sizes of the files differ.
+    """
+    files = Files()
+    raw = _read_angles(files, layout.pictures[name])
+    height, width = raw[0].shape[:2]
+    if factor > min(height, width):
+        raise PolarguideError(
+            "downscale",
+            expected=f"at most {min(height, width)} for pictures of {width}x{height}",
+            found=str(factor),
+            remedy="Choose a smaller factor.",
+        )
+    peak = np.maximum.reduce([pixels.max(axis=2) for pixels in raw])
+    invalid, mask, truth = np.zeros((height, width), bool), None, None
+    if name in layout.invalid:
+        invalid = _read_mask(files, layout.invalid[name], (height, width), any_value=True)
+    if name in layout.masks:
+        mask = _read_mask(files, layout.masks[name], (height, width), any_value=False)
+    if name in layout.truth:
+        path = layout.truth[name]
+        truth = read_truth(path, files.read(path), size=(height, width), factor=factor)
+    return ViewData(
+        name=name,
+        size=(width, height),
+        codes=np.stack([boxes.mean_codes(linear_codes(pixels, transfer), factor) for pixels in raw]),
+        peak=boxes.maximum(peak, factor),
+        black=boxes.maximum(np.asarray(peak == 0), factor),
+        histogram=np.sum([checks.top_histogram(pixels) for pixels in raw], axis=0),
+        invalid=boxes.maximum(invalid, factor),
+        mask=None if mask is None else boxes.every(mask, factor),
+        truth=truth,
+        digests=files.digests,
+    )
+
+
+def _read_angles(files: Files, paths: dict[int, Path]) -> list[NDArray[Any]]:
+    """The four stored pictures of a view, [H, W, 3] each, of one size and one depth."""
+    pictures: list[NDArray[Any]] = []
+    for angle in ANGLES:
+        path = paths[angle]
+        picture = decode_picture(path, files.read(path))
+        if pictures and (picture.shape, picture.dtype) != (pictures[0].shape, pictures[0].dtype):
+            raise PolarguideError(
+                path,
+                expected=f"{_kind(pictures[0])} like {'/'.join(paths[0].parts[-2:])}",
+                found=_kind(picture),
+                remedy="Export the four pictures of a view alike.",
+            )
+        pictures.append(picture)
+    return pictures
+
+
+def _read_mask(files: Files, path: Path, size: tuple[int, int], *, any_value: bool) -> NDArray[np.bool_]:
+    mask = decode_mask(path, files.read(path), any_value=any_value)
+    if mask.shape != size:
+        raise PolarguideError(
+            path,
+            expected=f"the size of the pictures, {size[1]}x{size[0]}",
+            found=f"{mask.shape[1]}x{mask.shape[0]}",
+            remedy="Make the mask for these pictures.",
+        )
+    return mask
+
+
+def _kind(picture: NDArray[Any]) -> str:
+    return f"{picture.shape[1]}x{picture.shape[0]} with {picture.dtype.itemsize * 8} bits"
