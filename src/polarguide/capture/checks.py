@@ -6,6 +6,7 @@ few sentences (``exposure_warnings``, ``polarization_warnings``).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -54,7 +55,7 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_]) -> Measures:
         codes: linear codes [4, H, W, 3].
         usable: pixels that are neither saturated nor invalid, [H, W].
     """
-    step = max(1, int(np.sqrt(usable.size / _SAMPLES)))
+    step = max(1, math.ceil(math.sqrt(usable.size / _SAMPLES)))
     sample = codes[:, ::step, ::step].astype(np.float64)
     bright = float(np.percentile(sample, 99.0)) / FULL_CODE
     grey = sample.mean(axis=3)

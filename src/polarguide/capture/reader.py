@@ -157,9 +157,9 @@ def _scaling_warning(scaled: list[tuple[str, str]], count: int) -> list[str]:
         return []
     sizes = ", ".join(sorted({size for _, size in scaled}))
     return [
-        f"The intrinsics were made for another resolution ({sizes}) than that of the pictures and were scaled "
-        f"in {len(scaled)} of {count} views ({listed([name for name, _ in scaled])}): right if the pictures "
-        "were resized, wrong if they were cropped."
+        f"The intrinsics were made for another resolution ({sizes}) than that of the pictures and were "
+        f"scaled in {len(scaled)} of {count} views ({listed([name for name, _ in scaled])}): right if the "
+        "pictures were resized, wrong if they were cropped."
     ]
 
 
