@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from polarguide import _native
 from polarguide.camera import Camera
+from polarguide.errors import PolarguideError
 from polarguide.raster.interface import NEAR_PLANE, Rasterised, ScreenStatistic, check_shapes, refuse_not_finite
 
 
@@ -81,4 +82,13 @@ def rasterise_cpu(
 ) -> Rasterised:
     """See ``polarguide.raster.interface``. CPU tensors, float32; deterministic for any number of threads."""
     check_shapes(means, quats, scales, opacities, features, statistic)
+    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
+    for name, tensor in named.items():
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise PolarguideError(
+                f"rasterise({name})",
+                expected="float32 on the CPU",
+                found=f"{tensor.dtype} on {tensor.device}",
+                remedy="Convert it, or use the plain-torch twin.",
+            )
     return Rasterised(*_Rasterise.apply(means, quats, scales, opacities, features, camera, statistic))
