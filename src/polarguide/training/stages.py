@@ -121,6 +121,8 @@ class Recipe:
         stages: in order; their fractions add up to 1.
         rates: learning rates; that of the means is times the scene's extent.
         means_decay: factor on the means' rate at the last step (exponential in between).
+        first_strength: reflection strength that Gaussians start with.
+        environment_spread: first raw texels are uniform in plus or minus this.
         environment_rate: learning rate of the environment's texels.
         environment_resolution: texels along a cube face's side.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
@@ -132,6 +134,8 @@ class Recipe:
     stages: tuple[Stage, ...]
     rates: dict[str, float]
     means_decay: float = 0.01
+    first_strength: float = 1e-3
+    environment_spread: float = 5.0
     environment_rate: float = 0.05
     environment_resolution: int = 128
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
