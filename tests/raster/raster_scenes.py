@@ -63,7 +63,7 @@ def posed(width: int, height: int) -> Camera:
 
 
 def in_view(camera: Camera, count: int, channels: int, seed: int) -> Gaussians:
-    """Float32 Gaussians of many sizes and shapes before a camera, none with a pixel near the cut-off 1/255."""
+    """Float32 Gaussians of many shapes before a camera, none with a pixel near the cut-off 1/255."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:

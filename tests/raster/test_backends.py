@@ -1,4 +1,4 @@
-"""The native kernels against their slow twin in float64, on every instruction set; the same bits each time."""
+"""The native kernels against their slow twin in float64 on every instruction set; always the same bits."""
 
 from __future__ import annotations
 
