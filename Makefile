@@ -4,18 +4,12 @@
 #
 # Needs Python 3.10 or newer with its venv module, a C++17 compiler and make; everything else is fetched from PyPI.
 #   PYTHON=python3.12     the interpreter of the environment (read when .venv is created)
-#   TORCH_INDEX=URL       where PyTorch comes from: by default a build for the CPU; empty: PyPI
 
 PYTHON ?= python3
-TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints-cpu.txt
-# PyTorch comes first and alone, so that the other packages are looked up on PyPI only. Where TORCH_INDEX cannot be
-# reached, pip takes the (larger) PyTorch of PyPI.
-INSTALL_TORCH := $(PIP_INSTALL) --no-deps --retries 1 $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
-
 # Directories are listed too: their time changes when a file is removed.
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
@@ -35,13 +29,11 @@ test: $(VENV)/.installed-test
 
 $(VENV)/.installed: $(SOURCES) | $(VENV)/pyvenv.cfg
 	@echo "Building and installing polarguide into $(VENV); the first time takes minutes."
-	$(INSTALL_TORCH)
 	$(PIP_INSTALL) .
 	@touch $@
 
 $(VENV)/.installed-test: $(SOURCES) | $(VENV)/pyvenv.cfg
 	@echo "Building and installing polarguide and its test tools into $(VENV); the first time takes minutes."
-	$(INSTALL_TORCH)
 	$(PIP_INSTALL) '.[test]'
 	@touch $(VENV)/.installed $@
 

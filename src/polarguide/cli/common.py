@@ -15,7 +15,7 @@ from polarguide.capture import Scene, View, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, DeviceName, choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.shading.render import render
+from polarguide.shading.render import Shading, render
 from polarguide.shading.result import RenderResult
 from polarguide.training.run import RunConfiguration, load_checkpoint
 from polarguide.training.stages import Recipe
@@ -75,6 +75,11 @@ class OpenRun:
     state: TrainingState
     backend: Backend
 
+    @property
+    def shading(self) -> Shading:
+        """How its layers combine."""
+        return self.recipe.shading(self.configuration.settings.refractive_index)
+
     @torch.no_grad()
     def render(self, view: View, *, depth: bool = False) -> RenderResult:
         """All layers of a view."""
@@ -84,6 +89,7 @@ class OpenRun:
             view.camera,
             self.backend.rasterise,
             environment=environment.texels if environment else None,
+            shading=self.shading,
             depth=depth,
         )
 

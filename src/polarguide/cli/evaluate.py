@@ -85,6 +85,7 @@ def _final(opened: OpenRun, view: View) -> object:
         view.camera,
         opened.backend.rasterise,
         environment=environment.texels if environment else None,
+        shading=opened.shading,
         normals=False,
     ).final
 

@@ -166,7 +166,8 @@ def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int) -> None:
             raise KeyboardInterrupt
     finally:
         interrupt.restore()
-    write_run_ply(out / PLY, trainer.state)
+    shading = trainer.recipe.shading(trainer.settings.refractive_index)
+    write_run_ply(out / PLY, trainer.state, shading)
 
 
 def _progress() -> Progress:

@@ -10,6 +10,7 @@ from typing import Literal
 
 from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.initialise import Initialisation
+from polarguide.shading.render import Blend, Shading
 
 Action = Literal[
     "reset_opacity",
@@ -121,6 +122,7 @@ class Recipe:
         stages: in order; their fractions add up to 1.
         rates: learning rates; that of the means is times the scene's extent.
         means_decay: factor on the means' rate at the last step (exponential in between).
+        blend: how base colour and reflection make the picture (see ``Shading``).
         first_strength: reflection strength that Gaussians start with.
         environment_spread: first raw texels are uniform in plus or minus this.
         environment_rate: learning rate of the environment's texels.
@@ -134,6 +136,7 @@ class Recipe:
     stages: tuple[Stage, ...]
     rates: dict[str, float]
     means_decay: float = 0.01
+    blend: Blend = "lerp"
     first_strength: float = 1e-3
     environment_spread: float = 5.0
     environment_rate: float = 0.05
@@ -144,6 +147,10 @@ class Recipe:
     initialisation: Initialisation = Initialisation()
     priors: Priors = Priors()
     propagation: Propagation = Propagation()
+
+    def shading(self, index: float) -> Shading:
+        """The shading of this recipe for surfaces of a refractive index."""
+        return Shading(self.blend, index)
 
     @property
     def reflects(self) -> bool:

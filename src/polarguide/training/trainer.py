@@ -121,6 +121,7 @@ class Trainer:
             self.backend.rasterise,
             sh_degree=self.schedule.sh_degree(state.step),
             environment=state.environment.texels if state.environment and stage.reflection else None,
+            shading=recipe.shading(self.settings.refractive_index),
             normals=bool(stage.weights.normal or stage.weights.azimuth),
             statistic=statistic,
         )
@@ -133,7 +134,8 @@ class Trainer:
         if statistic is not None and statistic.gradient is not None:
             state.statistics.add(statistic.gradient, result.radii, view.camera.width, view.camera.height)
         self._optimise()
-        report = StepReport(state.step, stage.name, float(photometric.detach()), _psnr(result.final, shown), len(state.rows))
+        psnr = _psnr(result.final, shown)
+        report = StepReport(state.step, stage.name, float(photometric.detach()), psnr, len(state.rows))
         state.step += 1
         if stage.densify and state.step % recipe.densification.every == 0:
             densify(
