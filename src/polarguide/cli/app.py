@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import tyro
 from rich.console import Console
@@ -16,7 +17,7 @@ from polarguide.cli.render import render_views
 from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
 
-VERBS = {
+VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
     "train": train,
     "eval": evaluate,

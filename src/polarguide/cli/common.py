@@ -38,10 +38,16 @@ def use_threads(threads: int) -> None:
 def read_scene(path: Path, *, downscale: int, transfer: Transfer) -> Scene:
     """Load a scene with a progress bar and print its warnings."""
     if downscale < 1:
-        raise PolarguideError("--downscale", expected="1 or more", found=str(downscale), remedy="Give a whole factor.")
+        raise PolarguideError(
+            "--downscale", expected="1 or more", found=str(downscale), remedy="Give a whole factor."
+        )
     with Progress(
-        TextColumn("reading {task.fields[name]}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True,
+        TextColumn("reading {task.fields[name]}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
     ) as progress:
         task = progress.add_task("", name=path.name, total=None)
 
@@ -59,7 +65,10 @@ def recipe_named(name: str) -> Recipe:
     """A recipe by name, or a clear error."""
     if name not in RECIPES:
         raise PolarguideError(
-            "recipe", expected="one of " + ", ".join(RECIPES), found=name, remedy="Train again with this version."
+            "recipe",
+            expected="one of " + ", ".join(RECIPES),
+            found=name,
+            remedy="Train again with this version.",
         )
     return RECIPES[name]
 
@@ -102,7 +111,9 @@ def open_run(folder: Path, *, device: DeviceName = "auto") -> OpenRun:
     transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
     scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
     if scene.digest != configuration.scene_digest:
-        console.print(f"[yellow]warning:[/] {configuration.scene} has changed since {folder} was trained on it.")
+        console.print(
+            f"[yellow]warning:[/] {configuration.scene} has changed since {folder} was trained on it."
+        )
     return OpenRun(folder, configuration, scene, recipe, state, choose_backend(device))
 
 

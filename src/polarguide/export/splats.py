@@ -36,7 +36,9 @@ def shown_colours(state: TrainingState, shading: Shading, directions: Tensor) ->
         colour = (evaluate_sh(means, torch.zeros(3), rows["sh_dc"], rows["sh_rest"], 3) + 0.5).clamp(min=0)
         if state.environment is not None:
             facing = torch.where((normals @ direction)[:, None] > 0, -normals, normals)
-            light = shading.light(cubemap_lookup(state.environment.texels, mirrored(means, facing).contiguous()))
+            light = shading.light(
+                cubemap_lookup(state.environment.texels, mirrored(means, facing).contiguous())
+            )
             strength = torch.sigmoid(rows["strength_logits"])[:, None]
             cosine = -(means * facing).sum(dim=-1, keepdim=True).clamp(-1, 0)
             specular, diffuse = shading.layers(colour, strength, light, cosine)

@@ -63,10 +63,10 @@ def evaluate_sh_reference(means: Tensor, centre: Tensor, dc: Tensor, rest: Tenso
 class _Harmonics(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
-        inputs = [t.detach().contiguous() for t in (means, centre, dc, rest)]
-        out = torch.empty_like(inputs[2])
-        _native.harmonics_forward(degree, *inputs, out)
-        ctx.save_for_backward(*inputs)
+        means, centre, dc, rest = (t.detach().contiguous() for t in (means, centre, dc, rest))
+        out = torch.empty_like(dc)
+        _native.harmonics_forward(degree, means, centre, dc, rest, out)
+        ctx.save_for_backward(means, centre, dc, rest)
         ctx.degree = degree
         return out
 
@@ -75,7 +75,9 @@ class _Harmonics(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         means, centre, dc, rest = ctx.saved_tensors
         to_means, to_dc, to_rest = (torch.empty_like(t) for t in (means, dc, rest))
-        _native.harmonics_backward(ctx.degree, means, centre, dc, rest, grad.contiguous(), to_means, to_dc, to_rest)
+        _native.harmonics_backward(
+            ctx.degree, means, centre, dc, rest, grad.contiguous(), to_means, to_dc, to_rest
+        )
         return to_means, None, to_dc, to_rest, None
 
 

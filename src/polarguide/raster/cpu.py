@@ -11,7 +11,13 @@ from torch.autograd.function import once_differentiable
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
-from polarguide.raster.interface import NEAR_PLANE, Rasterised, ScreenStatistic, check_shapes, refuse_not_finite
+from polarguide.raster.interface import (
+    NEAR_PLANE,
+    Rasterised,
+    ScreenStatistic,
+    check_shapes,
+    refuse_not_finite,
+)
 
 
 def native_rasteriser(camera: Camera, channels: int, statistic: ScreenStatistic | None) -> Any:
@@ -64,7 +70,9 @@ class _Rasterise(torch.autograd.Function):
         *inputs, out = ctx.saved_tensors
         gradients = [torch.empty_like(t) for t in inputs]
         screen = torch.empty(inputs[0].shape[0], 2) if ctx.statistic else None
-        ctx.rasteriser.backward(*inputs, out, grad_out.contiguous(), grad_alpha.contiguous(), *gradients, screen)
+        ctx.rasteriser.backward(
+            *inputs, out, grad_out.contiguous(), grad_alpha.contiguous(), *gradients, screen
+        )
         if ctx.statistic:
             ctx.statistic.gradient = screen
         return (*gradients, None, None)

@@ -116,7 +116,10 @@ def check_shapes(
             )
     if not 1 <= channels <= 32:
         raise PolarguideError(
-            "rasterise(features)", expected="1 to 32 channels", found=str(channels), remedy="Split the channels."
+            "rasterise(features)",
+            expected="1 to 32 channels",
+            found=str(channels),
+            remedy="Split the channels.",
         )
     chosen = statistic.channels if statistic else ()
     if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):

@@ -27,7 +27,7 @@ class Rows(Protocol):
     """Named per-Gaussian tensors: the trainable rows, or a frozen copy of them."""
 
     def __getitem__(self, name: str, /) -> Tensor: ...
-    def __contains__(self, name: object, /) -> bool: ...
+    def __contains__(self, name: str, /) -> bool: ...
 
 
 def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
@@ -57,7 +57,9 @@ class Shading:
 
     def light(self, texels: Tensor) -> Tensor:
         """Radiance of raw texel values."""
-        return torch.sigmoid(texels) if self.blend == "lerp" else torch.exp(texels.clamp(max=MAXIMUM_LOG_LIGHT))
+        return (
+            torch.sigmoid(texels) if self.blend == "lerp" else torch.exp(texels.clamp(max=MAXIMUM_LOG_LIGHT))
+        )
 
     def layers(self, base: Tensor, strength: Tensor, light: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
         """Specular and diffuse contributions [..., 3].

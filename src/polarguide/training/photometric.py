@@ -59,9 +59,13 @@ def photometric_loss_reference(
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float) -> Tensor:
+    def forward(
+        ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float
+    ) -> Tensor:
         prediction, target = prediction.detach().contiguous(), target.contiguous()
-        total = float(weight.sum()) if weight is not None else float(prediction.shape[0] * prediction.shape[1])
+        total = (
+            float(weight.sum()) if weight is not None else float(prediction.shape[0] * prediction.shape[1])
+        )
         gradient = torch.empty_like(prediction) if ctx.needs_input_grad[0] else None
         weight = weight.contiguous() if weight is not None else None
         l1, ssim = _native.photometric(prediction, target, weight, max(total, 1.0), ssim_weight, gradient)

@@ -143,10 +143,10 @@ class Recipe:
     environment_resolution: int = 128
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
     ssim_weight: float = 0.2
-    densification: Densification = Densification()
-    initialisation: Initialisation = Initialisation()
-    priors: Priors = Priors()
-    propagation: Propagation = Propagation()
+    densification: Densification = field(default_factory=Densification)
+    initialisation: Initialisation = field(default_factory=Initialisation)
+    priors: Priors = field(default_factory=Priors)
+    propagation: Propagation = field(default_factory=Propagation)
 
     def shading(self, index: float) -> Shading:
         """The shading of this recipe for surfaces of a refractive index."""

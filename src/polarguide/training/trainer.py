@@ -130,7 +130,7 @@ class Trainer:
         loss, photometric = step_loss(
             result, shown, valid, stage.weights, self._priors_of(view, stage), ssim_weight=recipe.ssim_weight
         )
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         if statistic is not None and statistic.gradient is not None:
             state.statistics.add(statistic.gradient, result.radii, view.camera.width, view.camera.height)
         self._optimise()
