@@ -189,19 +189,10 @@ def test_picture_without_a_pose(capture: TinyCapture) -> None:
 
 
 def test_two_poses_of_one_name(capture: TinyCapture) -> None:
+    for angle in (0, 45, 90, 135):
+        capture.picture("v004", angle).unlink()
     edit(model_folder(capture) / "images.txt", "v004.png", "left/v005.jpg")
-    fails(
-        capture.root,
-        "image called v004",
-        "found none",
-    )
-    edit(model_folder(capture) / "images.txt", "v003.png", "right/v004.png")
-    edit(model_folder(capture) / "images.txt", "v002.png", "v003.png")
-    assert "v002" not in read_model(capture.root).names
-    with pytest.raises(
-        PolarguideError, match=r"image called v005.*found (left/v005.jpg, v005.png|v005.png, left)"
-    ):
-        load_scene(capture.root, views=["v003", "v005"])
+    fails(capture.root, "one posed image called v005", "found left/v005.jpg, v005.png")
 
 
 def test_pose_without_pictures(capture: TinyCapture) -> None:
@@ -210,4 +201,4 @@ def test_pose_without_pictures(capture: TinyCapture) -> None:
             capture.picture(view, angle).unlink()
     scene = load_scene(capture.root)
     assert len(scene.views) == 7
-    assert scene.warnings == ("The COLMAP model has poses for images without pictures (v002, v006).",)
+    assert scene.warnings == ("The COLMAP model has poses for 2 images without pictures (v002, v006).",)

@@ -17,7 +17,7 @@ from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_pict
 
 from polarguide.capture import load_scene
 from polarguide.capture.integrity import find_damage
-from polarguide.capture.pictures import decode_picture
+from polarguide.capture.pictures import decode_picture, linear_codes
 from polarguide.errors import PolarguideError
 
 tifffile = pytest.importorskip("tifffile", reason="tifffile writes the unusual TIFF files")
@@ -85,10 +85,8 @@ def test_srgb_is_made_linear(capture: TinyCapture, bits: int) -> None:
     )
 
 
-def test_srgb_curve_meets_its_known_points(tmp_path: Path) -> None:
+def test_srgb_curve_meets_its_known_points() -> None:
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    from polarguide.capture.pictures import linear_codes
-
     codes = linear_codes(ramp, "srgb")[0, :, 0]
     assert (codes[0], codes[255]) == (0, 65535)
     assert codes[188] / 65535 == pytest.approx(0.5029, abs=1e-4)
@@ -219,6 +217,11 @@ def test_pictures_of_one_view_differ(capture: TinyCapture) -> None:
     )
     write_picture(capture.picture("v003", 135), capture.linear["v003"][3], bits=8)
     fails(capture.root, "v003_135.png", "found 12x10 with 8 bits", "Export the four pictures of a view alike")
+
+
+def test_a_view_of_another_size_than_its_camera(capture: TinyCapture) -> None:
+    capture.write_view("v003", ideal_intensities(0, height=8, width=12))
+    fails(capture.root, "camera of view v003", "the size of the pictures, 12x8", "found 12x10", "no crop")
 
 
 def test_views_differ_in_depth(capture: TinyCapture) -> None:
