@@ -6,6 +6,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
+import torchmetrics.image.lpip  # noqa: F401  (before the stand-in below can be mistaken for the real torchvision)
 from torch import nn
 
 from polarguide.evaluation import lpips

@@ -133,6 +133,10 @@ def test_reads_files_of_lower_degree_and_unknown_fields(tmp_path, rest, coeffici
             lambda text: text.replace(b"comment extra strength", b"comment extra strength 3"),
             "strength that a comment",
         ),
+        (
+            lambda text: text.replace(b"property float x\n", b"property list uchar float x\n"),
+            "list property|a PLY file",
+        ),
         (lambda text: text[:-1], "expected a PLY file"),
         (lambda text: b"a picture, perhaps\n", "expected a PLY file"),
         (lambda text: b"\xff\xfe\x00\n\x81", "expected a PLY file"),

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from torch import Tensor
 
 from polarguide.errors import PolarguideError
@@ -121,9 +122,12 @@ def read_ply(path: str | Path) -> dict[str, Any]:
         found = f"no {missing[0]}" if missing else f"{rest} fields f_rest_*"
         raise _unreadable(path, "the vertex fields of a 3DGS file (degree 0 to 3)", found)
 
+    # One pass over the records: reading field by field would walk the whole file for each.
+    table = torch.from_numpy(structured_to_unstructured(np.asarray(element.data), dtype=np.float32))
+    column = {name: index for index, name in enumerate(names)}
+
     def tensor(fields: list[str], *shape: int) -> Tensor:
-        table = np.stack([np.asarray(element.data[f], dtype=np.float32) for f in fields], axis=1)
-        return _from_columns(torch.from_numpy(table), shape)
+        return _from_columns(table[:, [column[f] for f in fields]], shape)
 
     extra = {}
     taken = {*RELEASE_FIELDS}
@@ -225,14 +229,17 @@ def _from_columns(table: Tensor, shape: tuple[int, ...]) -> Tensor:
 
 def _read_vertex(path: str | Path) -> PlyElement:
     try:
-        data = PlyData.read(path, mmap=False)
+        data = PlyData.read(path)
     except FileNotFoundError:
         raise _unreadable(path, "a PLY file", "no file") from None
     except (PlyParseError, ValueError, EOFError) as error:
         raise _unreadable(path, "a PLY file", f"something else ({error})") from error
     if "vertex" not in data:
         raise _unreadable(path, "a vertex element", "none")
-    return data["vertex"]
+    vertex = data["vertex"]
+    if any(isinstance(field, PlyListProperty) for field in vertex.properties):
+        raise _unreadable(path, "vertices of plain numbers", "a list property")
+    return vertex
 
 
 def _unreadable(path: str | Path, expected: str, found: str) -> PolarguideError:
