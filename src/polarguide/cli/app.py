@@ -50,4 +50,8 @@ def run(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+    except OSError as error:  # missing rights, a full disk, a file where a folder should be
+        errors.print("[bold red]error:[/] ", end="")
+        errors.print(f"{error.filename or 'files'}: {error.strerror or error}.", markup=False)
+        return 2
     return 0

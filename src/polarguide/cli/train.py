@@ -130,6 +130,9 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
     for field in ("scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer"):
         a, b = getattr(old, field), getattr(new, field)
         if a != b:
+            if isinstance(a, dict):  # a recipe: show what differs
+                keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
+                a, b = ({key: values.get(key) for key in keys} for values in (a, b))
             raise PolarguideError(
                 f"{out}/{CONFIGURATION} ({field})",
                 expected=json.dumps(a, default=str)[:120],

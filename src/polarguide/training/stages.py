@@ -85,12 +85,14 @@ class Priors:
         candidates: which polarization normals are considered.
         separation: which separation supervises the layers.
         threshold: DoLP above which a pixel's normal is used.
+        full_dolp: DoLP from which on a pixel's normal counts fully; below, in proportion.
         azimuth_weight: in [0, 1], how much the choice among candidates trusts azimuth over zenith.
     """
 
     candidates: Candidates = "physical"
     separation: Separation = "exact"
     threshold: float = 0.05
+    full_dolp: float = 0.3
     azimuth_weight: float = 0.5
 
 
