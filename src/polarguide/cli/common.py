@@ -121,5 +121,11 @@ def select_views(scene: Scene, choice: str) -> tuple[View, ...]:
     """The views that ``--views`` names: ``test``, ``train``, ``all``, or names separated by commas."""
     groups = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}
     if choice in groups:
-        return groups[choice]
-    return tuple(scene.view(name.strip()) for name in choice.split(",") if name.strip())
+        chosen = groups[choice]
+    else:
+        chosen = tuple(scene.view(name.strip()) for name in choice.split(",") if name.strip())
+    if not chosen:
+        raise PolarguideError(
+            "--views", expected="at least one view", found="none", remedy="Name a view, or take train."
+        )
+    return chosen

@@ -63,12 +63,12 @@ def priors(
                 found=str(downscale),
                 remedy="Give the same factor.",
             )
-    loaded = read_scene(scene, downscale=downscale, transfer=transfer)
+    chosen = select_views(read_scene(scene, downscale=downscale, transfer=transfer), views)
     out.mkdir(parents=True, exist_ok=True)
     rows: list[list[Picture]] = []
     labels: list[str] = []
     names: list[str] = []
-    for view in select_views(loaded, views):
+    for view in chosen:
         pictures = prior_pictures(view, opened, refractive_index, threshold)
         names = list(pictures)
         for name, picture in pictures.items():
