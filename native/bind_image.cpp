@@ -1,8 +1,7 @@
+#include "arrays.h"
 #include "image.h"
 #include "parallel.h"
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
@@ -17,7 +16,6 @@ using namespace polarguide;
 
 namespace {
 
-using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using Indices = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
 
 void expect_size(const Array &array, const char *name, int64_t size) {
@@ -25,6 +23,8 @@ void expect_size(const Array &array, const char *name, int64_t size) {
         throw std::invalid_argument(std::string(name) + ": expected " + std::to_string(size) + " numbers, found " +
                                     std::to_string(array.size()));
 }
+
+int64_t rows(const Array &array) { return array.ndim() ? int64_t(array.shape(0)) : 0; }
 
 constexpr int64_t row_chunk = 4, item_chunk = 2048;
 constexpr int maximum_width = 4096;
@@ -88,10 +88,11 @@ CubemapArgs cubemap_args(const Array &texture, const Indices &border, const Arra
 }
 
 HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest) {
-    const int64_t n = int64_t(means.shape(0));
-    if (degree < 0 || degree > 3) throw std::invalid_argument("degree: expected 0 to 3");
-    expect_size(means, "means", 3 * n), expect_size(centre, "centre", 3), expect_size(dc, "dc", 3 * n);
-    expect_size(rest, "rest", 45 * n);
+    if (degree < 0 || degree > 3)
+        throw std::invalid_argument("degree: expected 0 to 3, found " + std::to_string(degree));
+    const int64_t n = rows(means);
+    expect_shape(means, "means", {n, 3}), expect_shape(centre, "centre", {3}), expect_shape(dc, "dc", {n, 3});
+    expect_shape(rest, "rest", {n, 15, 3});
     HarmonicsArgs a{};
     a.degree = degree, a.means = means.data(), a.centre = centre.data(), a.dc = dc.data(), a.rest = rest.data();
     return a;
@@ -138,22 +139,23 @@ void bind_image(nb::module_ &module) {
         "harmonics_forward",
         [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest, Array out) {
             HarmonicsArgs a = harmonics_args(degree, means, centre, dc, rest);
-            const int64_t n = int64_t(means.shape(0));
-            expect_size(out, "out", 3 * n);
+            const int64_t n = rows(means);
+            expect_shape(out, "out", {n, 3});
             a.out = out.data();
             nb::gil_scoped_release release;
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_forward)(a, b, e); };
             parallel_chunks(n, item_chunk, body);
         },
-        nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"));
+        nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"),
+        "Sum of the harmonics towards each Gaussian.");
     module.def(
         "harmonics_backward",
         [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest,
            const Array &grad_out, Array grad_means, Array grad_dc, Array grad_rest) {
             HarmonicsArgs a = harmonics_args(degree, means, centre, dc, rest);
-            const int64_t n = int64_t(means.shape(0));
-            expect_size(grad_out, "grad_out", 3 * n), expect_size(grad_means, "grad_means", 3 * n);
-            expect_size(grad_dc, "grad_dc", 3 * n), expect_size(grad_rest, "grad_rest", 45 * n);
+            const int64_t n = rows(means);
+            expect_shape(grad_out, "grad_out", {n, 3}), expect_shape(grad_means, "grad_means", {n, 3});
+            expect_shape(grad_dc, "grad_dc", {n, 3}), expect_shape(grad_rest, "grad_rest", {n, 15, 3});
             a.grad_out = grad_out.data(), a.grad_means = grad_means.data(), a.grad_dc = grad_dc.data();
             a.grad_rest = grad_rest.data();
             nb::gil_scoped_release release;
@@ -161,5 +163,5 @@ void bind_image(nb::module_ &module) {
             parallel_chunks(n, item_chunk, body);
         },
         nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("grad_out"),
-        nb::arg("grad_means"), nb::arg("grad_dc"), nb::arg("grad_rest"));
+        nb::arg("grad_means"), nb::arg("grad_dc"), nb::arg("grad_rest"), "Fills the three gradients.");
 }

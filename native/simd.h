@@ -4,7 +4,15 @@
 #include <stdint.h>
 
 #if defined(__AVX512F__) || defined(__AVX2__)
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wmaybe-uninitialized" // GCC 12 warns about its own "undefined" vectors
+#pragma GCC diagnostic ignored "-Wuninitialized"
+#endif
 #include <immintrin.h>
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC diagnostic pop
+#endif
 #endif
 
 #define POLARGUIDE_INLINE static inline __attribute__((always_inline))
@@ -77,11 +85,11 @@ POLARGUIDE_INLINE vf exp2(vf x) {
     return as_float(as_int(p) + (as_int(shifted) << 23));
 }
 
-// out[c][r] = in[r][c] for 16 x 16 floats.
-POLARGUIDE_INLINE void transpose16(const float *in, float *out) {
+// out[c][r] = in[r][c] for 16 x 16 floats; rows are `in_stride` and `out_stride` apart.
+POLARGUIDE_INLINE void transpose16(const float *in, int64_t in_stride, float *out, int64_t out_stride) {
 #if defined(__AVX512F__)
     __m512 r[16], t[16];
-    for (int i = 0; i < 16; ++i) r[i] = _mm512_loadu_ps(in + 16 * i);
+    for (int i = 0; i < 16; ++i) r[i] = _mm512_loadu_ps(in + in_stride * i);
     for (int i = 0; i < 16; i += 2) {
         t[i] = _mm512_unpacklo_ps(r[i], r[i + 1]);
         t[i + 1] = _mm512_unpackhi_ps(r[i], r[i + 1]);
@@ -96,26 +104,27 @@ POLARGUIDE_INLINE void transpose16(const float *in, float *out) {
     for (int c = 0; c < 4; ++c) {
         __m512 x = _mm512_shuffle_f32x4(r[c], r[4 + c], 0x88), y = _mm512_shuffle_f32x4(r[8 + c], r[12 + c], 0x88);
         __m512 z = _mm512_shuffle_f32x4(r[c], r[4 + c], 0xdd), w = _mm512_shuffle_f32x4(r[8 + c], r[12 + c], 0xdd);
-        _mm512_storeu_ps(out + 16 * c, _mm512_shuffle_f32x4(x, y, 0x88));
-        _mm512_storeu_ps(out + 16 * (c + 4), _mm512_shuffle_f32x4(z, w, 0x88));
-        _mm512_storeu_ps(out + 16 * (c + 8), _mm512_shuffle_f32x4(x, y, 0xdd));
-        _mm512_storeu_ps(out + 16 * (c + 12), _mm512_shuffle_f32x4(z, w, 0xdd));
+        _mm512_storeu_ps(out + out_stride * c, _mm512_shuffle_f32x4(x, y, 0x88));
+        _mm512_storeu_ps(out + out_stride * (c + 4), _mm512_shuffle_f32x4(z, w, 0x88));
+        _mm512_storeu_ps(out + out_stride * (c + 8), _mm512_shuffle_f32x4(x, y, 0xdd));
+        _mm512_storeu_ps(out + out_stride * (c + 12), _mm512_shuffle_f32x4(z, w, 0xdd));
     }
 #else
     typedef float v4 __attribute__((vector_size(16), aligned(4), may_alias));
     for (int i = 0; i < 16; i += 4)
         for (int j = 0; j < 16; j += 4) {
-            v4 a = *(const v4 *)(in + 16 * i + j), b = *(const v4 *)(in + 16 * (i + 1) + j);
-            v4 c = *(const v4 *)(in + 16 * (i + 2) + j), d = *(const v4 *)(in + 16 * (i + 3) + j);
+            v4 a = *(const v4 *)(in + in_stride * i + j), b = *(const v4 *)(in + in_stride * (i + 1) + j);
+            v4 c = *(const v4 *)(in + in_stride * (i + 2) + j), d = *(const v4 *)(in + in_stride * (i + 3) + j);
             v4 ab0 = __builtin_shufflevector(a, b, 0, 4, 1, 5), ab1 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
             v4 cd0 = __builtin_shufflevector(c, d, 0, 4, 1, 5), cd1 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
-            *(v4 *)(out + 16 * j + i) = __builtin_shufflevector(ab0, cd0, 0, 1, 4, 5);
-            *(v4 *)(out + 16 * (j + 1) + i) = __builtin_shufflevector(ab0, cd0, 2, 3, 6, 7);
-            *(v4 *)(out + 16 * (j + 2) + i) = __builtin_shufflevector(ab1, cd1, 0, 1, 4, 5);
-            *(v4 *)(out + 16 * (j + 3) + i) = __builtin_shufflevector(ab1, cd1, 2, 3, 6, 7);
+            *(v4 *)(out + out_stride * j + i) = __builtin_shufflevector(ab0, cd0, 0, 1, 4, 5);
+            *(v4 *)(out + out_stride * (j + 1) + i) = __builtin_shufflevector(ab0, cd0, 2, 3, 6, 7);
+            *(v4 *)(out + out_stride * (j + 2) + i) = __builtin_shufflevector(ab1, cd1, 0, 1, 4, 5);
+            *(v4 *)(out + out_stride * (j + 3) + i) = __builtin_shufflevector(ab1, cd1, 2, 3, 6, 7);
         }
 #endif
 }
+POLARGUIDE_INLINE void transpose16(const float *in, float *out) { transpose16(in, 16, out, 16); }
 
 } // namespace
 } // namespace POLARGUIDE_ISA
