@@ -5,11 +5,11 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <memory>
 #include <optional>
 #include <stdexcept>
 #include <string>
 #include <tuple>
-#include <vector>
 
 namespace nb = nanobind;
 using namespace polarguide;
@@ -26,52 +26,53 @@ void expect_size(const Array &array, const char *name, int64_t size) {
 
 int64_t rows(const Array &array) { return array.ndim() ? int64_t(array.shape(0)) : 0; }
 
-constexpr int64_t row_chunk = 4, item_chunk = 2048;
-constexpr int maximum_width = 4096;
+constexpr int64_t row_chunk = 8, item_chunk = 2048;
+
+// Work memory of the photometric loss: five planes and a scratch for each worker. Not cleared: every float is written
+// before it is read.
+class PhotometricMemory {
+  public:
+    PhotometricMemory(PhotometricArgs &a, int workers)
+        : planes_(new float[size_t(a.stride) * size_t(a.height) * 5]), sums_(new double[size_t(a.height) * 2]),
+          size_(photometric_scratch(a.stride)), scratch_(new float[size_t(size_) * size_t(workers)]) {
+        float *next = planes_.get();
+        for (float **plane : {&a.shown, &a.goal, &a.parts[0], &a.parts[1], &a.parts[2]})
+            *plane = next, next += a.stride * a.height;
+        a.row_l1 = sums_.get(), a.row_ssim = a.row_l1 + a.height;
+    }
+    float *scratch(int worker) { return scratch_.get() + worker * size_; }
+
+  private:
+    std::unique_ptr<float[]> planes_;
+    std::unique_ptr<double[]> sums_;
+    int64_t size_;
+    std::unique_ptr<float[]> scratch_;
+};
 
 std::tuple<double, double> photometric(const Array &prediction, const Array &target, std::optional<Array> weight,
                                        double weight_sum, float ssim_weight, std::optional<Array> gradient) {
-    if (prediction.ndim() != 3 || prediction.shape(2) != 3)
-        throw std::invalid_argument("prediction: expected shape [H, W, 3]");
+    const int64_t height = rows(prediction), width = prediction.ndim() > 1 ? int64_t(prediction.shape(1)) : 0;
+    expect_shape(prediction, "prediction", {height, width, 3}), expect_shape(target, "target", {height, width, 3});
+    if (weight) expect_shape(*weight, "weight", {height, width});
+    if (gradient) expect_shape(*gradient, "gradient", {height, width, 3});
+    if (height * width == 0) return {0.0, 0.0};
     PhotometricArgs a{};
-    a.height = int(prediction.shape(0)), a.width = int(prediction.shape(1));
-    if (a.width > maximum_width) throw std::invalid_argument("prediction: expected a width of at most 4096");
-    const int64_t pixels = int64_t(a.width) * a.height;
-    expect_size(target, "target", pixels * 3);
-    if (weight) expect_size(*weight, "weight", pixels);
-    if (gradient) expect_size(*gradient, "gradient", pixels * 3);
-    nb::gil_scoped_release release;
-    // Planes are read sixteen columns at a time: room behind the last.
-    const int64_t plane = 3 * pixels, room = plane + 16;
-    std::vector<float> memory(size_t(room) * 11, 0.0f);
-    float *next = memory.data();
-    auto take = [&] {
-        float *p = next;
-        next += room;
-        return p;
-    };
-    a.shown = take(), a.slope = take(), a.goal = take();
-    for (float *&p : a.rows) p = take();
-    for (float *&p : a.parts) p = take();
-    std::vector<double> l1(size_t(a.height), 0.0), ssim(size_t(a.height), 0.0);
-    a.row_l1 = l1.data(), a.row_ssim = ssim.data();
+    a.height = int(height), a.width = int(width), a.stride = (3 * width + 15) / 16 * 16;
     a.prediction = prediction.data(), a.target = target.data(), a.weight = weight ? weight->data() : nullptr;
     a.gradient = gradient ? gradient->data() : nullptr;
     a.ssim_weight = ssim_weight, a.inverse_count = float(1.0 / (3.0 * weight_sum));
-    auto show = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_show)(a, b, e); };
-    auto statistics = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_statistics)(a, b, e); };
-    auto spread = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_spread)(a, b, e); };
-    auto derive = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_gradient)(a, b, e); };
-    parallel_chunks(a.height, row_chunk, show);
-    parallel_chunks(a.height, row_chunk, statistics);
-    if (gradient) {
-        parallel_chunks(a.height, row_chunk, spread);
-        parallel_chunks(a.height, row_chunk, derive);
-    }
-    double sum_l1 = 0.0, sum_ssim = 0.0;
-    for (double x : l1) sum_l1 += x;
-    for (double x : ssim) sum_ssim += x;
-    return {sum_l1 / (3.0 * weight_sum), sum_ssim / (3.0 * weight_sum)};
+    nb::gil_scoped_release release;
+    PhotometricMemory memory(a, thread_count());
+    auto run = [&](void (*kernel)(const PhotometricArgs &, int64_t, int64_t, float *)) {
+        auto body = [&](int64_t b, int64_t e, int worker) { kernel(a, b, e, memory.scratch(worker)); };
+        parallel_chunks(height, row_chunk, body);
+    };
+    run(POLARGUIDE_DISPATCH(photometric_show));
+    run(POLARGUIDE_DISPATCH(photometric_statistics));
+    if (gradient) run(POLARGUIDE_DISPATCH(photometric_gradient));
+    double l1 = 0.0, ssim = 0.0;
+    for (int64_t y = 0; y < height; ++y) l1 += a.row_l1[y], ssim += a.row_ssim[y];
+    return {l1 / (3.0 * weight_sum), ssim / (3.0 * weight_sum)};
 }
 
 CubemapArgs cubemap_args(const Array &texture, const Indices &border, const Array &directions) {

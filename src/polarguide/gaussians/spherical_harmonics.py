@@ -1,6 +1,6 @@
 """Real spherical harmonics to degree 3, in the order and with the signs of the 3DGS release.
 
-Degree 1 is in the order -y, z, -x. On the CPU in float32 a native kernel evaluates the colours of all Gaussians;
+Degree 1 is in the order -y, z, -x. On the CPU in float32 a native kernel evaluates the colours;
 ``evaluate_sh_reference`` is its twin in plain torch.
 """
 
