@@ -1,5 +1,92 @@
-"""The compiled module (``native/``); its docstrings say what each function takes."""
+"""The native kernels (``native/``). Arrays are float32, contiguous, on the CPU."""
 
-from typing import Any
+from collections.abc import Sequence
 
-def __getattr__(name: str) -> Any: ...
+from torch import Tensor
+
+MAX_CHANNELS: int
+
+def thread_count() -> int: ...
+def set_thread_count(threads: int) -> None: ...
+def simd() -> str: ...
+def select_simd(name: str) -> None: ...
+def first_not_finite(array: Tensor) -> int: ...
+def fma_peak(seconds: float = 0.5) -> float: ...
+
+class Rasteriser:
+    def __init__(
+        self,
+        rotation: Sequence[float],
+        translation: Sequence[float],
+        intrinsics: Sequence[float],
+        width: int,
+        height: int,
+        near_plane: float,
+        permutation: Sequence[int],
+        statistic_channels: int,
+    ) -> None: ...
+    def forward(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        out: Tensor,
+        alpha: Tensor,
+        radius: Tensor,
+        count_pairs: bool = False,
+    ) -> None: ...
+    def backward(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        out: Tensor,
+        grad_out: Tensor,
+        grad_alpha: Tensor,
+        d_means: Tensor,
+        d_quats: Tensor,
+        d_scales: Tensor,
+        d_opacities: Tensor,
+        d_features: Tensor,
+        statistic: Tensor | None,
+    ) -> None: ...
+    @property
+    def pairs(self) -> int: ...
+    @property
+    def instances(self) -> int: ...
+
+def photometric(
+    prediction: Tensor,
+    target: Tensor,
+    weight: Tensor | None,
+    weight_sum: float,
+    ssim_weight: float,
+    gradient: Tensor | None,
+) -> tuple[float, float]: ...
+def cubemap_forward(texture: Tensor, border: Tensor, directions: Tensor, out: Tensor) -> None: ...
+def cubemap_backward(
+    texture: Tensor,
+    border: Tensor,
+    directions: Tensor,
+    grad_out: Tensor,
+    grad_texture: Tensor | None,
+    grad_directions: Tensor | None,
+) -> None: ...
+def harmonics_forward(
+    degree: int, means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, out: Tensor
+) -> None: ...
+def harmonics_backward(
+    degree: int,
+    means: Tensor,
+    centre: Tensor,
+    dc: Tensor,
+    rest: Tensor,
+    grad_out: Tensor,
+    grad_means: Tensor,
+    grad_dc: Tensor,
+    grad_rest: Tensor,
+) -> None: ...

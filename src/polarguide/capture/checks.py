@@ -6,6 +6,7 @@ few sentences (``exposure_warnings``, ``polarization_warnings``).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -54,7 +55,7 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_]) -> Measures:
         codes: linear codes [4, H, W, 3].
         usable: pixels that are neither saturated nor invalid, [H, W].
     """
-    step = max(1, int(np.sqrt(usable.size / _SAMPLES)))
+    step = max(1, math.ceil(math.sqrt(usable.size / _SAMPLES)))
     sample = codes[:, ::step, ::step].astype(np.float64)
     bright = float(np.percentile(sample, 99.0)) / FULL_CODE
     grey = sample.mean(axis=3)
@@ -137,26 +138,23 @@ def exposure_warnings(
 
 def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], transfer: str) -> list[str]:
     """Sentences about the order of the files and their encoding."""
-    off = [
-        (name, found.residuals)
-        for name, found in zip(names, measures, strict=True)
-        if _is_off(found.residuals)
-    ]
+    off = {name: m.residuals for name, m in zip(names, measures, strict=True) if _is_off(m.residuals)}
     warnings = []
+    swapped = False
     if off:
-        pairs = np.median([residuals for _, residuals in off], axis=0)
+        pairs = np.median(list(off.values()), axis=0)
         hint = "Probably files are swapped, or the transfer is wrong"
         best = int(pairs.argmin())
         if best:
             swap = ("45 and 90 (or 0 and 135)", "90 and 135 (or 0 and 45)")[best - 1]
             hint = f"The pictures at {swap} degrees are probably swapped"
+            swapped = len(off) * 2 > len(names)
         warnings.append(
             f"I0 + I90 differs from I45 + I135 by {pairs[0]:.1%} of S0 (median) in {len(off)} of "
-            f"{len(names)} views ({listed([name for name, _ in off])}); a sound capture stays under "
-            f"{_RESIDUAL:.0%}. {hint}."
+            f"{len(names)} views ({listed(list(off))}); a sound capture stays under {_RESIDUAL:.0%}. {hint}."
         )
     slope = curvature(measures)
-    if len(off) * 2 > len(names) or slope is None:
+    if swapped or slope is None:  # with the wrong pairs the slope means nothing
         return warnings
     if transfer == "linear" and slope < _ENCODED_CURVATURE:
         warnings.append(

@@ -57,7 +57,8 @@ class ColmapModel:
             raise PolarguideError(
                 self.folder,
                 expected=f"one posed image called {view} (any suffix)",
-                found=", ".join(image.name for image in images) or f"none; the nearest are {', '.join(near)}",
+                found=", ".join(sorted(image.name for image in images))
+                or f"none; the nearest are {', '.join(near)}",
                 remedy="Register the view in COLMAP under this name, or leave out its pictures.",
             )
         return _camera_of(self.folder, images[0], self._cameras[images[0].camera_id])
@@ -94,7 +95,11 @@ def read_model(root: Path) -> ColmapModel:
             found="none",
             remedy="Triangulate points with the known poses (colmap point_triangulator).",
         )
-    warnings = (f"{folder.name}: {dropped} 3D points are not finite and were left out.",) if dropped else ()
+    warnings = (
+        (f"{dropped} of {dropped + len(points)} 3D points are not finite and were left out.",)
+        if dropped
+        else ()
+    )
     return ColmapModel(folder, files, points, colours, warnings, images, dict(model.cameras))
 
 
@@ -168,10 +173,8 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     rotation = np.asarray(pose.rotation.matrix(), dtype=np.float64)
     translation = np.asarray(pose.translation, dtype=np.float64)
     inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (
-        off < 1e-6 and np.isfinite(translation).all() and np.isfinite(inner).all() and min(inner[:2]) > 0
-    ):
+    numbers = np.isfinite([*translation, *inner]).all() and min(inner[:2]) > 0
+    if not numbers or abs(float(np.linalg.norm(pose.rotation.quat)) - 1.0) > 1e-6:
         raise PolarguideError(
             where,
             expected="a unit quaternion, a finite translation and positive focal lengths",
@@ -193,7 +196,8 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
 def _points_of(model: Any) -> tuple[Tensor, Tensor, int]:
     """Finite points and their colours, and how many points are not finite."""
     points = [point for _, point in sorted(model.points3D.items())]
-    places = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
+    with np.errstate(over="ignore"):
+        places = np.array([point.xyz for point in points]).reshape(-1, 3).astype(np.float32)
     colours = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     finite = np.isfinite(places).all(axis=1)
     return torch.from_numpy(places[finite]), torch.from_numpy(colours[finite]), int((~finite).sum())

@@ -13,7 +13,7 @@ import zlib
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-_TIFF_SIZES = {1: 1, 3: 2, 4: 4}
+_TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _TIFF_CODES = {1: "B", 3: "H", 4: "I"}
 _TIFF_STRIPS = ((273, 279), (324, 325))
 
@@ -88,9 +88,11 @@ def _tiff_is_complete(data: bytes) -> bool:
         for index in range(count):
             entry = start + 2 + 12 * index
             tag, kind, length = struct.unpack_from(order + "HHI", data, entry)
-            if kind in _TIFF_SIZES and any(tag in pair for pair in _TIFF_STRIPS):
-                inline = length * _TIFF_SIZES[kind] <= 4
-                at = entry + 8 if inline else struct.unpack_from(order + "I", data, entry + 8)[0]
+            size = length * _TIFF_SIZES.get(kind, 0)
+            at = entry + 8 if size <= 4 else struct.unpack_from(order + "I", data, entry + 8)[0]
+            if at + size > len(data):
+                return False
+            if kind in _TIFF_CODES and any(tag in pair for pair in _TIFF_STRIPS):
                 tags[tag] = struct.unpack_from(f"{order}{length}{_TIFF_CODES[kind]}", data, at)
     except struct.error:
         return False

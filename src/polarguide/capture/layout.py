@@ -69,11 +69,11 @@ def find_layout(root: Path) -> Layout:
     sides: dict[str, dict[str, Path]] = {}
     for folder, suffixes in (("masks", SUFFIXES), ("invalid", SUFFIXES), ("gt", (".npz",))):
         files = _index(root / folder, suffixes)
-        strangers = sorted(files.keys() - pictures.keys())
+        strangers = sorted(path.name for stem, path in files.items() if stem not in pictures)
         if strangers:
             warnings.append(
-                f"{folder}/ has {len(strangers)} files that belong to no view and are not used "
-                f"({listed(strangers)}): a file there is named like its view."
+                f"{folder}/ has files that belong to no view and are not used ({listed(strangers)}): "
+                "name a file there like its view."
             )
         sides[folder] = files
     without = sorted(pictures.keys() - sides["masks"].keys())
@@ -115,7 +115,7 @@ def _require_complete(layout: Layout, names: list[str]) -> None:
     name = incomplete[0]
     have = layout.pictures[name]
     missing = next(angle for angle in ANGLES if angle not in have)
-    others = f" ({len(incomplete) - 1} other views are incomplete too)" if len(incomplete) > 1 else ""
+    others = f" ({len(incomplete)} views are incomplete)" if len(incomplete) > 1 else ""
     raise PolarguideError(
         _sibling(layout, have, missing),
         expected=f"the picture of view {name} at {missing} degrees",
@@ -145,7 +145,7 @@ def _read_flat(folder: Path, warnings: list[str]) -> dict[str, dict[int, Path]]:
             pictures.setdefault(match["view"], {})[int(match["angle"])] = path
     if strangers:
         warnings.append(
-            f"polar/ has {len(strangers)} pictures whose names do not end in _000, _045, _090 or _135 and "
+            f"polar/ has pictures whose names do not end in _000, _045, _090 or _135 and "
             f"that are not used ({listed(strangers)})."
         )
     return pictures

@@ -13,7 +13,7 @@ import numpy as np
 
 from polarguide.camera import Camera
 from polarguide.capture import checks
-from polarguide.capture.colmap import fit_camera, read_model, unused_poses
+from polarguide.capture.colmap import ColmapModel, fit_camera, read_model, unused_poses
 from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.pictures import TRANSFERS
 from polarguide.capture.sidecars import held_out, parse_json, refractive_index_of
@@ -67,18 +67,17 @@ def load_scene(
     for name in names:
         model.camera(name)  # a missing pose is to be found before the pictures are read
 
+    def read(name: str) -> ViewData:
+        return read_view(layout, name, factor=downscale, transfer=transfer)
+
     data: list[ViewData] = []
     cameras: list[Camera] = []
-    scaled: list[tuple[str, str]] = []
     with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-        for item in pool.map(
-            lambda name: read_view(layout, name, factor=downscale, transfer=transfer), names
-        ):
-            camera = model.camera(item.name)
-            cameras.append(fit_camera(camera, *item.size, folder=model.folder, view=item.name))
-            if cameras[-1] is not camera:
-                scaled.append((item.name, f"{camera.width}x{camera.height}"))
+        for item in pool.map(read, names):
             data.append(item)
+            cameras.append(
+                fit_camera(model.camera(item.name), *item.size, folder=model.folder, view=item.name)
+            )
             files.digests.update(item.digests)
             if progress is not None:
                 progress(len(data), len(names))
@@ -97,13 +96,7 @@ def load_scene(
         downscale=downscale,
         transfer=transfer,
         digest=_digest_all(root, files),
-        warnings=(
-            *layout.warnings,
-            *model.warnings,
-            *unused_poses(model, layout.names),
-            *_scaling_warning(scaled, len(data)),
-            *warnings,
-        ),
+        warnings=(*layout.warnings, *model.warnings, *_pose_warnings(model, layout.names, data), *warnings),
     )
 
 
@@ -151,16 +144,19 @@ def _judge(data: list[ViewData], transfer: str) -> tuple[int | None, list[str]]:
     return scale, warnings + checks.polarization_warnings(names, measures, transfer)
 
 
-def _scaling_warning(scaled: list[tuple[str, str]], count: int) -> list[str]:
-    """A warning about intrinsics that were made for another size, given view names and those sizes."""
-    if not scaled:
-        return []
-    sizes = ", ".join(sorted({size for _, size in scaled}))
-    return [
-        f"The intrinsics were made for another resolution ({sizes}) than that of the pictures and were scaled "
-        f"in {len(scaled)} of {count} views ({listed([name for name, _ in scaled])}): right if the pictures "
-        "were resized, wrong if they were cropped."
-    ]
+def _pose_warnings(model: ColmapModel, all_names: list[str], data: list[ViewData]) -> list[str]:
+    """What does not match between the COLMAP model and the pictures, where it could be put right."""
+    warnings = unused_poses(model, all_names)
+    sizes = {item.name: (model.camera(item.name).width, model.camera(item.name).height) for item in data}
+    scaled = [item.name for item in data if item.size != sizes[item.name]]
+    if scaled:
+        found = ", ".join(f"{width}x{height}" for width, height in sorted({sizes[name] for name in scaled}))
+        warnings.append(
+            f"The intrinsics were made for another resolution ({found}) than that of the pictures and were "
+            f"scaled in {len(scaled)} of {len(data)} views ({listed(scaled)}): right if the pictures were "
+            "resized, wrong if they were cropped."
+        )
+    return warnings
 
 
 def _digest_all(root: Path, files: Files) -> str:

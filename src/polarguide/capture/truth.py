@@ -53,7 +53,7 @@ def _read_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             return {name: archive[name] for name in _CHANNELS if name in archive.files}
-    except (ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise PolarguideError(
             path,
             expected="a NumPy .npz file with normal, depth, mask, specular or diffuse",

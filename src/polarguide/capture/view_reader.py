@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,7 +91,8 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
             found=str(factor),
             remedy="Choose a smaller factor.",
         )
-    peak = np.maximum.reduce([pixels.max(axis=2) for pixels in raw])
+    channels = [pixels[..., channel] for pixels in raw for channel in range(3)]
+    peak = functools.reduce(np.maximum, channels)
     invalid, mask, truth = np.zeros((height, width), bool), None, None
     if name in layout.invalid:
         invalid = _read_mask(files, layout.invalid[name], (height, width), any_value=True)

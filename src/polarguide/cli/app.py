@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import tyro
 from rich.console import Console
@@ -16,7 +17,7 @@ from polarguide.cli.render import render_views
 from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
 
-VERBS = {
+VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
     "train": train,
     "eval": evaluate,
@@ -49,4 +50,8 @@ def run(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+    except OSError as error:  # missing rights, a full disk, a file where a folder should be
+        errors.print("[bold red]error:[/] ", end="")
+        errors.print(f"{error.filename or 'files'}: {error.strerror or error}.", markup=False)
+        return 2
     return 0

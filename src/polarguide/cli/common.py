@@ -15,7 +15,7 @@ from polarguide.capture import Scene, View, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, DeviceName, choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.shading.render import render
+from polarguide.shading.render import Shading, render
 from polarguide.shading.result import RenderResult
 from polarguide.training.run import RunConfiguration, load_checkpoint
 from polarguide.training.stages import Recipe
@@ -38,10 +38,16 @@ def use_threads(threads: int) -> None:
 def read_scene(path: Path, *, downscale: int, transfer: Transfer) -> Scene:
     """Load a scene with a progress bar and print its warnings."""
     if downscale < 1:
-        raise PolarguideError("--downscale", expected="1 or more", found=str(downscale), remedy="Give a whole factor.")
+        raise PolarguideError(
+            "--downscale", expected="1 or more", found=str(downscale), remedy="Give a whole factor."
+        )
     with Progress(
-        TextColumn("reading {task.fields[name]}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True,
+        TextColumn("reading {task.fields[name]}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
     ) as progress:
         task = progress.add_task("", name=path.name, total=None)
 
@@ -59,7 +65,10 @@ def recipe_named(name: str) -> Recipe:
     """A recipe by name, or a clear error."""
     if name not in RECIPES:
         raise PolarguideError(
-            "recipe", expected="one of " + ", ".join(RECIPES), found=name, remedy="Train again with this version."
+            "recipe",
+            expected="one of " + ", ".join(RECIPES),
+            found=name,
+            remedy="Train again with this version.",
         )
     return RECIPES[name]
 
@@ -75,6 +84,11 @@ class OpenRun:
     state: TrainingState
     backend: Backend
 
+    @property
+    def shading(self) -> Shading:
+        """How its layers combine."""
+        return self.recipe.shading(self.configuration.settings.refractive_index)
+
     @torch.no_grad()
     def render(self, view: View, *, depth: bool = False) -> RenderResult:
         """All layers of a view."""
@@ -84,6 +98,7 @@ class OpenRun:
             view.camera,
             self.backend.rasterise,
             environment=environment.texels if environment else None,
+            shading=self.shading,
             depth=depth,
         )
 
@@ -96,7 +111,9 @@ def open_run(folder: Path, *, device: DeviceName = "auto") -> OpenRun:
     transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
     scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
     if scene.digest != configuration.scene_digest:
-        console.print(f"[yellow]warning:[/] {configuration.scene} has changed since {folder} was trained on it.")
+        console.print(
+            f"[yellow]warning:[/] {configuration.scene} has changed since {folder} was trained on it."
+        )
     return OpenRun(folder, configuration, scene, recipe, state, choose_backend(device))
 
 
@@ -104,5 +121,11 @@ def select_views(scene: Scene, choice: str) -> tuple[View, ...]:
     """The views that ``--views`` names: ``test``, ``train``, ``all``, or names separated by commas."""
     groups = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}
     if choice in groups:
-        return groups[choice]
-    return tuple(scene.view(name.strip()) for name in choice.split(",") if name.strip())
+        chosen = groups[choice]
+    else:
+        chosen = tuple(scene.view(name.strip()) for name in choice.split(",") if name.strip())
+    if not chosen:
+        raise PolarguideError(
+            "--views", expected="at least one view", found="none", remedy="Name a view, or take train."
+        )
+    return chosen

@@ -34,5 +34,7 @@ def demo(*, out: Path = Path("runs/demo"), steps: int = STEPS, seed: int = 0, th
         train(scene, out=out, steps=steps, seed=seed, threads=threads, resume=(out / CONFIGURATION).exists())
         opened = open_run(out)
         evaluate_run(opened)
-        sheet = render_run(opened, opened.scene.test_views, [n for n in LAYERS if n != "alpha"], out / "render")
+        sheet = render_run(
+            opened, opened.scene.test_views, [n for n in LAYERS if n != "alpha"], out / "render"
+        )
     console.print(f"look at {sheet}: rows are rendered and true pictures, columns are layers")

@@ -65,7 +65,9 @@ def evaluate_run(opened: OpenRun) -> dict[str, Any]:
         views=views,
         run={
             "fps": frames_per_second(lambda view: _final(opened, view), opened.scene.test_views),
-            "fps_layers": frames_per_second(lambda view: opened.render(view, depth=True), opened.scene.test_views),
+            "fps_layers": frames_per_second(
+                lambda view: opened.render(view, depth=True), opened.scene.test_views
+            ),
             "train_seconds": seconds if alone and seconds > 0 else None,
             "gaussians": len(opened.state.rows),
             "steps": opened.state.step,
@@ -85,6 +87,7 @@ def _final(opened: OpenRun, view: View) -> object:
         view.camera,
         opened.backend.rasterise,
         environment=environment.texels if environment else None,
+        shading=opened.shading,
         normals=False,
     ).final
 

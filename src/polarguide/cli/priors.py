@@ -63,12 +63,12 @@ def priors(
                 found=str(downscale),
                 remedy="Give the same factor.",
             )
-    loaded = read_scene(scene, downscale=downscale, transfer=transfer)
+    chosen = select_views(read_scene(scene, downscale=downscale, transfer=transfer), views)
     out.mkdir(parents=True, exist_ok=True)
     rows: list[list[Picture]] = []
     labels: list[str] = []
     names: list[str] = []
-    for view in select_views(loaded, views):
+    for view in chosen:
         pictures = prior_pictures(view, opened, refractive_index, threshold)
         names = list(pictures)
         for name, picture in pictures.items():
@@ -107,7 +107,9 @@ def prior_pictures(view: View, opened: OpenRun | None, index: float, threshold: 
         "diffuse_paper": figures.radiance_to_rgb(paper.diffuse / 2),
         f"specular_exact_{source}": figures.radiance_to_rgb(exact.specular / 2),
         f"diffuse_exact_{source}": figures.radiance_to_rgb(exact.diffuse / 2),
-        f"normal_{source}": figures.normal_to_rgb(view.camera.to_world(normal * mask[..., None]), view.camera),
+        f"normal_{source}": figures.normal_to_rgb(
+            view.camera.to_world(normal * mask[..., None]), view.camera
+        ),
         "mask": figures.scalar_to_rgb(mask.float(), 0.0, 1.0),
     }
 

@@ -54,6 +54,10 @@ def render_views(
             raise PolarguideError(
                 "--layers", expected="any of " + ", ".join(LAYERS), found=name, remedy="Correct the name."
             )
+    if not names:
+        raise PolarguideError(
+            "--layers", expected="any of " + ", ".join(LAYERS), found="none", remedy="Name a layer."
+        )
     opened = open_run(run, device=device)
     render_run(opened, select_views(opened.scene, views), names, out or run / "render")
 
@@ -61,8 +65,6 @@ def render_views(
 def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out: Path) -> Path:
     """Write the layers of some views and their contact sheet; returns the sheet's path."""
     out.mkdir(parents=True, exist_ok=True)
-    if not views:
-        raise PolarguideError("--views", expected="at least one view", found="none", remedy="Name a view.")
     rows: list[list[Picture | None]] = []
     labels: list[str] = []
     missing: set[str] = set()

@@ -72,10 +72,15 @@ def train(
     use_threads(threads)
     for name, value in (("--steps", steps), ("--checkpoint-every", checkpoint_every)):
         if value < 1:
-            raise PolarguideError(name, expected="1 or more", found=str(value), remedy="Give a positive count.")
+            raise PolarguideError(
+                name, expected="1 or more", found=str(value), remedy="Give a positive count."
+            )
     if not 1.0 < refractive_index < 4.0:
         raise PolarguideError(
-            "--refractive-index", expected="between 1 and 4", found=str(refractive_index), remedy="1.5 suits most."
+            "--refractive-index",
+            expected="between 1 and 4",
+            found=str(refractive_index),
+            remedy="1.5 suits most.",
         )
     _check_out(out, resume)
     backend = choose_backend(device)
@@ -107,11 +112,17 @@ def _check_out(out: Path, resume: bool) -> None:
     has_run = (out / CONFIGURATION).exists()
     if resume and not has_run:
         raise PolarguideError(
-            out, expected="a run to resume", found="no run.json", remedy="Leave out --resume, or give the right --out."
+            out,
+            expected="a run to resume",
+            found="no run.json",
+            remedy="Leave out --resume, or give the right --out.",
         )
     if not resume and has_run:
         raise PolarguideError(
-            out, expected="a new folder", found="a run", remedy="Add --resume to go on with it, or give another --out."
+            out,
+            expected="a new folder",
+            found="a run",
+            remedy="Add --resume to go on with it, or give another --out.",
         )
 
 
@@ -119,6 +130,9 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
     for field in ("scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer"):
         a, b = getattr(old, field), getattr(new, field)
         if a != b:
+            if isinstance(a, dict):  # a recipe: show what differs
+                keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
+                a, b = ({key: values.get(key) for key in keys} for values in (a, b))
             raise PolarguideError(
                 f"{out}/{CONFIGURATION} ({field})",
                 expected=json.dumps(a, default=str)[:120],
@@ -162,16 +176,23 @@ def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int) -> None:
                         save_checkpoint(out, trainer.state)
         save_checkpoint(out, trainer.state)
         if interrupt.asked:
-            console.print(f"stopped after step {trainer.state.step}; go on with the same command and --resume")
+            console.print(
+                f"stopped after step {trainer.state.step}; go on with the same command and --resume"
+            )
             raise KeyboardInterrupt
     finally:
         interrupt.restore()
-    write_run_ply(out / PLY, trainer.state)
+    shading = trainer.recipe.shading(trainer.settings.refractive_index)
+    write_run_ply(out / PLY, trainer.state, shading)
 
 
 def _progress() -> Progress:
     return Progress(
-        BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn(), console=console
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[note]}"),
+        TimeRemainingColumn(),
+        console=console,
     )
 
 

@@ -1,1 +1,6 @@
 """Metrics, records and figures: what a trained scene is worth, in numbers and to the eye."""
+
+from .record import validate_metrics, write_metrics
+from .scores import ViewScores, score_view, summarise
+
+__all__ = ["ViewScores", "score_view", "summarise", "validate_metrics", "write_metrics"]

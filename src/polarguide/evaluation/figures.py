@@ -22,7 +22,6 @@ __all__ = [
     "Picture",
     "aolp_to_rgb",
     "contact_sheet",
-    "depth_to_rgb",
     "dolp_to_rgb",
     "error_to_rgb",
     "normal_to_rgb",
@@ -102,11 +101,6 @@ def scalar_to_rgb(
     picture = np.ascontiguousarray(colours[..., ::-1], dtype=np.uint8)
     picture[~numbers.isfinite().numpy()] = 0
     return picture
-
-
-def depth_to_rgb(depth: Tensor, low: float, high: float) -> Picture:
-    """Depth [H, W] in turbo, near red and far blue; black where there is none (zero or not finite)."""
-    return scalar_to_rgb(torch.where(depth > 0, depth, math.nan), low, high, "turbo", invert=True)
 
 
 def dolp_to_rgb(dolp: Tensor, high: float = 1.0) -> Picture:

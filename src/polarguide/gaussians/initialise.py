@@ -1,4 +1,4 @@
-"""First Gaussians: on the SfM points, and where SfM has no points (inside the capture's space and far around it)."""
+"""First Gaussians: on the SfM points, and far around the capture, where SfM has none."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ class Initialisation:
     """How many Gaussians are added to the SfM points.
 
     Attributes:
-        inside: random ones within the sphere that the cameras and the middle of the points span.
-        shell: ones on far shells around it, for surroundings that SfM does not triangulate.
-        shell_radii: nearest and farthest shell, in units of that sphere's radius.
+        shell: ones far around the capture, for surroundings that SfM does not triangulate. None are added inside:
+            random Gaussians among the cameras end as haze in front of them.
+        shell_radii: nearest and farthest shell, in units of the cameras' distance from the middle of the points.
         opacity: first opacity of all.
     """
 
-    inside: int = 4000
     shell: int = 4000
     shell_radii: tuple[float, float] = (3.0, 12.0)
     opacity: float = 0.1
@@ -64,18 +63,17 @@ def initial_rows(
     cameras = centres.double().numpy()
     middle = np.median(sfm, axis=0)
     radius = float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
-    directions = random.normal(size=(settings.inside + settings.shell, 3))
+    directions = random.normal(size=(settings.shell, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    reach = radius * random.random(settings.inside) ** (1 / 3)
     near, far = (radius * r for r in settings.shell_radii)
     # Evenly spaced in 1/distance, as parallax is.
     away = 1 / (1 / near + (1 / far - 1 / near) * random.random(settings.shell))
-    added = middle + directions * np.concatenate((reach, away))[:, None]
+    added = middle + directions * away[:, None]
     means = np.concatenate((sfm, added))
     grey = colours.double().mean(dim=0, keepdim=True).numpy() if len(sfm) else np.full((1, 3), 0.5)
     rgb = np.concatenate((colours.double().numpy(), np.repeat(grey, len(added), axis=0)))
     # Each kind measures its spacing among its own: a shell Gaussian must not shrink because SfM points are dense.
-    parts = (sfm, added[: settings.inside], added[settings.inside :])
+    parts = (sfm, added)
     spacing = np.concatenate([neighbour_distance(part) for part in parts if len(part)])
     count = len(means)
     rows = {

@@ -33,7 +33,9 @@ class GaussianRows:
     """
 
     def __init__(self, tensors: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
-        self._tensors = {name: t.detach().clone().contiguous().requires_grad_() for name, t in tensors.items()}
+        self._tensors = {
+            name: t.detach().clone().contiguous().requires_grad_() for name, t in tensors.items()
+        }
         self._check()
         groups = [
             {"params": [self._tensors[name]], "lr": rate, "name": name}
@@ -46,7 +48,10 @@ class GaussianRows:
         counts = {name: t.shape[0] for name, t in self._tensors.items()}
         if len(set(counts.values())) > 1:
             raise PolarguideError(
-                "Gaussian rows", expected="one row count", found=str(counts), remedy="Give every tensor one row each."
+                "Gaussian rows",
+                expected="one row count",
+                found=str(counts),
+                remedy="Give every tensor one row each.",
             )
 
     def __len__(self) -> int:

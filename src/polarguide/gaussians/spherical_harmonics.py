@@ -86,10 +86,10 @@ def evaluate_sh_reference(means: Tensor, centre: Tensor, dc: Tensor, rest: Tenso
 class _Harmonics(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
-        inputs = [t.detach().contiguous() for t in (means, centre, dc, rest)]
-        out = torch.empty_like(inputs[2])
-        _native.harmonics_forward(degree, *inputs, out)
-        ctx.save_for_backward(*inputs)
+        means, centre, dc, rest = (t.detach().contiguous() for t in (means, centre, dc, rest))
+        out = torch.empty_like(dc)
+        _native.harmonics_forward(degree, means, centre, dc, rest, out)
+        ctx.save_for_backward(means, centre, dc, rest)
         ctx.degree = degree
         return out
 

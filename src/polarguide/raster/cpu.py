@@ -10,7 +10,14 @@ from torch.autograd.function import once_differentiable
 
 from polarguide import _native
 from polarguide.camera import Camera
-from polarguide.raster.interface import NEAR_PLANE, Rasterised, ScreenStatistic, check_shapes, refuse_not_finite
+from polarguide.errors import PolarguideError
+from polarguide.raster.interface import (
+    NEAR_PLANE,
+    Rasterised,
+    ScreenStatistic,
+    check_shapes,
+    refuse_not_finite,
+)
 
 
 def native_rasteriser(camera: Camera, channels: int, statistic: ScreenStatistic | None) -> Any:
@@ -63,7 +70,9 @@ class _Rasterise(torch.autograd.Function):
         *inputs, out = ctx.saved_tensors
         gradients = [torch.empty_like(t) for t in inputs]
         screen = torch.empty(inputs[0].shape[0], 2) if ctx.statistic else None
-        ctx.rasteriser.backward(*inputs, out, grad_out.contiguous(), grad_alpha.contiguous(), *gradients, screen)
+        ctx.rasteriser.backward(
+            *inputs, out, grad_out.contiguous(), grad_alpha.contiguous(), *gradients, screen
+        )
         if ctx.statistic:
             ctx.statistic.gradient = screen
         return (*gradients, None, None)
@@ -81,4 +90,13 @@ def rasterise_cpu(
 ) -> Rasterised:
     """See ``polarguide.raster.interface``. CPU tensors, float32; deterministic for any number of threads."""
     check_shapes(means, quats, scales, opacities, features, statistic)
+    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
+    for name, tensor in named.items():
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise PolarguideError(
+                f"rasterise({name})",
+                expected="float32 on the CPU",
+                found=f"{tensor.dtype} on {tensor.device}",
+                remedy="Convert it, or use the plain-torch twin.",
+            )
     return Rasterised(*_Rasterise.apply(means, quats, scales, opacities, features, camera, statistic))

@@ -98,7 +98,7 @@ def check_shapes(
     statistic: ScreenStatistic | None,
 ) -> None:
     """Refuse inputs whose shapes do not fit each other, or a statistic over channels that do not exist."""
-    count = means.shape[0]
+    count = means.shape[0] if means.ndim else 0
     channels = features.shape[-1]
     for name, tensor, shape in (
         ("means", means, (count, 3)),
@@ -116,16 +116,19 @@ def check_shapes(
             )
     if not 1 <= channels <= 32:
         raise PolarguideError(
-            "rasterise(features)", expected="1 to 32 channels", found=str(channels), remedy="Split the channels."
+            "rasterise(features)",
+            expected="1 to 32 channels",
+            found=str(channels),
+            remedy="Split the channels.",
         )
-    for channel in statistic.channels if statistic else ():
-        if not 0 <= channel < channels:
-            raise PolarguideError(
-                "rasterise(statistic)",
-                expected=f"channels below {channels}",
-                found=str(channel),
-                remedy="Name channels that exist.",
-            )
+    chosen = statistic.channels if statistic else ()
+    if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):
+        raise PolarguideError(
+            "rasterise(statistic)",
+            expected=f"different channels below {channels}",
+            found=str(chosen),
+            remedy="Name channels that exist, each once.",
+        )
 
 
 def refuse_not_finite(name: str, row: int) -> PolarguideError:

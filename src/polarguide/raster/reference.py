@@ -73,9 +73,9 @@ def rasterise_reference(
     check_shapes(means, quats, scales, opacities, features, statistic)
     named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
     for name, tensor in named.items():
-        bad = (~torch.isfinite(tensor)).reshape(tensor.shape[0], -1).any(dim=1).nonzero()
+        bad = (~torch.isfinite(tensor)).nonzero()
         if len(bad):
-            raise refuse_not_finite(name, int(bad[0]))
+            raise refuse_not_finite(name, int(bad[0, 0]))
     means2d, covariances, depth = _project(means, quats, scales, camera)
     determinant = torch.linalg.det(covariances)
     visible = (depth > NEAR_PLANE) & (opacities >= MINIMUM_ALPHA) & (determinant > 0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -11,18 +12,22 @@ from torch.nn.functional import normalize
 from polarguide.camera import Camera
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.spherical_harmonics import evaluate_sh
+from polarguide.optics import reflectances_from_cosine
 from polarguide.raster.interface import Rasterise, ScreenStatistic
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.result import RenderResult
 
 COLOUR_CHANNELS = (0, 1, 2)
+Blend = Literal["lerp", "fresnel"]
+# Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
+MAXIMUM_LOG_LIGHT = 5.0
 
 
 class Rows(Protocol):
     """Named per-Gaussian tensors: the trainable rows, or a frozen copy of them."""
 
     def __getitem__(self, name: str, /) -> Tensor: ...
-    def __contains__(self, name: object, /) -> bool: ...
+    def __contains__(self, name: str, /) -> bool: ...
 
 
 def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
@@ -36,8 +41,46 @@ def mirrored(rays: Tensor, normals: Tensor) -> Tensor:
     return rays - 2 * (rays * normals).sum(dim=-1, keepdim=True) * normals
 
 
-def reflect(base: Tensor, normal: Tensor, strength: Tensor, environment: Tensor, camera: Camera) -> dict[str, Tensor]:
-    """Deferred reflection: final = (1 - r) base + r sigmoid(environment(mirrored ray)) (Ye et al. 2024, Eq. 5).
+@dataclass(frozen=True)
+class Shading:
+    """How base colour and reflection make the picture.
+
+    Attributes:
+        blend: "lerp": final = (1 - r) base + r sigmoid(environment), as in 3DGS-DR (Ye et al. 2024, Eq. 5);
+            "fresnel": final = base + r F(i) exp(environment), with F the unpolarized power reflectance of a
+            dielectric at the angle between ray and normal, so that strength can be a property of the surface.
+        index: refractive index of F.
+    """
+
+    blend: Blend = "lerp"
+    index: float = 1.5
+
+    def light(self, texels: Tensor) -> Tensor:
+        """Radiance of raw texel values."""
+        return (
+            torch.sigmoid(texels) if self.blend == "lerp" else torch.exp(texels.clamp(max=MAXIMUM_LOG_LIGHT))
+        )
+
+    def layers(self, base: Tensor, strength: Tensor, light: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
+        """Specular and diffuse contributions [..., 3].
+
+        Args:
+            base: [..., 3]. strength: [..., 1] in [0, 1]. light: [..., 3] from the mirrored direction.
+            cosine: [..., 1] of the angle between the ray and the normal, in [0, 1].
+        """
+        if self.blend == "lerp":
+            return strength * light, (1 - strength) * base
+        s, p = reflectances_from_cosine(cosine, self.index)
+        return strength * (0.5 * (s + p)) * light, base
+
+
+SHADING_3DGS_DR = Shading()
+
+
+def reflect(
+    base: Tensor, normal: Tensor, strength: Tensor, environment: Tensor, camera: Camera, shading: Shading
+) -> dict[str, Tensor]:
+    """Deferred reflection per pixel.
 
     Args:
         base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
@@ -46,11 +89,12 @@ def reflect(base: Tensor, normal: Tensor, strength: Tensor, environment: Tensor,
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
     """
     rays = camera.world_rays(dtype=base.dtype, device=base.device)
-    directions = mirrored(rays, normalize(normal, dim=-1, eps=1e-3))
-    reflection = torch.sigmoid(cubemap_lookup(environment, directions.reshape(-1, 3)).reshape(base.shape))
-    specular = strength[..., None] * reflection
-    diffuse = (1 - strength[..., None]) * base
-    return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": reflection}
+    unit = normalize(normal, dim=-1, eps=1e-3)
+    directions = mirrored(rays, unit)
+    light = shading.light(cubemap_lookup(environment, directions.reshape(-1, 3)).reshape(base.shape))
+    cosine = -(rays * unit).sum(dim=-1, keepdim=True).clamp(-1, 0)
+    specular, diffuse = shading.layers(base, strength[..., None], light, cosine)
+    return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": light}
 
 
 def render(
@@ -60,6 +104,7 @@ def render(
     *,
     sh_degree: int = 3,
     environment: Tensor | None = None,
+    shading: Shading = SHADING_3DGS_DR,
     normals: bool = True,
     depth: bool = False,
     statistic: ScreenStatistic | None = None,
@@ -70,6 +115,7 @@ def render(
         rows: the Gaussians; with ``strength_logits`` when there is an environment.
         sh_degree: SH degree of the base colour, 0 to 3.
         environment: [6, R, R, 3] raw texels of the learned environment; None: no reflection.
+        shading: how base colour and reflection are combined.
         normals: also splat normals (always done with an environment).
         depth: also splat camera depth.
         statistic: see ``ScreenStatistic``; the colour channels come first.
@@ -97,7 +143,7 @@ def render(
     strength = picture.features[..., 6] if environment is not None else None
     layers = {"final": base}
     if environment is not None and normal is not None and strength is not None:
-        layers = reflect(base, normal, strength, environment, camera)
+        layers = reflect(base, normal, strength, environment, camera, shading)
     return RenderResult(
         final=layers["final"],
         specular=layers.get("specular"),

@@ -28,7 +28,9 @@ def reset_opacity(state: TrainingState) -> None:
 
 
 @torch.no_grad()
-def propagate_normals(state: TrainingState, settings: Propagation, generator: torch.Generator, rest: int) -> None:
+def propagate_normals(
+    state: TrainingState, settings: Propagation, generator: torch.Generator, rest: int
+) -> None:
     """Let Gaussians with a right normal take over their neighbourhood (Ye et al. 2024, Sec. 3.3).
 
     Opacities rise, matt Gaussians get noise on their colour (which hides what they explain by colour alone), and

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from polarguide.errors import PolarguideError
 from polarguide.shading.result import RenderResult
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
@@ -67,5 +68,10 @@ def step_loss(
     if weights.azimuth and result.normal is not None:
         total = total + weights.azimuth * azimuth_loss(result.normal, priors)
     if not torch.isfinite(total):
-        raise FloatingPointError("the loss is not finite")
+        raise PolarguideError(
+            "training",
+            expected="a finite loss",
+            found=str(float(total.detach())),
+            remedy="Lower the learning rates, or resume from an earlier checkpoint.",
+        )
     return total, photometric

@@ -19,8 +19,6 @@ from polarguide.training.stages import Priors
 
 # Rendered normals shorter than this are too mixed to say anything.
 MINIMUM_NORMAL = 0.3
-# DoLP from which on a pixel's azimuth counts fully.
-FULL_WEIGHT_DOLP = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +81,7 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
         layers = optics.exact_separation(stokes, guide, rays, index)
         conditioned = layers.conditioned & known & ~view.saturated
     plane = normalize(torch.linalg.cross(rays, chosen), dim=-1, eps=1e-6)
-    weight = (optics.dolp(luminance) / FULL_WEIGHT_DOLP).clamp(max=1) * (usable & known)
+    weight = (optics.dolp(luminance) / settings.full_dolp).clamp(max=1) * (usable & known)
     return ViewPriors(
         specular=srgb_encode((layers.specular / 2).clamp(0, 1)),
         diffuse=srgb_encode((layers.diffuse / 2).clamp(0, 1)),

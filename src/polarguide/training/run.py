@@ -1,9 +1,9 @@
 """A run folder: the configuration, atomically written checkpoints, the log, and the exported PLY.
 
-    RUN/run.json            what was asked for (scene, recipe, settings), plain JSON
-    RUN/checkpoint.safetensors   everything training needs to go on, and all that rendering needs
-    RUN/log.jsonl           one line per logged step
-    RUN/point_cloud.ply     for other viewers, at the end
+RUN/run.json            what was asked for (scene, recipe, settings), plain JSON
+RUN/checkpoint.safetensors   everything training needs to go on, and all that rendering needs
+RUN/log.jsonl           one line per logged step
+RUN/point_cloud.ply     for other viewers, at the end
 """
 
 from __future__ import annotations
@@ -75,7 +75,10 @@ class RunConfiguration:
             return cls(**data)
         except FileNotFoundError:
             raise PolarguideError(
-                run, expected=f"a run folder with {CONFIGURATION}", found="none", remedy="Give the --out of a training."
+                run,
+                expected=f"a run folder with {CONFIGURATION}",
+                found="none",
+                remedy="Give the --out of a training.",
             ) from None
         except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError) as error:
             raise PolarguideError(
@@ -120,7 +123,10 @@ def load_checkpoint(run: Path, recipe: Recipe) -> TrainingState:
     path = run / CHECKPOINT
     if not path.exists():
         raise PolarguideError(
-            run, expected=f"a checkpoint ({CHECKPOINT})", found="none", remedy="Train first, or without --resume."
+            run,
+            expected=f"a checkpoint ({CHECKPOINT})",
+            found="none",
+            remedy="Train first, or without --resume.",
         )
     try:
         with safe_open(path, framework="pt") as file:

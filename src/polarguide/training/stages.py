@@ -10,6 +10,7 @@ from typing import Literal
 
 from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.initialise import Initialisation
+from polarguide.shading.render import Blend, Shading
 
 Action = Literal[
     "reset_opacity",
@@ -84,12 +85,14 @@ class Priors:
         candidates: which polarization normals are considered.
         separation: which separation supervises the layers.
         threshold: DoLP above which a pixel's normal is used.
+        full_dolp: DoLP from which on a pixel's normal counts fully; below, in proportion.
         azimuth_weight: in [0, 1], how much the choice among candidates trusts azimuth over zenith.
     """
 
     candidates: Candidates = "physical"
     separation: Separation = "exact"
     threshold: float = 0.05
+    full_dolp: float = 0.3
     azimuth_weight: float = 0.5
 
 
@@ -121,6 +124,9 @@ class Recipe:
         stages: in order; their fractions add up to 1.
         rates: learning rates; that of the means is times the scene's extent.
         means_decay: factor on the means' rate at the last step (exponential in between).
+        blend: how base colour and reflection make the picture (see ``Shading``).
+        first_strength: reflection strength that Gaussians start with.
+        environment_spread: first raw texels are uniform in plus or minus this.
         environment_rate: learning rate of the environment's texels.
         environment_resolution: texels along a cube face's side.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
@@ -132,14 +138,21 @@ class Recipe:
     stages: tuple[Stage, ...]
     rates: dict[str, float]
     means_decay: float = 0.01
+    blend: Blend = "lerp"
+    first_strength: float = 1e-3
+    environment_spread: float = 5.0
     environment_rate: float = 0.05
     environment_resolution: int = 128
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
     ssim_weight: float = 0.2
-    densification: Densification = Densification()
-    initialisation: Initialisation = Initialisation()
-    priors: Priors = Priors()
-    propagation: Propagation = Propagation()
+    densification: Densification = field(default_factory=Densification)
+    initialisation: Initialisation = field(default_factory=Initialisation)
+    priors: Priors = field(default_factory=Priors)
+    propagation: Propagation = field(default_factory=Propagation)
+
+    def shading(self, index: float) -> Shading:
+        """The shading of this recipe for surfaces of a refractive index."""
+        return Shading(self.blend, index)
 
     @property
     def reflects(self) -> bool:

@@ -19,12 +19,6 @@ class Environment:
         self.texels = texels.detach().clone().contiguous().requires_grad_()
         self._optimiser = torch.optim.Adam([self.texels], lr=rate, eps=1e-15, fused=True)
 
-    @classmethod
-    def random(cls, resolution: int, rate: float, generator: torch.Generator) -> Environment:
-        """Raw texels uniform in (-5, 5), as 3DGS-DR starts (Ye et al. 2024)."""
-        texels = torch.rand(6, resolution, resolution, 3, generator=generator) * 10 - 5
-        return cls(texels, rate)
-
     def step(self) -> None:
         """One Adam step, if there is a gradient."""
         if self.texels.grad is not None:

@@ -21,9 +21,6 @@ from polarguide.training.priors import ViewPriors, view_priors
 from polarguide.training.stages import Action, Recipe, Schedule, Stage
 from polarguide.training.state import Environment, TrainingState
 
-# Strength that Gaussians start with (Ye et al. 2024).
-FIRST_STRENGTH = 1e-3
-
 
 @dataclass(frozen=True)
 class TrainSettings:
@@ -67,11 +64,11 @@ def first_state(scene: Scene, recipe: Recipe, settings: TrainSettings) -> Traini
     count = tensors["means"].shape[0]
     environment = None
     if recipe.reflects:
-        logit = torch.logit(torch.tensor(FIRST_STRENGTH))
+        logit = torch.logit(torch.tensor(recipe.first_strength))
         tensors["strength_logits"] = logit.expand(count).clone()
-        environment = Environment.random(
-            recipe.environment_resolution, recipe.environment_rate, _seeded(settings.seed, 1)
-        )
+        size = (6, recipe.environment_resolution, recipe.environment_resolution, 3)
+        uniform = torch.rand(size, generator=_seeded(settings.seed, 1)) * 2 - 1
+        environment = Environment(uniform * recipe.environment_spread, recipe.environment_rate)
     rows = GaussianRows(tensors, recipe.rates)
     return TrainingState(0, rows, environment, DensityStatistics(count))
 
@@ -124,6 +121,7 @@ class Trainer:
             self.backend.rasterise,
             sh_degree=self.schedule.sh_degree(state.step),
             environment=state.environment.texels if state.environment and stage.reflection else None,
+            shading=recipe.shading(self.settings.refractive_index),
             normals=bool(stage.weights.normal or stage.weights.azimuth),
             statistic=statistic,
         )
@@ -132,11 +130,12 @@ class Trainer:
         loss, photometric = step_loss(
             result, shown, valid, stage.weights, self._priors_of(view, stage), ssim_weight=recipe.ssim_weight
         )
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         if statistic is not None and statistic.gradient is not None:
             state.statistics.add(statistic.gradient, result.radii, view.camera.width, view.camera.height)
         self._optimise()
-        report = StepReport(state.step, stage.name, float(photometric), _psnr(result.final, shown), len(state.rows))
+        psnr = _psnr(result.final, shown)
+        report = StepReport(state.step, stage.name, float(photometric.detach()), psnr, len(state.rows))
         state.step += 1
         if stage.densify and state.step % recipe.densification.every == 0:
             densify(

@@ -1,0 +1,49 @@
+# make demo    train, score and render the demo scene that ships with the package
+# make test    linter, formatter, types and tests, on the package as it is installed
+# make clean   remove what these commands made
+#
+# Needs Python 3.10 or newer with its venv module, a C++17 compiler and make; everything else is fetched from PyPI.
+#   PYTHON=python3.12     the interpreter of the environment (read when .venv is created)
+
+PYTHON ?= python3
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints-cpu.txt
+# Directories are listed too: their time changes when a file is removed.
+SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
+	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
+
+.PHONY: demo test clean
+.DELETE_ON_ERROR:
+MAKEFLAGS += --no-print-directory
+
+demo: $(VENV)/.installed
+	$(BIN)/polarguide demo
+
+test: $(VENV)/.installed-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+$(VENV)/.installed: $(SOURCES) | $(VENV)/pyvenv.cfg
+	@echo "Building and installing polarguide into $(VENV); the first time takes minutes."
+	$(PIP_INSTALL) .
+	@touch $@
+
+$(VENV)/.installed-test: $(SOURCES) | $(VENV)/pyvenv.cfg
+	@echo "Building and installing polarguide and its test tools into $(VENV); the first time takes minutes."
+	$(PIP_INSTALL) '.[test]'
+	@touch $(VENV)/.installed $@
+
+$(VENV)/pyvenv.cfg:
+	@$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 10) else \
+		"polarguide needs Python 3.10 or newer, found %s; try make PYTHON=python3.12" % sys.version.split()[0])'
+	$(PYTHON) -m venv $(VENV)
+	@touch $(VENV)/.made-by-make
+
+# An environment that was made by hand stays.
+clean:
+	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@[ ! -e $(VENV)/.made-by-make ] || (set -x; rm -rf $(VENV))

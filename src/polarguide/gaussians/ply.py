@@ -1,0 +1,246 @@
+"""PLY files of Gaussians as the 3DGS release writes them, so that ordinary viewers open them.
+
+One ``vertex`` per Gaussian, float32 binary little-endian: position, normal (zero, as in the release),
+spherical harmonics of the display colour, opacity (logit), scales (log), rotation (w, x, y, z). Our own
+fields follow in the same vertex. Viewers that read fields by name ignore them; the SIBR viewer of the release
+reads records of a fixed size and opens only files without extra fields.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.lib.recfunctions import structured_to_unstructured
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from torch import Tensor
+
+from polarguide.errors import PolarguideError
+
+from .spherical_harmonics import sh_basis
+
+REST_COUNT = 15
+DIRECTIONS = 64
+CHUNK_NUMBERS = 1 << 24
+
+RELEASE_FIELDS = (
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(3 * REST_COUNT)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+)
+"""The fields of the 3DGS release at degree 3, in order. ``f_rest`` is channel-major: all of red first."""
+
+
+def write_ply(
+    path: str | Path,
+    *,
+    means: Tensor,
+    log_scales: Tensor,
+    quaternions: Tensor,
+    opacity_logits: Tensor,
+    sh_dc: Tensor,
+    sh_rest: Tensor,
+    extra: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Write Gaussians in one step: a reader sees the old file or the whole new one.
+
+    Args:
+        path: the file; its folder must exist.
+        means: [N, 3] world positions.
+        log_scales: [N, 3] natural logarithms of the standard deviations.
+        quaternions: [N, 4] rotations (w, x, y, z).
+        opacity_logits: [N] or [N, 1].
+        sh_dc, sh_rest: [N, 1, 3] and [N, 15, 3] harmonics of the display (sRGB-encoded) colour minus 0.5.
+        extra: further floating-point tensors [N, ...] by name (letters, digits, underscores). A tensor [N]
+            becomes the field ``name``; one [N, ..., C] the fields ``name_0`` and so on, last axis slowest
+            (channel-major, as ``f_rest``). A header comment keeps its shape.
+
+    Raises:
+        ValueError: shapes, names or types that do not fit.
+    """
+    count = means.shape[0]
+    core = {
+        "means": (means, (3,)),
+        "log_scales": (log_scales, (3,)),
+        "quaternions": (quaternions, (4,)),
+        "sh_dc": (sh_dc, (1, 3)),
+        "sh_rest": (sh_rest, (REST_COUNT, 3)),
+    }
+    for name, (tensor, shape) in core.items():
+        if tensor.shape != (count, *shape):
+            raise ValueError(f"{name}: expected {[count, *shape]}, found {list(tensor.shape)}")
+    if opacity_logits.numel() != count:
+        raise ValueError(f"opacity_logits: expected [{count}], found {list(opacity_logits.shape)}")
+    columns = [means, torch.zeros_like(means), sh_dc, sh_rest, opacity_logits, log_scales, quaternions]
+    names = list(RELEASE_FIELDS)
+    comments = []
+    for name, tensor in (extra or {}).items():
+        _check_extra(name, tensor, count)
+        fields = _extra_fields(name, tuple(tensor.shape[1:]))
+        if set(fields) & set(names):
+            raise ValueError(f"extra {name!r}: its fields are in the file already")
+        names += fields
+        columns.append(tensor)
+        comments.append(f"extra {' '.join([name, *map(str, tensor.shape[1:])])}")
+    table = np.concatenate([_columns(column) for column in columns], axis=1)
+    vertices = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
+    # The comments belong to the element: a reader that expects its line third, as SIBR does, finds it there.
+    element = PlyElement.describe(vertices, "vertex", comments=comments)
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    PlyData([element], byte_order="<").write(partial)
+    os.replace(partial, path)
+
+
+def read_ply(path: str | Path) -> dict[str, Any]:
+    """Read Gaussians written by ``write_ply`` or another 3DGS program (any degree of harmonics up to 3).
+
+    Returns:
+        ``means``, ``log_scales``, ``quaternions``, ``opacity_logits`` [N], ``sh_dc`` [N, 1, 3] and
+        ``sh_rest`` [N, K, 3] (K = 15 for degree 3) as float32 tensors, and ``extra``: the other tensors by
+        name, in the shapes they were written in. A field that no comment describes is a tensor [N] of its
+        own.
+
+    Raises:
+        PolarguideError: not a PLY file, or one without the fields of the 3DGS release.
+    """
+    element = _read_vertex(path)
+    names = [p.name for p in element.properties]
+    rest = sum(bool(re.fullmatch(r"f_rest_\d+", name)) for name in names)
+    missing = [n for n in RELEASE_FIELDS if n not in names and not n.startswith(("f_rest_", "n"))]
+    if missing or rest not in (0, 9, 24, 45):
+        found = f"no {missing[0]}" if missing else f"{rest} fields f_rest_*"
+        raise _unreadable(path, "the vertex fields of a 3DGS file (degree 0 to 3)", found)
+
+    # One pass over the records: reading field by field would walk the whole file for each.
+    table = torch.from_numpy(structured_to_unstructured(np.asarray(element.data), dtype=np.float32))
+    column = {name: index for index, name in enumerate(names)}
+
+    def tensor(fields: list[str], *shape: int) -> Tensor:
+        return _from_columns(table[:, [column[f] for f in fields]], shape)
+
+    extra = {}
+    taken = {*RELEASE_FIELDS}
+    for comment in element.comments:
+        if match := re.fullmatch(r"extra (\w+)((?: \d+)*)", comment):
+            shape = tuple(int(size) for size in match[2].split())
+            fields = _extra_fields(match[1], shape)
+            if not set(fields) <= set(names):
+                raise _unreadable(path, f"the fields of {match[1]} that a comment announces", "some missing")
+            extra[match[1]] = tensor(fields, *shape)
+            taken |= set(fields)
+    extra |= {name: tensor([name]) for name in names if name not in taken}
+    return {
+        "means": tensor(["x", "y", "z"], 3),
+        "log_scales": tensor([f"scale_{i}" for i in range(3)], 3),
+        "quaternions": tensor([f"rot_{i}" for i in range(4)], 4),
+        "opacity_logits": tensor(["opacity"]),
+        "sh_dc": tensor([f"f_dc_{i}" for i in range(3)], 1, 3),
+        "sh_rest": tensor([f"f_rest_{i}" for i in range(rest)], rest // 3, 3)
+        if rest
+        else torch.zeros(len(element.data), 0, 3),
+        "extra": extra,
+    }
+
+
+def refit_sh_to_display(
+    colour_fn: Callable[[Tensor], Tensor], count: int, degree: int = 3
+) -> tuple[Tensor, Tensor]:
+    """Spherical harmonics of display colours, ``colour = 0.5 + sum``, by least squares for each Gaussian.
+
+    The colours are sampled in directions spread evenly over the sphere, a few at a time, so that memory stays
+    near that of the result.
+
+    Args:
+        colour_fn: maps directions [K, 3] (unit, from the camera to the Gaussian, as harmonics take them) to
+            sRGB-encoded colours [count, K, 3].
+        count: number of Gaussians.
+        degree: 0 to 3.
+
+    Returns:
+        dc [count, 1, 3] and rest [count, 15, 3] float32, zero beyond ``degree``.
+
+    Raises:
+        ValueError: ``colour_fn`` returns another shape.
+    """
+    directions = fibonacci_sphere(DIRECTIONS)
+    basis = sh_basis(directions, degree)
+    solve = torch.linalg.pinv(basis)
+    fitted = torch.zeros(count, 1 + REST_COUNT, 3)
+    step = max(1, CHUNK_NUMBERS // max(1, 3 * count))
+    for begin in range(0, DIRECTIONS, step):
+        chunk = slice(begin, min(begin + step, DIRECTIONS))
+        some = directions[chunk].to(torch.float32)
+        colours = colour_fn(some).detach().to("cpu", torch.float32)
+        if colours.shape != (count, len(some), 3):
+            raise ValueError(f"colours: expected {[count, len(some), 3]}, found {list(colours.shape)}")
+        fitted[:, : solve.shape[0]] += torch.einsum(
+            "dk,nkc->ndc", solve[:, chunk].to(torch.float32), colours - 0.5
+        )
+    return fitted[:, :1].clone(), fitted[:, 1:].clone()
+
+
+def fibonacci_sphere(count: int) -> Tensor:
+    """Unit vectors [count, 3] float64, spread evenly: equal steps in z, golden-angle steps around it."""
+    index = torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * index + 1) / count
+    angle = index * (math.pi * (3 - math.sqrt(5)))
+    radius = torch.sqrt(1 - z * z)
+    return torch.stack((radius * torch.cos(angle), radius * torch.sin(angle), z), dim=-1)
+
+
+def _check_extra(name: str, tensor: Tensor, count: int) -> None:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
+        raise ValueError(f"extra: expected a name of letters, digits and underscores, found {name!r}")
+    if tensor.ndim == 0 or tensor.shape[0] != count or tensor.numel() == 0 < count:
+        raise ValueError(f"extra {name!r}: expected [{count}, ...], found {list(tensor.shape)}")
+    if not tensor.is_floating_point():
+        raise ValueError(f"extra {name!r}: expected floating-point numbers, found {tensor.dtype}")
+
+
+def _extra_fields(name: str, shape: tuple[int, ...]) -> list[str]:
+    return [f"{name}_{i}" for i in range(math.prod(shape))] if shape else [name]
+
+
+def _columns(tensor: Tensor) -> NDArray[np.float32]:
+    """[N, ...] as a table [N, fields], last axis slowest."""
+    table = tensor.detach().to("cpu", torch.float32)
+    if table.ndim > 2:
+        table = table.movedim(-1, 1)
+    return table.reshape(table.shape[0], math.prod(table.shape[1:])).numpy()
+
+
+def _from_columns(table: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """The inverse of ``_columns`` for rows of ``shape``."""
+    if len(shape) < 2:
+        return table.reshape(-1, *shape)
+    return table.reshape(-1, shape[-1], *shape[:-1]).movedim(1, -1).contiguous()
+
+
+def _read_vertex(path: str | Path) -> PlyElement:
+    try:
+        data = PlyData.read(path)
+    except FileNotFoundError:
+        raise _unreadable(path, "a PLY file", "no file") from None
+    except (PlyParseError, ValueError, EOFError) as error:
+        raise _unreadable(path, "a PLY file", f"something else ({error})") from error
+    if "vertex" not in data:
+        raise _unreadable(path, "a vertex element", "none")
+    vertex = data["vertex"]
+    if any(isinstance(field, PlyListProperty) for field in vertex.properties):
+        raise _unreadable(path, "vertices of plain numbers", "a list property")
+    return vertex
+
+
+def _unreadable(path: str | Path, expected: str, found: str) -> PolarguideError:
+    return PolarguideError(path, expected=expected, found=found, remedy="Give a PLY file of Gaussians.")

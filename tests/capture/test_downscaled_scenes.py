@@ -1,0 +1,121 @@
+"""Averages over pixel boxes, against a slow twin that walks the boxes one by one."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_capture import HEIGHT, WIDTH, TinyCapture, encode_srgb
+
+from polarguide.capture import boxes, load_scene
+
+
+def slow_boxes(values: np.ndarray, factor: int) -> list[list[np.ndarray]]:
+    """The pixels of each whole box, [rows][columns] of [K * K, ...]."""
+    return [
+        [
+            values[row : row + factor, column : column + factor].reshape(factor * factor, *values.shape[2:])
+            for column in range(0, values.shape[1] - factor + 1, factor)
+        ]
+        for row in range(0, values.shape[0] - factor + 1, factor)
+    ]
+
+
+def slow(reduce: object, values: np.ndarray, factor: int) -> np.ndarray:
+    return np.array([[reduce(box) for box in row] for row in slow_boxes(values, factor)])  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4, 10])
+def test_intensities_are_averaged_on_linear_values(capture: TinyCapture, factor: int) -> None:
+    capture.rewrite(encode_srgb)
+    full = load_scene(capture.root, transfer="srgb")
+    small = load_scene(capture.root, transfer="srgb", downscale=factor)
+    assert small.downscale == factor
+    for one, other in zip(full.views, small.views, strict=True):
+        for angle in range(4):
+            expected = slow(lambda box: box.mean(axis=0), one.intensities()[angle].double().numpy(), factor)
+            np.testing.assert_allclose(other.intensities()[angle].numpy(), expected, atol=0.51 / 65535)
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_camera_keeps_looking_at_the_same_points(capture: TinyCapture, factor: int) -> None:
+    full = load_scene(capture.root).views[1].camera
+    small = load_scene(capture.root, downscale=factor).views[1].camera
+    assert (small.width, small.height) == (WIDTH // factor, HEIGHT // factor)
+    assert small.fx == full.fx / factor
+    assert small.cy == full.cy / factor
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_masks_need_all_pixels_and_invalid_any(capture: TinyCapture, factor: int) -> None:
+    rng = np.random.default_rng(1)
+    mask, invalid = rng.random((2, HEIGHT, WIDTH)) < np.array([0.8, 0.1])[:, None, None]
+    for folder, picture in (("masks", mask), ("invalid", invalid)):
+        (capture.root / folder).mkdir()
+        cv2.imwrite(str(capture.root / folder / "v000.png"), picture.astype(np.uint8) * 255)
+    view = load_scene(capture.root, downscale=factor).views[0]
+    assert view.mask is not None
+    np.testing.assert_array_equal(view.mask.numpy(), slow(np.all, mask, factor))
+    np.testing.assert_array_equal(view.invalid.numpy(), slow(np.any, invalid, factor))
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_one_saturated_or_black_pixel_marks_its_box(capture: TinyCapture, factor: int) -> None:
+    values = capture.linear["v000"].copy()
+    values[2, 4, 7, 1] = 1.0
+    values[:, 0, 0] = 0.0
+    capture.write_view("v000", values)
+    marked = np.zeros((HEIGHT, WIDTH), bool)
+    marked[4, 7] = marked[0, 0] = True
+    np.testing.assert_array_equal(load_scene(capture.root).views[0].saturated.numpy(), marked)
+    view = load_scene(capture.root, downscale=factor).views[0]
+    np.testing.assert_array_equal(view.saturated.numpy(), slow(np.any, marked, factor))
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_ground_truth(capture: TinyCapture, factor: int) -> None:
+    rng = np.random.default_rng(2)
+    normal = rng.normal(size=(HEIGHT, WIDTH, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    depth, mask = rng.uniform(1, 9, (HEIGHT, WIDTH)), rng.random((HEIGHT, WIDTH)) < 0.8
+    normal[~mask] = 0.0
+    specular, diffuse = rng.random((2, HEIGHT, WIDTH, 3))
+    capture.write_truth("v000", normal=normal, depth=depth, mask=mask, specular=specular, diffuse=diffuse)
+    truth = load_scene(capture.root, downscale=factor).views[0].truth
+    assert truth is not None
+    fields = (truth.normal, truth.depth, truth.mask, truth.specular, truth.diffuse)
+    found = [field.numpy() for field in fields if field is not None]
+    mean_normal = slow(lambda box: box.mean(axis=0), normal, factor)
+    expected = [
+        mean_normal / np.linalg.norm(mean_normal, axis=-1, keepdims=True),
+        slow(np.mean, depth, factor),
+        slow(np.all, mask, factor),
+        slow(lambda box: box.mean(axis=0), specular, factor),
+        slow(lambda box: box.mean(axis=0), diffuse, factor),
+    ]
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-6)
+
+
+@given(
+    height=st.integers(1, 9),
+    width=st.integers(1, 9),
+    factor=st.integers(1, 4),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_box_functions_against_the_twin(height: int, width: int, factor: int, seed: int) -> None:
+    if factor > min(height, width):
+        return
+    codes = np.random.default_rng(seed).integers(0, 65536, (height, width, 3)).astype(np.uint16)
+    exact = slow(lambda box: box.astype(np.float64).mean(axis=0), codes, factor)
+    assert np.abs(boxes.mean_codes(codes, factor) - exact).max() <= 0.5
+    np.testing.assert_array_equal(boxes.maximum(codes[..., 0], factor), slow(np.max, codes[..., 0], factor))
+    np.testing.assert_allclose(boxes.mean(codes.astype(np.float32), factor), exact, rtol=1e-6)
+
+
+def test_normals_that_cancel_become_zero() -> None:
+    normals = np.zeros((2, 2, 3), np.float32)
+    normals[0], normals[1] = (0, 0, 1), (0, 0, -1)
+    np.testing.assert_array_equal(boxes.unit_mean(normals, 2), np.zeros((1, 1, 3)))

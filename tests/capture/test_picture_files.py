@@ -1,0 +1,240 @@
+"""Kinds of picture files, and files that are damaged."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_picture
+
+from polarguide.capture import load_scene
+from polarguide.capture.integrity import find_damage
+from polarguide.capture.pictures import decode_picture, linear_codes
+from polarguide.errors import PolarguideError
+
+tifffile = pytest.importorskip("tifffile", reason="tifffile writes the unusual TIFF files")
+
+COLOURS = np.random.default_rng(0).integers(0, 65536, (20, 30, 3)).astype(np.uint16)
+
+
+def encoded(suffix: str, picture: np.ndarray, *options: int) -> bytes:
+    done, data = cv2.imencode(suffix, picture, options)
+    assert done
+    return data.tobytes()
+
+
+JPEGS = {
+    "baseline": encoded(".jpg", (COLOURS >> 8).astype(np.uint8)),
+    "progressive": encoded(".jpg", (COLOURS >> 8).astype(np.uint8), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "restarts": encoded(".jpg", (COLOURS >> 8).astype(np.uint8), cv2.IMWRITE_JPEG_RST_INTERVAL, 1),
+}
+PNG = encoded(".png", COLOURS)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".tiff", ".PNG"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_lossless_files(capture: TinyCapture, suffix: str, bits: int) -> None:
+    capture.rewrite(lambda linear: linear, bits=bits, suffix=suffix)
+    scene = load_scene(capture.root)
+    for view in scene.views:
+        half_a_step = 0.5 / (2**bits - 1) + 1e-6
+        np.testing.assert_allclose(view.intensities().numpy(), capture.linear[view.name], atol=half_a_step)
+    assert scene.warnings == ()
+
+
+def test_eight_bits_are_exact_multiples_of_257(capture: TinyCapture) -> None:
+    capture.rewrite(lambda linear: linear, bits=8)
+    view = load_scene(capture.root).views[0]
+    stored = np.rint(capture.linear["v000"] * 255)
+    np.testing.assert_array_equal(view.codes.numpy(), stored * 257)
+
+
+def test_jpeg_is_read_within_its_loss(capture: TinyCapture) -> None:
+    flat = np.full((4, 10, 12, 3), 0.4)
+    flat[..., 1] = 0.5
+    capture.linear = dict.fromkeys(capture.linear, flat)
+    capture.rewrite(lambda linear: linear, bits=8, suffix=".jpg")
+    np.testing.assert_allclose(load_scene(capture.root).views[0].intensities().numpy(), flat, atol=0.01)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_grey_pictures_become_three_equal_channels(capture: TinyCapture, bits: int) -> None:
+    capture.rewrite(lambda linear: linear[..., 0], bits=bits)
+    view = load_scene(capture.root).views[0]
+    grey = torch.from_numpy(capture.linear["v000"][..., :1]).float()
+    torch.testing.assert_close(
+        view.intensities(), grey.expand(-1, -1, -1, 3), atol=0.51 / (2**bits - 1), rtol=0
+    )
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_srgb_is_made_linear(capture: TinyCapture, bits: int) -> None:
+    capture.rewrite(encode_srgb, bits=bits)
+    view = load_scene(capture.root, transfer="srgb").views[0]
+    # A step of the encoded value is at most 2.3 steps of the linear one.
+    np.testing.assert_allclose(
+        view.intensities().numpy(), capture.linear["v000"], atol=1.2 / (2**bits - 1) + 1e-5
+    )
+
+
+def test_srgb_curve_meets_its_known_points() -> None:
+    ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    codes = linear_codes(ramp, "srgb")[0, :, 0]
+    assert (codes[0], codes[255]) == (0, 65535)
+    assert codes[188] / 65535 == pytest.approx(0.5029, abs=1e-4)
+    assert codes[10] / 65535 == pytest.approx(10 / 255 / 12.92, abs=1e-5)
+    assert (np.diff(codes.astype(int)) > 0).all()
+
+
+def test_alpha_is_dropped_and_channels_are_in_rgb_order(tmp_path: Path) -> None:
+    bgra = np.zeros((4, 5, 4), np.uint8)
+    bgra[..., 0], bgra[..., 2], bgra[..., 3] = 10, 30, 7
+    picture = decode_picture(tmp_path, encoded(".png", bgra))
+    assert picture.shape == (4, 5, 3)
+    assert picture[0, 0].tolist() == [30, 0, 10]
+
+
+@pytest.mark.parametrize("data", JPEGS.values(), ids=JPEGS.keys())
+def test_complete_jpegs_pass_and_every_cut_is_found(data: bytes) -> None:
+    assert find_damage(data) is None
+    assert find_damage(data + b"\0maker notes after the end") is None
+    cuts = {length: find_damage(data[:length]) for length in range(2, len(data))}
+    assert [length for length, damage in cuts.items() if damage is None] == []
+    assert cuts[len(data) // 2] == f"a JPEG file cut short (it ends after {len(data) // 2} bytes)"
+
+
+def test_a_thumbnail_inside_a_jpeg_does_not_end_it() -> None:
+    data = JPEGS["baseline"]
+    thumbnail = b"Exif\0\0" + data
+    segment = b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail
+    whole = data[:2] + segment + data[2:]
+    assert find_damage(whole) is None
+    assert find_damage(whole[: len(whole) - len(data) // 2]) is not None
+
+
+@given(length=st.integers(1, len(PNG) - 1))
+def test_png_cut_anywhere(length: int) -> None:
+    assert find_damage(PNG[:length]) is not None
+
+
+@given(at=st.integers(8, len(PNG) - 1), bit=st.integers(0, 7))
+def test_png_with_one_flipped_bit(at: int, bit: int) -> None:
+    damaged = bytearray(PNG)
+    damaged[at] ^= 1 << bit
+    assert find_damage(bytes(damaged)) is not None
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"byteorder": ">"},
+        {"compression": "zlib"},
+        {"rowsperstrip": 4},
+        {"tile": (16, 16)},
+        {"bigtiff": True},
+    ],
+    ids=str,
+)
+def test_tiff_variants(tmp_path: Path, options: dict[str, object]) -> None:
+    path = tmp_path / "picture.tif"
+    tifffile.imwrite(path, COLOURS, photometric="rgb", **options)
+    data = path.read_bytes()
+    assert find_damage(data) is None
+    np.testing.assert_array_equal(decode_picture(path, data), COLOURS)
+    if "bigtiff" not in options:
+        last_strip = int(len(data) * 0.97)
+        assert "a TIFF file cut short" in str(find_damage(data[:last_strip]))
+        assert find_damage(data[:6]) is not None
+
+
+def fails(root: Path, *parts: str) -> None:
+    """``load_scene`` raises one error whose message holds all parts, in order."""
+    with pytest.raises(PolarguideError, match=".*".join(re.escape(part) for part in parts)):
+        load_scene(root)
+
+
+@pytest.mark.parametrize(
+    ("keep", "found"), [(0, "an empty file"), (300, "a PNG file cut short"), (-1, "a PNG file cut short")]
+)
+def test_truncated_png_in_a_capture(capture: TinyCapture, keep: int, found: str) -> None:
+    path = capture.picture("v002", 90)
+    path.write_bytes(path.read_bytes()[:keep])
+    fails(capture.root, "v002_090.png", "a complete PNG, JPEG or TIFF file", found, "Copy or export")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".tif"])
+def test_truncated_jpeg_and_tiff_in_a_capture(capture: TinyCapture, suffix: str) -> None:
+    capture.rewrite(lambda linear: linear, bits=8, suffix=suffix)
+    path = capture.picture("v002", 90, suffix)
+    path.write_bytes(path.read_bytes()[:-3])
+    fails(capture.root, f"v002_090{suffix}", "file cut short")
+
+
+def test_files_of_other_kinds(capture: TinyCapture) -> None:
+    capture.picture("v001", 0).write_bytes(b"GIF89a and so on")
+    fails(capture.root, "v001_000.png", "found a file that is none of these")
+
+
+def test_a_png_that_is_whole_but_makes_no_sense(capture: TinyCapture) -> None:
+    header = struct.pack(">IIBBBBB", 12, 10, 16, 2, 0, 0, 0)
+    chunks = b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in ((b"IHDR", header), (b"IDAT", b"no zlib stream"), (b"IEND", b""))
+    )
+    capture.picture("v001", 0).write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
+    fails(capture.root, "v001_000.png", "found one that cannot be decoded")
+
+
+def test_a_folder_in_place_of_a_picture(capture: TinyCapture) -> None:
+    capture.picture("v001", 0).unlink()
+    capture.picture("v001", 0).mkdir()
+    fails(capture.root, "v001_000.png", "a readable file", "found Is a directory")
+
+
+def test_floating_point_pictures(capture: TinyCapture) -> None:
+    for angle in (0, 45, 90, 135):
+        capture.picture("v001", angle).unlink()
+        path = capture.picture("v001", angle, ".tif")
+        assert cv2.imwrite(str(path), np.zeros((10, 12, 3), np.float32))
+    fails(
+        capture.root, "v001_000.tif", "8 or 16 bits a channel", "found values of type float32", "16-bit PNG"
+    )
+
+
+def test_pictures_of_one_view_differ(capture: TinyCapture) -> None:
+    write_picture(capture.picture("v003", 135), ideal_intensities(0, height=8, width=12)[3])
+    fails(
+        capture.root, "v003_135.png", "12x10 with 16 bits like polar/v003_000.png", "found 12x8 with 16 bits"
+    )
+    write_picture(capture.picture("v003", 135), capture.linear["v003"][3], bits=8)
+    fails(capture.root, "v003_135.png", "found 12x10 with 8 bits", "Export the four pictures of a view alike")
+
+
+def test_a_view_of_another_size_than_its_camera(capture: TinyCapture) -> None:
+    capture.write_view("v003", ideal_intensities(0, height=8, width=12))
+    fails(capture.root, "camera of view v003", "the size of the pictures, 12x8", "found 12x10", "no crop")
+
+
+def test_views_differ_in_depth(capture: TinyCapture) -> None:
+    capture.write_view("v003", capture.linear["v003"], bits=8)
+    fails(capture.root, "one number of bits for all views", "8 bits in view v003 and 16 in view v000")
+
+
+@pytest.mark.parametrize("folder", ["masks", "invalid"])
+def test_mask_of_another_size_or_damaged(capture: TinyCapture, folder: str) -> None:
+    path = capture.root / folder / "v002.png"
+    write_picture(path, np.ones((12, 10)), bits=8)
+    fails(
+        capture.root, f"{folder}/v002.png", "the size of the pictures, 12x10", "found 10x12", "Make the mask"
+    )
+    path.write_bytes(path.read_bytes()[:-1])
+    fails(capture.root, f"{folder}/v002.png", "a PNG file cut short")

@@ -1,0 +1,193 @@
+"""The verbs one after another on the demo scene: what they write is whole, valid and of the right size."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from plyfile import PlyData
+from safetensors.torch import load_file
+
+from polarguide.cli.app import run
+from polarguide.evaluation import validate_metrics
+from polarguide.training.run import CHECKPOINT, CONFIGURATION, LOG, PLY
+from polarguide.training.trainer import StepReport, Trainer
+
+SIZE = (24, 32)  # the demo scene over 4
+TEST_VIEWS = ("v000", "v022", "v044", "v066")
+
+
+def picture(path: Path) -> np.ndarray:
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None, path
+    assert pixels.dtype == np.uint8
+    assert pixels.shape[2] == 3
+    return pixels
+
+
+def differing(a: Path, b: Path) -> list[str]:
+    """Names of the checkpoints' tensors that are not the same bits."""
+    first, second = load_file(a / CHECKPOINT), load_file(b / CHECKPOINT)
+    assert set(first) == set(second)
+    return [name for name in first if first[name].numpy().tobytes() != second[name].numpy().tobytes()]
+
+
+def test_a_training_leaves_a_whole_run(trained: Path) -> None:
+    assert {path.name for path in trained.iterdir()} >= {CONFIGURATION, CHECKPOINT, LOG, PLY}
+    assert not list(trained.glob(".*"))
+    lines = [json.loads(line) for line in (trained / LOG).read_text().splitlines()]
+    assert [line["step"] for line in lines] == [9, 19, 29, 39]
+    assert all(np.isfinite(line["loss"]) and np.isfinite(line["psnr"]) for line in lines)
+    seconds = [line["seconds"] for line in lines]
+    assert seconds == sorted(seconds)
+    assert json.loads((trained / CONFIGURATION).read_text())["settings"]["steps"] == 40
+
+
+def test_the_ply_opens_in_an_independent_reader(trained: Path) -> None:
+    vertex = PlyData.read(str(trained / PLY))["vertex"]
+    tensors = load_file(trained / CHECKPOINT)
+    assert vertex.count == len(tensors["rows.means"])
+    for column, name in enumerate("xyz"):
+        np.testing.assert_array_equal(vertex[name], tensors["rows.means"][:, column].numpy())
+    np.testing.assert_array_equal(vertex["opacity"], tensors["rows.opacity_logits"].numpy())
+    rotation = np.stack([vertex[f"rot_{i}"] for i in range(4)], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(rotation, axis=1), 1, rtol=1e-5)
+    names = {p.name for p in vertex.properties}
+    assert {"f_dc_2", "f_rest_44", "scale_2", "strength", "linear_dc_0", "linear_rest_44"} <= names
+    assert all(np.isfinite(vertex[name]).all() for name in names)
+
+
+def test_eval_writes_a_valid_record(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    assert run(["eval", str(tmp_path / "run"), "--threads", "1"]) == 0
+    record = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    validate_metrics(record)
+    assert tuple(sorted(record["views"])) == TEST_VIEWS
+    assert record["steps"] == 40
+    assert record["gaussians"] == len(load_file(trained / CHECKPOINT)["rows.means"])
+    assert record["provenance"]["recipe"] == "polarguide"
+    assert record["provenance"]["downscale"] == 4
+    assert 5 < record["psnr"] < 60
+    shown = capsys.readouterr().out
+    assert f"{record['psnr']:.3f}" in shown
+    assert "metrics.json" in shown
+
+
+def test_render_writes_every_layer_of_every_test_view(trained: Path, tmp_path: Path) -> None:
+    out = tmp_path / "pictures"
+    assert run(["render", str(trained), "--out", str(out), "--threads", "1"]) == 0
+    layers = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth")
+    wanted = {f"{view}_{layer}.png" for view in TEST_VIEWS for layer in layers} | {"contact_sheet.png"}
+    assert {path.name for path in out.iterdir()} == wanted
+    assert all(picture(out / name).shape[:2] == SIZE for name in wanted if name != "contact_sheet.png")
+    sheet = picture(out / "contact_sheet.png")
+    assert sheet.shape[0] >= 2 * len(TEST_VIEWS) * SIZE[0]
+    assert sheet.shape[1] >= len(layers) * SIZE[1]
+    assert len({picture(out / f"v000_{layer}.png").tobytes() for layer in layers}) == len(layers)
+
+
+def test_render_of_chosen_views_and_layers(trained: Path, tmp_path: Path) -> None:
+    out = tmp_path / "pictures"
+    arguments = ["--views", "v003, v071", "--layers", "alpha,final", "--out", str(out)]
+    assert run(["render", str(trained), *arguments]) == 0
+    names = {f"{view}_{layer}.png" for view in ("v003", "v071") for layer in ("alpha", "final")}
+    assert {path.name for path in out.iterdir()} == names | {"contact_sheet.png"}
+
+
+@pytest.mark.parametrize("with_run", [False, True])
+def test_priors_before_and_after_training(
+    trained: Path, demo_scene: Path, tmp_path: Path, with_run: bool
+) -> None:
+    out = tmp_path / "pictures"
+    arguments = ["--downscale", "4", "--views", "v000,v003", "--out", str(out)]
+    arguments += ["--run", str(trained)] if with_run else []
+    assert run(["priors", str(demo_scene), *arguments]) == 0
+    names = {path.name for path in out.iterdir()}
+    source = "by_run" if with_run else "by_polarization"
+    for view in ("v000", "v003"):
+        for layer in ("S0", "DoLP", "AoLP", "mask", "specular_paper", f"diffuse_exact_{source}"):
+            assert picture(out / f"{view}_{layer}.png").shape[:2] == SIZE
+    assert "contact_sheet.png" in names
+    assert len(names) == 2 * (len(names) // 2) + 1
+
+
+def test_a_recipe_without_reflection_goes_through_all_verbs(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    short = ["--downscale", "8", "--steps", "5", "--threads", "1", "--recipe", "3dgs"]
+    assert run(["train", str(demo_scene), "--out", str(out), *short]) == 0
+    assert run(["eval", str(out)]) == 0
+    assert json.loads((out / "metrics.json").read_text())["specular_psnr"] is None
+    assert run(["render", str(out), "--views", "v000"]) == 0
+    assert "this recipe has no layer diffuse, reflection, specular, strength" in capsys.readouterr().out
+    assert not (out / "render" / "v000_specular.png").exists()
+    assert (out / "render" / "v000_final.png").exists()
+
+
+def test_a_changed_scene_is_warned_of(
+    trained: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    shutil.copytree(demo_scene, tmp_path / "scene")
+    split = tmp_path / "scene" / "split.json"
+    split.write_text(split.read_text() + "\n")
+    path = tmp_path / "run" / CONFIGURATION
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"scene": str(tmp_path / "scene")}))
+    arguments = ["--views", "v000", "--layers", "final", "--out", str(tmp_path / "out")]
+    assert run(["render", str(tmp_path / "run"), *arguments]) == 0
+    assert "has changed since" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_and_resumed_is_uninterrupted(
+    trained: Path,
+    demo_scene: Path,
+    short: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+) -> None:
+    """Ctrl-C in the middle of step 17: the state is saved, and --resume ends with the same bits."""
+    straight = Trainer.step
+
+    def stopped(self: Trainer) -> StepReport:
+        if self.state.step == 17:
+            os.kill(os.getpid(), number)
+        return straight(self)
+
+    command = ["train", str(demo_scene), "--out", str(tmp_path / "run"), *short]
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", stopped)
+        assert run(command) == 130
+    assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 18
+    assert not (tmp_path / "run" / PLY).exists()
+    assert signal.getsignal(number) is not None
+    assert run([*command, "--resume"]) == 0
+    assert differing(tmp_path / "run", trained) == []
+    lines = [json.loads(line)["step"] for line in (tmp_path / "run" / LOG).read_text().splitlines()]
+    assert lines == [9, 19, 29, 39]
+    assert (tmp_path / "run" / PLY).read_bytes() == (trained / PLY).read_bytes()
+
+
+def test_resuming_a_finished_run_changes_nothing(
+    trained: Path, demo_scene: Path, short: tuple[str, ...], tmp_path: Path
+) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    assert run(["train", str(demo_scene), "--out", str(tmp_path / "run"), *short, "--resume"]) == 0
+    assert differing(tmp_path / "run", trained) == []
+
+
+def test_the_demo_trains_scores_and_renders_and_can_be_gone_on_with(tmp_path: Path) -> None:
+    for _ in range(2):
+        assert run(["demo", "--out", str(tmp_path / "run"), "--steps", "8", "--threads", "1"]) == 0
+        validate_metrics(json.loads((tmp_path / "run" / "metrics.json").read_text()))
+        assert picture(tmp_path / "run" / "render" / "v000_final.png").shape == (96, 128, 3)

@@ -1,0 +1,180 @@
+"""Wrong input ends in one line on stderr and status 2, never in a traceback, and writes nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from polarguide.cli.app import run
+from polarguide.training.run import CHECKPOINT, CONFIGURATION
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+    """Runs a command line that must be refused; returns the one line it says."""
+
+    def run_and_read(*arguments: object) -> str:
+        assert run([str(argument) for argument in arguments]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1, lines
+        assert lines[0].startswith("error: ")
+        assert lines[0].endswith(".")
+        return lines[0]
+
+    return run_and_read
+
+
+def test_missing_scene(refused, tmp_path: Path) -> None:
+    line = refused("train", tmp_path / "none", "--out", tmp_path / "run")
+    assert f"{tmp_path / 'none'}: expected a capture folder, found nothing" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_without_pictures(refused, tmp_path: Path) -> None:
+    assert str(tmp_path) in refused("train", tmp_path, "--out", tmp_path / "run")
+    assert str(tmp_path) in refused("priors", tmp_path, "--out", tmp_path / "pictures")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [
+        ("--steps", 0),
+        ("--steps", -3),
+        ("--checkpoint-every", 0),
+        ("--downscale", 0),
+        ("--downscale", 1000),
+        ("--threads", -1),
+        ("--refractive-index", 1.0),
+        ("--refractive-index", "nan"),
+        ("--refractive-index", 9),
+        ("--device", "cuda"),
+    ],
+)
+def test_values_out_of_range(refused, tmp_path: Path, demo_scene: Path, flag: str, value: object) -> None:
+    line = refused("train", demo_scene, "--out", tmp_path / "run", flag, value)
+    assert flag.strip("-") in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_out_that_already_has_a_run(refused, demo_scene: Path, trained: Path, short) -> None:
+    before = (trained / CHECKPOINT).read_bytes()
+    assert "--resume" in refused("train", demo_scene, "--out", trained, *short)
+    assert (trained / CHECKPOINT).read_bytes() == before
+
+
+def test_out_that_is_a_file(refused, tmp_path: Path, demo_scene: Path, trained: Path, short) -> None:
+    (tmp_path / "file").write_text("mine")
+    for command in (
+        ("train", demo_scene, "--out", tmp_path / "file", *short),
+        ("render", trained, "--out", tmp_path / "file"),
+        ("priors", demo_scene, "--out", tmp_path / "file", "--downscale", 4, "--views", "v000"),
+    ):
+        assert str(tmp_path / "file") in refused(*command)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_resume_without_a_run(refused, tmp_path: Path, demo_scene: Path, short) -> None:
+    line = refused("train", demo_scene, "--out", tmp_path / "run", "--resume", *short)
+    assert "expected a run to resume" in line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("flag", "value", "field"),
+    [
+        ("--steps", 50, "settings"),
+        ("--seed", 1, "settings"),
+        ("--recipe", "3dgs", "recipe"),
+        ("--downscale", 8, "downscale"),
+        ("--refractive-index", 1.4, "settings"),
+    ],
+)
+def test_resume_with_other_flags(
+    refused, demo_scene: Path, trained: Path, short, flag: str, value: object, field: str
+) -> None:
+    before = (trained / CONFIGURATION).read_text()
+    line = refused("train", demo_scene, "--out", trained, "--resume", *short, flag, value)
+    assert f"({field})" in line
+    assert (trained / CONFIGURATION).read_text() == before
+
+
+def test_resume_with_another_scene(refused, tmp_path: Path, demo_scene: Path, trained: Path, short) -> None:
+    other = tmp_path / "demo"
+    shutil.copytree(demo_scene, other)
+    shutil.copy(other / "polar" / "v003_000.png", other / "polar" / "v005_000.png")
+    assert "(scene_digest)" in refused("train", other, "--out", trained, "--resume", *short)
+
+
+def test_resume_after_the_recipe_changed_says_what_changed(
+    refused, tmp_path: Path, demo_scene: Path, trained: Path, short
+) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    path = tmp_path / "run" / CONFIGURATION
+    data = json.loads(path.read_text())
+    data["recipe_data"]["ssim_weight"] = 0.875
+    path.write_text(json.dumps(data))
+    line = refused("train", demo_scene, "--out", tmp_path / "run", "--resume", *short)
+    assert "(recipe_data)" in line
+    assert '{"ssim_weight": 0.875}' in line
+
+
+@pytest.mark.parametrize("verb", ["eval", "render"])
+def test_a_folder_that_is_no_run(refused, tmp_path: Path, verb: str) -> None:
+    for folder in (tmp_path, tmp_path / "none"):
+        assert f"{folder}: expected a run folder" in refused(verb, folder)
+
+
+def test_unknown_layers_and_views(refused, trained: Path, demo_scene: Path, tmp_path: Path) -> None:
+    assert "found colour" in refused("render", trained, "--layers", "final,colour")
+    line = refused("render", trained, "--views", "v001", "--out", tmp_path / "r")
+    assert "found 'v001'" in line
+    assert "The nearest names are: v0" in line
+    line = refused("priors", demo_scene, "--views", "x", "--out", tmp_path / "p", "--downscale", 4)
+    assert "found 'x'" in line
+
+
+@pytest.mark.parametrize("verb", ["render", "priors"])
+def test_no_views(refused, trained: Path, demo_scene: Path, tmp_path: Path, verb: str) -> None:
+    first = trained if verb == "render" else demo_scene
+    assert "--views" in refused(verb, first, "--views", ",", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_layers(refused, trained: Path, tmp_path: Path) -> None:
+    assert "--layers" in refused("render", trained, "--layers", "", "--out", tmp_path / "out")
+
+
+def test_priors_of_a_run_at_another_size(refused, trained: Path, demo_scene: Path, tmp_path: Path) -> None:
+    line = refused("priors", demo_scene, "--run", trained, "--out", tmp_path / "p", "--downscale", 2)
+    assert "--downscale: expected 4" in line
+
+
+@pytest.mark.parametrize("verb", ["eval", "render"])
+def test_a_damaged_checkpoint(refused, trained: Path, tmp_path: Path, verb: str) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    checkpoint = tmp_path / "run" / CHECKPOINT
+    checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
+    assert str(checkpoint) in refused(verb, tmp_path / "run")
+    checkpoint.unlink()
+    assert "expected a checkpoint" in refused(verb, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("scene", "/no/such/scene", "/no/such/scene"),
+        ("recipe", "magic", "found magic"),
+        ("settings", 3, CONFIGURATION),
+    ],
+)
+def test_a_run_whose_configuration_is_wrong(
+    refused, trained: Path, tmp_path: Path, field: str, value: object, said: str
+) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    path = tmp_path / "run" / CONFIGURATION
+    path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
+    assert said in refused("eval", tmp_path / "run")

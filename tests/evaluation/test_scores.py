@@ -1,0 +1,216 @@
+"""Scores of one view and the record of a run."""
+
+import json
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from polarguide.errors import PolarguideError
+from polarguide.evaluation import metrics, record, scores
+
+PROVENANCE = {
+    "recipe": "polarguide",
+    "seed": 0,
+    "commit": "0123abc",
+    "versions": {"torch": "2.13.0"},
+    "device": "cpu",
+    "downscale": 1,
+    "scene_hash": "ff00",
+}
+
+
+def rand(seed, *shape):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def scene(seed=0, height=36, width=40):
+    specular, diffuse = rand(seed, height, width, 3) * 0.5, rand(seed + 1, height, width, 3) * 0.5
+    mask = torch.zeros(height, width, dtype=torch.bool)
+    mask[5:30, 5:30] = True
+    normal = torch.nn.functional.normalize(rand(seed + 2, height, width, 3) - 0.5, dim=-1)
+    truth = SimpleNamespace(normal=normal, mask=mask, specular=specular, diffuse=diffuse)
+    return (specular + diffuse) / 2, truth
+
+
+def rendering(photograph, truth):
+    return SimpleNamespace(
+        final=photograph * 0.9,
+        normal=truth.normal * 0.3 + 0.02,
+        specular=truth.specular * 0.4,
+        diffuse=truth.diffuse * 0.5,
+    )
+
+
+def test_every_key_has_its_definition():
+    photograph, truth = scene()
+    rendered = rendering(photograph, truth)
+    got = scores.score_view(photograph, None, truth, rendered)
+    reflective = metrics.reflective_mask(truth.specular, 2 * photograph, truth.mask)
+    assert 0 < reflective.sum() < truth.mask.sum()
+    expected = {
+        "psnr": metrics.psnr(rendered.final, photograph),
+        "psnr_foreground": metrics.psnr(rendered.final, photograph, truth.mask),
+        "psnr_reflective": metrics.psnr(rendered.final, photograph, reflective),
+        "ssim": metrics.ssim(rendered.final, photograph),
+        "normal_mae_deg": metrics.normal_mae_deg(rendered.normal, truth.normal, truth.mask),
+        "normal_within_11": metrics.normal_within_11(rendered.normal, truth.normal, truth.mask),
+        "specular_psnr": metrics.layer_psnr(rendered.specular, truth.specular, truth.mask),
+        "specular_psnr_aligned": scores.PERFECT_PSNR,
+        "diffuse_psnr": scores.PERFECT_PSNR,
+        "diffuse_psnr_aligned": scores.PERFECT_PSNR,
+    }
+    assert {key: got[key] for key in expected} == pytest.approx(expected)
+    assert set(got) == {*scores.MEAN_KEYS, "lpips_reason"}
+    assert len({round(expected[key], 6) for key in list(expected)[:7]}) == 7
+
+
+def test_invalid_pixels_count_in_no_score():
+    photograph, truth = scene()
+    rendered = rendering(photograph, truth)
+    invalid = torch.zeros(photograph.shape[:2], dtype=torch.bool)
+    invalid[8:20, 12:22] = True
+    before = scores.score_view(photograph, invalid, truth, rendered)
+    assert before != scores.score_view(photograph, None, truth, rendered)
+    spoiled = SimpleNamespace(
+        **{k: torch.where(invalid[..., None], 0.3, v) for k, v in vars(rendered).items()}
+    )
+    photograph = torch.where(invalid[..., None], 1.0, photograph)
+    assert scores.score_view(photograph, invalid, truth, spoiled) == before
+
+
+def test_what_is_missing_is_none():
+    photograph, truth = scene()
+    plain = SimpleNamespace(final=photograph * 0.9, normal=None, specular=None, diffuse=None)
+    without_truth = scores.score_view(photograph, None, None, plain)
+    assert {k for k in scores.MEAN_KEYS if without_truth[k] is not None} <= {"psnr", "ssim", "lpips"}
+    without_layers = scores.score_view(photograph, None, truth, plain)
+    assert without_layers["psnr_reflective"] is not None
+    for key in ("normal_mae_deg", "normal_within_11", "specular_psnr", "diffuse_psnr_aligned"):
+        assert without_layers[key] is None
+    truth.mask = torch.zeros_like(truth.mask)
+    assert scores.score_view(photograph, None, truth, rendering(photograph, truth))["psnr_foreground"] is None
+
+
+def test_broken_pixels_are_scored_and_counted():
+    photograph, truth = scene()
+    rendered = rendering(photograph, truth)
+    rendered.final[10, 10, 1] = math.nan
+    rendered.specular[10, 10] = math.inf
+    rendered.normal[7, 7, 0] = math.nan
+    got = scores.score_view(photograph, None, truth, rendered)
+    assert got["nonfinite_pixels"] == 2
+    rendered.final[10, 10] = 0
+    rendered.specular[10, 10] = 0
+    rendered.normal[7, 7] = 0
+    clean = scores.score_view(photograph, None, truth, rendered)
+    assert "nonfinite_pixels" not in clean
+    assert {k: v for k, v in got.items() if k != "nonfinite_pixels"} == clean
+
+
+def test_summary_is_the_plain_mean_of_what_is_there():
+    views = {
+        "a": {
+            "psnr": 20.0,
+            "ssim": 0.5,
+            "psnr_reflective": None,
+            "lpips": None,
+            "lpips_reason": "no network",
+        },
+        "b": {
+            "psnr": 30.0,
+            "ssim": 0.7,
+            "psnr_reflective": 18.0,
+            "lpips": None,
+            "lpips_reason": "no network",
+        },
+        "c": {
+            "psnr": 40.0,
+            "ssim": math.nan,
+            "psnr_reflective": None,
+            "lpips": None,
+            "lpips_reason": "no network",
+        },
+    }
+    means = scores.summarise(views)
+    assert means["psnr"] == 30
+    assert means["ssim"] == pytest.approx(0.6)
+    assert means["psnr_reflective"] == 18
+    assert means["normal_mae_deg"] is None
+    assert means["lpips_reason"] == "no network"
+
+
+@pytest.fixture
+def views():
+    photograph, truth = scene()
+    perfect = rendering(photograph, truth)
+    perfect.final = photograph
+    return {
+        "v1": scores.score_view(photograph, None, truth, rendering(photograph, truth)),
+        "v2": scores.score_view(photograph, None, truth, perfect),
+    }
+
+
+def test_metrics_file(tmp_path, views):
+    path = tmp_path / "metrics.json"
+    path.write_text("old")
+    run = {"fps": 12.5, "gaussians": 1000, "train_seconds": math.nan}
+    written = record.write_metrics(path, views=views, run=run, provenance=PROVENANCE)
+
+    def refuse(token):
+        raise AssertionError(f"{token} is not JSON")
+
+    read = json.loads(path.read_text(), parse_constant=refuse)
+    assert read == written
+    assert read["views"]["v2"]["psnr"] == 100
+    assert read["psnr"] == pytest.approx((views["v1"]["psnr"] + 100) / 2)
+    assert (read["fps"], read["gaussians"], read["train_seconds"], read["steps"]) == (12.5, 1000, None, None)
+    assert read["provenance"] == PROVENANCE
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
+    record.validate_metrics(read)
+
+
+def test_failed_write_leaves_the_old_file(tmp_path, views):
+    path = tmp_path / "metrics.json"
+    path.write_text("old")
+    with pytest.raises(TypeError):
+        record.write_metrics(path, views=views, run={}, provenance={**PROVENANCE, "seed": object()})
+    assert path.read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def set_at(tree, path, value):
+    *parents, last = path
+    for key in parents:
+        tree = tree[key]
+    if value is KeyError:
+        del tree[last]
+    else:
+        tree[last] = value
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("psnr",), KeyError, "m.json: psnr: expected a finite number or null, found 'no such key'"),
+        (("psnr",), math.inf, "m.json: psnr: expected a finite number or null, found inf"),
+        (("psnr",), 101.0, "m.json: psnr: expected at most 100.0 dB"),
+        (("fps",), "fast", "m.json: fps: expected a finite number or null, found 'fast'"),
+        (("steps",), True, "m.json: steps: expected a finite number or null, found True"),
+        (("views",), {}, "m.json: views: expected an object with at least one view"),
+        (("views", "v1"), 3, "m.json: views.v1: expected an object, found 3"),
+        (("views", "v2", "ssim"), KeyError, "m.json: views.v2: ssim"),
+        (("views", "v2", "lpips_reason"), None, "m.json: views.v2: lpips_reason: expected a reason"),
+        (("provenance", "seed"), KeyError, "m.json: provenance.seed: expected a value"),
+        (("provenance",), None, "m.json: provenance: expected an object, found None"),
+    ],
+)
+def test_schema_names_what_is_wrong(tmp_path, views, path, value, message):
+    for scored in views.values():
+        scored.update(lpips=None, lpips_reason="not wanted here")
+    good = record.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=dict(PROVENANCE))
+    set_at(good, path, value)
+    with pytest.raises(PolarguideError) as caught:
+        record.validate_metrics(good, "m.json")
+    assert str(caught.value).startswith(message)

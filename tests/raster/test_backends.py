@@ -1,0 +1,162 @@
+"""The native kernels against their slow twin in float64 on every instruction set; always the same bits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from raster_scenes import Gaussians, Outcome, differences, in_view, outcome, posed, same_bits
+
+from polarguide import _native
+from polarguide.raster import choose_backend, rasterise_reference
+from polarguide.raster.cpu import rasterise_cpu
+
+# Float32 against float64. Sums over some hundred pixels and some ten layers round off about 1e-6.
+TOLERANCE = 1e-5
+# A lone pixel's pull is summed about the tile's centre, eight pixels away: nothing averages the rounding out.
+LONE_PIXEL_TOLERANCE = 1e-4
+CHANNELS = (1, 3, 4, 5, 7, 8, 11, 12, 16, 20, 32)
+SIZES = ((1, 1), (3, 2), (16, 16), (17, 33), (31, 18), (50, 37))
+STATISTICS = (None, (0, 1, 2), (1, 4), (2,))
+
+
+def instruction_sets() -> list[str]:
+    """The variants that this processor can run."""
+    names = []
+    active = _native.simd()
+    for name in ("baseline", "avx2", "avx512"):
+        try:
+            _native.select_simd(name)
+        except ValueError:
+            continue
+        names.append(name)
+    _native.select_simd(active)
+    return names
+
+
+@pytest.fixture(params=instruction_sets())
+def simd(request: pytest.FixtureRequest) -> Iterator[str]:
+    active = _native.simd()
+    _native.select_simd(request.param)
+    yield request.param
+    _native.select_simd(active)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = _native.thread_count()
+    yield
+    _native.set_thread_count(before)
+
+
+def compared(gaussians: Gaussians, width: int, height: int, statistic: tuple[int, ...] | None) -> None:
+    camera = posed(width, height)
+    found = outcome(rasterise_cpu, gaussians, camera, statistic)
+    expected = outcome(rasterise_reference, gaussians, camera, statistic, dtype=torch.float64)
+    assert torch.equal(found.radii > 0, expected.radii > 0)
+    worst = differences(found, expected)
+    assert max(worst.values()) < (TOLERANCE if width * height > 1 else LONE_PIXEL_TOLERANCE), worst
+    touched = [float(g.norm()) > 0 for g in expected.gradients]
+    assert all(touched), "the scene says nothing about some gradient"
+
+
+@pytest.mark.parametrize("channels", CHANNELS)
+def test_every_channel_count_agrees_with_the_twin(simd: str, channels: int) -> None:
+    statistics = [s for s in STATISTICS if s is None or max(s) < channels]
+    for seed, statistic in enumerate(statistics):
+        gaussians = in_view(posed(23, 21), 40, channels, seed)
+        compared(gaussians, 23, 21, statistic)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_every_picture_size_agrees_with_the_twin(simd: str, width: int, height: int) -> None:
+    gaussians = in_view(posed(width, height), 60, 7, seed=11)
+    compared(gaussians, width, height, (0, 1, 2))
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_statistic_counts_its_own_channels_alone(statistic: tuple[int, ...] | None) -> None:
+    camera = posed(20, 20)
+    gaussians = in_view(camera, 30, 7, seed=5)
+    first = outcome(rasterise_cpu, gaussians, camera, statistic)
+    other = gaussians.features.clone()
+    ignored = [k for k in range(7) if statistic is None or k not in statistic]
+    other[:, ignored] *= -3
+    second = outcome(rasterise_cpu, gaussians._replace(features=other), camera, statistic)
+    assert not torch.allclose(first.gradients.means, second.gradients.means)
+    if statistic is None:
+        assert first.statistic is None
+    else:
+        assert first.statistic is not None
+        assert second.statistic is not None
+        torch.testing.assert_close(first.statistic, second.statistic, rtol=1e-4, atol=1e-5)
+
+
+def test_statistic_does_not_change_the_gradients() -> None:
+    camera = posed(20, 20)
+    gaussians = in_view(camera, 30, 7, seed=6)
+    plain = outcome(rasterise_cpu, gaussians, camera)
+    for channels in ((0, 1, 2), (1, 4), tuple(range(7)), ()):
+        watched = outcome(rasterise_cpu, gaussians, camera, channels)
+        worst = differences(watched._replace(statistic=None), plain)
+        assert max(worst.values()) < TOLERANCE, (channels, worst)
+
+
+def runs(simd_gaussians: Gaussians, thread_counts: tuple[int, ...]) -> list[Outcome]:
+    results = []
+    for count in thread_counts:
+        _native.set_thread_count(count)
+        assert _native.thread_count() == count
+        results.append(outcome(rasterise_cpu, simd_gaussians, posed(70, 45), (0, 1, 2)))
+    return results
+
+
+@pytest.mark.usefixtures("threads")
+def test_same_bits_for_any_number_of_threads(simd: str) -> None:
+    # More Gaussians than a chunk of the projection, so that several threads really share each loop.
+    small = in_view(posed(70, 45), 60, 7, seed=1)
+    many = Gaussians(*(torch.cat([t] * 40) for t in small))
+    jitter = torch.randn(many.means.shape, generator=torch.Generator().manual_seed(0))
+    many = many._replace(means=many.means + 0.3 * jitter, opacities=many.opacities * 0.2)
+    first, *others = runs(many, (1, 2, 3, 2, 1))
+    assert all(same_bits(other, first) for other in others)
+
+
+def test_same_bits_in_repeated_runs(simd: str) -> None:
+    gaussians = in_view(posed(40, 30), 60, 8, seed=2)
+    first, *others = (outcome(rasterise_cpu, gaussians, posed(40, 30), (1, 4)) for _ in range(4))
+    assert all(same_bits(other, first) for other in others)
+
+
+def test_unknown_instruction_set_is_refused() -> None:
+    active = _native.simd()
+    with pytest.raises(ValueError, match="avx1024"):
+        _native.select_simd("avx1024")
+    assert _native.simd() == active
+
+
+def test_auto_and_cpu_choose_the_native_backend() -> None:
+    for name in ("auto", "cpu"):
+        backend = choose_backend(name)
+        assert backend.device == torch.device("cpu")
+        assert backend.rasterise is rasterise_cpu
+
+
+def test_gradients_follow_inputs_that_are_views_or_not_contiguous() -> None:
+    camera = posed(16, 16)
+    gaussians = in_view(camera, 20, 4, seed=3)
+    expected = outcome(rasterise_cpu, gaussians, camera)
+    wide = torch.cat((gaussians.features, torch.zeros_like(gaussians.features)), dim=1).requires_grad_()
+    turned = gaussians.means.T.contiguous().requires_grad_()
+    picture = rasterise_cpu(turned.T, *gaussians[1:4], wide[:, :4], camera)
+    assert torch.equal(picture.features, expected.features)
+    generator = torch.Generator().manual_seed(7)
+    to_features = torch.randn(picture.features.shape, generator=generator)
+    to_alpha = torch.randn(picture.alpha.shape, generator=generator)
+    ((picture.features * to_features).sum() + (picture.alpha * to_alpha).sum()).backward()
+    assert turned.grad is not None
+    assert wide.grad is not None
+    torch.testing.assert_close(turned.grad.T, expected.gradients.means)
+    torch.testing.assert_close(wide.grad[:, :4], expected.gradients.features)
+    assert not wide.grad[:, 4:].any()

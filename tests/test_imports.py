@@ -1,0 +1,186 @@
+"""Data flows one way: every module imports only from rooms above its own, and openly."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "polarguide"
+SOURCE = Path(__file__).resolve().parents[1] / "src" / PACKAGE
+
+# From the top down. A room may import from itself and from every room before it.
+ROOMS = (
+    "errors",
+    "camera",
+    "_native",
+    "optics",
+    "capture",
+    "gaussians",
+    "raster",
+    "shading",
+    "training",
+    "recipes",
+    "evaluation",
+    "inspection",
+    "export",
+    "viewer",
+    "synth",
+    "cli",
+    "__main__",
+)
+# What ``polarguide/__init__.py`` defines itself (its version) is for everyone.
+ROOT = ""
+
+
+def room_of(parts):
+    """The room of a module's path below the package, ROOT for the package itself."""
+    return parts[0] if parts and parts[0] != "__init__" else ROOT
+
+
+def imported_rooms(node, parts, rooms):
+    """The rooms that one import statement of the module at ``parts`` reaches; [] where it is not ours."""
+    if isinstance(node, ast.Import):
+        names = [alias.name.split(".") for alias in node.names]
+        return [room_of(name[1:]) for name in names if name[0] == PACKAGE]
+    if node.level:
+        base = list(parts[: len(parts) - node.level])
+        path = base + (node.module.split(".") if node.module else [])
+    else:
+        path = (node.module or "").split(".")
+        if path[0] != PACKAGE:
+            return []
+        path = path[1:]
+    if path:
+        return [room_of(path)]
+    # ``from polarguide import x``: a room, or something the package itself defines.
+    return [alias.name if alias.name in rooms else ROOT for alias in node.names]
+
+
+def faults(source, rooms=ROOMS):
+    """What breaks the order in the package at ``source``, one line each."""
+    found = []
+    for path in sorted(source.rglob("*.py")):
+        parts = path.relative_to(source).with_suffix("").parts
+        room = room_of(parts)
+        where = path.relative_to(source).as_posix()
+        if room != ROOT and room not in rooms:
+            found.append(f"{where}: the room {room} has no place in the order")
+            continue
+        tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+        functions = [
+            n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+        ]
+        deferred = {id(n) for function in functions for n in ast.walk(function)}
+        for node in ast.walk(tree):
+            if not isinstance(node, (ast.Import, ast.ImportFrom)):
+                continue
+            line = f"{where}:{node.lineno}"
+            if any(alias.name == "*" for alias in node.names):
+                found.append(f"{line}: star import")
+            targets = imported_rooms(node, parts, rooms)
+            if targets and id(node) in deferred:
+                found.append(f"{line}: project import inside a function")
+            for target in targets:
+                if target in (ROOT, room):
+                    continue
+                if target not in rooms:
+                    found.append(f"{line}: imports {target}, which has no place in the order")
+                elif room == ROOT or rooms.index(target) > rooms.index(room):
+                    found.append(f"{line}: {room or PACKAGE} imports {target}, which is further down")
+    return found
+
+
+def test_the_package_keeps_its_order():
+    assert len(list(SOURCE.rglob("*.py"))) > 10
+    assert faults(SOURCE) == []
+
+
+@pytest.fixture
+def package(tmp_path):
+    def write(files):
+        for name, text in files.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return tmp_path
+
+    return write
+
+
+def test_upward_and_outside_imports_are_fine(package):
+    cli = [
+        "import polarguide",
+        "from polarguide import __version__, _native",
+        "from ..optics.stokes import s",
+    ]
+    stokes = ["def f():", "    import scipy", "from ..errors import E", "from . import frames"]
+    frames = ["import torch", "from polarguide.camera import Camera", "import polarguide.optics.stokes"]
+    source = package(
+        {
+            "__init__.py": "__version__ = '1'",
+            "cli/run.py": "\n".join(cli),
+            "optics/stokes.py": "\n".join(stokes),
+            "optics/frames.py": "\n".join(frames),
+        }
+    )
+    assert faults(source) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fault"),
+    [
+        (
+            "optics/a.py",
+            "from polarguide.training import loop",
+            "optics/a.py:1: optics imports training, which is",
+        ),
+        (
+            "optics/a.py",
+            "from polarguide import cli",
+            "optics/a.py:1: optics imports cli, which is further down",
+        ),
+        (
+            "optics/a.py",
+            "import polarguide.raster.cpu as c",
+            "optics/a.py:1: optics imports raster, which is",
+        ),
+        (
+            "optics/a.py",
+            "from ..raster import x",
+            "optics/a.py:1: optics imports raster, which is further down",
+        ),
+        (
+            "optics/__init__.py",
+            "from .. import raster",
+            "optics/__init__.py:1: optics imports raster, which is",
+        ),
+        ("camera.py", "from .optics import x", "camera.py:1: camera imports optics, which is further down"),
+        (
+            "__init__.py",
+            "from .errors import E",
+            "__init__.py:1: polarguide imports errors, which is further down",
+        ),
+        (
+            "cli/a.py",
+            "def f():\n    from polarguide.optics import x",
+            "cli/a.py:2: project import inside a function",
+        ),
+        (
+            "cli/a.py",
+            "class A:\n  def f(self):\n    from . import b",
+            "cli/a.py:3: project import inside a function",
+        ),
+        ("cli/a.py", "from math import *", "cli/a.py:1: star import"),
+        ("cli/a.py", "from polarguide.nowhere import x", "cli/a.py:1: imports nowhere, which has no place"),
+        ("attic/a.py", "", "attic/a.py: the room attic has no place in the order"),
+        (
+            "optics/a.py",
+            "if TYPE_CHECKING:\n    from ..cli import x",
+            "optics/a.py:2: optics imports cli, which is",
+        ),
+    ],
+)
+def test_what_breaks_the_order_is_found(package, name, text, fault):
+    found = faults(package({name: text + "\n"}))
+    assert len(found) == 1
+    assert found[0].startswith(fault)

@@ -1,0 +1,135 @@
+"""Terms of the loss at inputs whose value is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from polarguide.errors import PolarguideError
+from polarguide.shading.display import srgb_encode
+from polarguide.shading.result import RenderResult
+from polarguide.training.losses import azimuth_loss, normal_loss, step_loss
+from polarguide.training.photometric import photometric_loss
+from polarguide.training.priors import ViewPriors
+from polarguide.training.stages import Weights
+
+SIZE = (12, 14)
+
+
+def unit(seed: int) -> Tensor:
+    return normalize(torch.randn(*SIZE, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
+
+
+def picture(seed: int) -> Tensor:
+    return torch.rand(*SIZE, 3, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture
+def priors() -> ViewPriors:
+    normal = unit(0)
+    plane = normalize(torch.linalg.cross(normal, unit(1)), dim=-1)
+    weight = torch.rand(SIZE, generator=torch.Generator().manual_seed(2))
+    return ViewPriors(
+        srgb_encode(picture(3)), srgb_encode(picture(4)), torch.ones(SIZE), normal, plane, weight
+    )
+
+
+def result(**layers: Tensor | None) -> RenderResult:
+    empty = dict.fromkeys(("specular", "diffuse", "reflection", "strength", "normal", "depth"))
+    values = {
+        "final": picture(5),
+        "base": picture(5),
+        "alpha": torch.ones(SIZE),
+        "radii": torch.ones(3),
+    }
+    return RenderResult(**{**empty, **values, **layers})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("length", [0.5, 1.0, 3.0])
+def test_normal_loss_is_zero_at_the_target_whatever_the_length(priors: ViewPriors, length: float) -> None:
+    assert float(normal_loss(length * priors.normal, priors)) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_normal_loss_is_two_at_the_opposite_and_one_across(priors: ViewPriors) -> None:
+    assert float(normal_loss(-priors.normal, priors)) == pytest.approx(2.0, rel=1e-5)
+    assert float(normal_loss(priors.plane, priors)) == pytest.approx(1.0, rel=1e-4)
+
+
+def test_azimuth_loss_is_zero_in_the_plane_whatever_the_zenith(priors: ViewPriors) -> None:
+    across = torch.linalg.cross(priors.plane, priors.normal)
+    for angle in torch.linspace(0, 3, 7):
+        in_plane = torch.cos(angle) * priors.normal + torch.sin(angle) * across
+        assert float(azimuth_loss(in_plane, priors)) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_azimuth_loss_is_one_across_the_plane_and_blind_to_its_sign(priors: ViewPriors) -> None:
+    assert float(azimuth_loss(priors.plane, priors)) == pytest.approx(1.0, rel=1e-5)
+    assert float(azimuth_loss(-2 * priors.plane, priors)) == pytest.approx(1.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("loss", [normal_loss, azimuth_loss])
+def test_pixels_without_weight_do_not_count(priors: ViewPriors, loss: object) -> None:
+    weight = priors.weight.clone()
+    weight[:, :5] = 0
+    priors = replace(priors, weight=weight)
+    normal = unit(9)
+    other = normal.clone()
+    other[:, :5] = unit(10)[:, :5]
+    assert torch.equal(loss(normal, priors), loss(other, priors))  # type: ignore[operator]
+    none = replace(priors, weight=torch.zeros(SIZE))
+    assert float(loss(normal, none)) == 0  # type: ignore[operator]
+
+
+def test_a_blended_normal_of_length_zero_has_a_finite_gradient(priors: ViewPriors) -> None:
+    normal = torch.zeros(*SIZE, 3, requires_grad=True)
+    (normal_loss(normal, priors) + azimuth_loss(normal, priors)).backward()
+    assert normal.grad is not None
+    assert bool(torch.isfinite(normal.grad).all())
+
+
+def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> None:
+    shown = srgb_encode(picture(6))
+    rendered = result(specular=picture(7), diffuse=picture(8), normal=unit(9))
+    valid = (picture(11)[..., 0] > 0.2).float()
+    weights = Weights(photometric=0.7, specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
+    total, photometric = step_loss(rendered, shown, valid, weights, priors, ssim_weight=0.3)
+    assert rendered.specular is not None
+    assert rendered.diffuse is not None
+    assert rendered.normal is not None
+    expected_photometric = photometric_loss(rendered.final, shown, valid, 0.3)
+    expected = (
+        0.7 * expected_photometric
+        + 0.5 * photometric_loss(rendered.specular, priors.specular, priors.separated, 0.3)
+        + 0.2 * photometric_loss(rendered.diffuse, priors.diffuse, priors.separated, 0.3)
+        + 0.3 * normal_loss(rendered.normal, priors)
+        + 0.4 * azimuth_loss(rendered.normal, priors)
+    )
+    assert float(total) == pytest.approx(float(expected), rel=1e-5)
+    assert float(photometric) == pytest.approx(float(expected_photometric), rel=1e-6)
+
+
+def test_a_perfect_picture_costs_nothing(priors: ViewPriors) -> None:
+    assert priors.separated.all()
+    rendered = result(final=picture(6), specular=picture(3), diffuse=picture(4), normal=priors.normal)
+    weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
+    total, _ = step_loss(rendered, srgb_encode(picture(6)), None, weights, priors, ssim_weight=0.2)
+    assert float(total) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_layers_that_a_recipe_lacks_are_left_out(priors: ViewPriors) -> None:
+    weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
+    shown = srgb_encode(picture(6))
+    total, photometric = step_loss(result(), shown, None, weights, priors, ssim_weight=0.2)
+    assert torch.equal(total, photometric)
+    total, photometric = step_loss(result(normal=unit(1)), shown, None, weights, None, ssim_weight=0.2)
+    assert torch.equal(total, photometric)
+
+
+def test_a_loss_that_is_not_finite_is_an_error(priors: ViewPriors) -> None:
+    rendered = result(normal=torch.full((*SIZE, 3), torch.nan))
+    with pytest.raises(PolarguideError, match="finite loss"):
+        step_loss(rendered, picture(6), None, Weights(normal=0.1), priors, ssim_weight=0.2)

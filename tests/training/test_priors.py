@@ -1,0 +1,125 @@
+"""Priors of the demo scene, whose normals and layers are known, with the true normals as guide."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from polarguide.capture import GroundTruth, View, load_scene
+from polarguide.shading.display import srgb_decode, srgb_encode
+from polarguide.training.losses import azimuth_loss
+from polarguide.training.priors import ViewPriors, guide_normals, view_priors
+from polarguide.training.stages import Priors
+
+INDEX = 1.5
+PAPER = Priors(candidates="paper", separation="paper", azimuth_weight=0.0)
+EXACT = Priors(candidates="physical", separation="exact")
+
+
+@pytest.fixture(scope="module")
+def view(demo_scene: Path) -> View:
+    return load_scene(demo_scene, views=["v022"]).view("v022")
+
+
+def truth_of(view: View) -> GroundTruth:
+    assert view.truth is not None
+    return view.truth
+
+
+def guide_of(view: View) -> Tensor:
+    normal = truth_of(view).normal
+    assert normal is not None
+    return normal
+
+
+def psnr(found: Tensor, linear: Tensor, where: Tensor) -> float:
+    error = (found - srgb_encode(linear.clamp(0, 1)))[where].square().mean()
+    return float(-10 * torch.log10(error))
+
+
+def layers_psnr(priors: ViewPriors, view: View) -> tuple[float, float]:
+    truth = truth_of(view)
+    assert truth.specular is not None
+    assert truth.diffuse is not None
+    assert truth.mask is not None
+    where = truth.mask & (priors.separated > 0)
+    assert float(where.sum() / truth.mask.sum()) > 0.5
+    return psnr(priors.specular, truth.specular / 2, where), psnr(priors.diffuse, truth.diffuse / 2, where)
+
+
+def test_exact_separation_is_near_the_truth_and_nearer_than_the_papers(view: View) -> None:
+    exact = layers_psnr(view_priors(view, guide_of(view), EXACT, INDEX), view)
+    paper = layers_psnr(view_priors(view, guide_of(view), PAPER, INDEX), view)
+    assert min(exact) > 35
+    assert exact[0] > paper[0] + 5
+    assert exact[1] > paper[1] + 5
+
+
+def test_exact_layers_add_up_to_the_photograph_and_the_papers_fall_short(view: View) -> None:
+    for settings in (EXACT, PAPER):
+        priors = view_priors(view, guide_of(view), settings, INDEX)
+        inside = (priors.specular > 0.01) & (priors.diffuse > 0.01) & (view.photograph() < 0.99)
+        assert float(inside.float().mean()) > 0.5
+        total = srgb_decode(priors.specular) + srgb_decode(priors.diffuse)
+        if settings is EXACT:
+            torch.testing.assert_close(total[inside], view.photograph()[inside], atol=1e-5, rtol=1e-5)
+        else:
+            assert bool((total < 0.99 * view.photograph())[inside].all())
+
+
+def test_settings_of_the_paper_give_other_priors(view: View) -> None:
+    exact = view_priors(view, guide_of(view), EXACT, INDEX)
+    paper = view_priors(view, guide_of(view), PAPER, INDEX)
+    for name in ("specular", "diffuse", "normal", "separated"):
+        assert not torch.allclose(getattr(exact, name), getattr(paper, name), atol=0.01), name
+
+
+def test_the_true_normals_lie_near_the_planes_of_incidence(view: View) -> None:
+    priors = view_priors(view, guide_of(view), EXACT, INDEX)
+    assert float(priors.weight.sum()) > 500
+    assert float(azimuth_loss(guide_of(view), priors)) < 0.07
+    turned = view.camera.to_world(torch.tensor([1.0, 1.0, -1.0]).expand_as(guide_of(view)))
+    assert float(azimuth_loss(turned, priors)) > 0.3
+
+
+def test_shapes_ranges_and_units(view: View) -> None:
+    priors = view_priors(view, guide_of(view), EXACT, INDEX)
+    size = (view.camera.height, view.camera.width)
+    for name in ("specular", "diffuse"):
+        layer = getattr(priors, name)
+        assert layer.shape == (*size, 3)
+        assert 0 <= float(layer.min()) <= float(layer.max()) <= 1
+    assert priors.weight.shape == priors.separated.shape == size
+    assert 0 <= float(priors.weight.min()) <= float(priors.weight.max()) <= 1
+    assert set(priors.separated.unique().tolist()) <= {0.0, 1.0}
+    counted = priors.weight > 0
+    torch.testing.assert_close(priors.normal.norm(dim=-1)[counted], torch.ones(int(counted.sum())))
+    rays = view.camera.world_rays()
+    assert bool(((priors.normal * rays).sum(-1)[counted] < 1e-3).all()), "faces the camera"
+    torch.testing.assert_close(
+        (priors.normal * priors.plane).sum(-1)[counted], torch.zeros(int(counted.sum())), atol=1e-4, rtol=0
+    )
+
+
+def test_where_the_guide_knows_nothing_the_weights_are_zero(view: View) -> None:
+    guide = guide_of(view).clone()
+    guide[:40] = 0
+    priors = view_priors(view, guide, EXACT, INDEX)
+    assert not priors.weight[:40].any()
+    assert not priors.separated[:40].any()
+    assert bool(priors.weight[40:].any())
+
+
+def test_guide_normals_face_the_camera_and_mixed_ones_are_not_known(view: View) -> None:
+    rays = view.camera.rays()
+    raw = torch.randn(rays.shape, generator=torch.Generator().manual_seed(0))
+    unit, known = guide_normals(raw, rays)
+    assert float((unit * rays).sum(-1).max()) <= 1e-4
+    torch.testing.assert_close(unit.norm(dim=-1), torch.ones(rays.shape[:2]))
+    assert torch.equal(known, raw.norm(dim=-1) > 0.3)
+    facing = (raw * rays).sum(-1) < -1e-3
+    torch.testing.assert_close(unit[facing], normalize(raw, dim=-1)[facing])

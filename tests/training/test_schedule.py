@@ -1,0 +1,140 @@
+"""Stages laid over steps. No number of a real recipe appears here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import get_args, get_type_hints
+
+import pytest
+
+from polarguide.cli import train as train_verb
+from polarguide.recipes import RECIPES
+from polarguide.training.stages import Recipe, Repeat, Schedule, Stage
+
+EVERY_RECIPE = pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES.keys())
+
+RESET = Repeat("reset_opacity", fraction=0.06)
+PROPAGATE = Repeat("propagate_normals", fraction=0.02)
+REFRESH = Repeat("refresh_priors", fraction=0.03)
+RECIPE = Recipe(
+    name="three",
+    about="",
+    stages=(
+        Stage("first", 0.2, reflection=False),
+        Stage("second", 0.5, True, repeats=(RESET, PROPAGATE, REFRESH), on_enter=("refresh_priors",)),
+        Stage("third", 0.3, reflection=True),
+    ),
+    rates={"means": 2.0},
+    means_decay=0.25,
+    sh_fractions=(0.1, 0.4, 0.5),
+)
+
+
+def names(steps: int) -> list[str]:
+    schedule = Schedule(RECIPE, steps)
+    return [schedule.at(step).stage.name for step in range(steps)]
+
+
+@pytest.mark.parametrize("steps", [10, 100, 1000, 30_000])
+def test_boundaries_scale_with_the_steps(steps: int) -> None:
+    stages = names(steps)
+    assert stages.count("first") == steps // 5
+    assert stages.count("second") == steps // 2
+    assert stages == sorted(stages, key=["first", "second", "third"].index)
+
+
+def test_every_step_of_a_short_training_has_a_stage() -> None:
+    for steps in range(1, 20):
+        assert len(names(steps)) == steps
+
+
+def test_actions_are_due_at_their_distance_from_the_stage_start() -> None:
+    schedule = Schedule(RECIPE, 100)
+    due = {step: schedule.at(step).actions for step in range(100) if schedule.at(step).actions}
+    assert due[20] == ("refresh_priors",), "on entering"
+    assert [s for s, actions in due.items() if "reset_opacity" in actions] == [26, 32, 38, 44, 50, 56, 62, 68]
+    assert [s for s, actions in due.items() if "refresh_priors" in actions] == [20, *range(23, 70, 3)]
+    assert min(due) == 20
+    assert max(due) < 70
+
+
+def test_the_reset_wins_over_the_propagation() -> None:
+    schedule = Schedule(RECIPE, 100)
+    propagated = [s for s in range(100) if "propagate_normals" in schedule.at(s).actions]
+    assert propagated == [s for s in range(22, 70, 2) if (s - 20) % 6]
+    assert schedule.at(26).actions == ("reset_opacity", "refresh_priors")
+
+
+def test_minimum_distance() -> None:
+    close = replace(RESET, minimum=17)
+    recipe = replace(RECIPE, stages=(Stage("only", 1.0, True, repeats=(close,)),))
+    schedule = Schedule(recipe, 100)
+    assert [s for s in range(100) if schedule.at(s).actions] == [17, 34, 51, 68, 85]
+    assert Schedule(recipe, 10_000).period(close) == 600
+
+
+def test_a_repeat_is_never_closer_than_one_step() -> None:
+    assert Schedule(RECIPE, 3).period(PROPAGATE) == 1
+
+
+def test_harmonics_begin_at_their_shares() -> None:
+    schedule = Schedule(RECIPE, 200)
+    degrees = [schedule.sh_degree(step) for step in range(200)]
+    assert [degrees.index(degree) for degree in range(4)] == [0, 20, 80, 100]
+    assert degrees == sorted(degrees)
+
+
+def test_rate_of_the_means_decays_to_its_last_share() -> None:
+    schedule = Schedule(RECIPE, 101)
+    assert schedule.means_rate(0) == pytest.approx(2.0)
+    assert schedule.means_rate(50) == pytest.approx(1.0)
+    assert schedule.means_rate(100) == pytest.approx(0.5)
+    assert Schedule(RECIPE, 1).means_rate(0) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6])
+def test_stages_that_do_not_cover_the_steps_are_refused(share: float) -> None:
+    broken = replace(RECIPE, stages=(replace(RECIPE.stages[0], fraction=share), *RECIPE.stages[1:]))
+    with pytest.raises(ValueError, match="not 1"):
+        Schedule(broken, 100)
+
+
+@EVERY_RECIPE
+def test_fractions_of_every_recipe_add_up(recipe: Recipe) -> None:
+    assert sum(stage.fraction for stage in recipe.stages) == pytest.approx(1.0, abs=1e-6)
+    assert all(stage.fraction > 0 for stage in recipe.stages)
+    Schedule(recipe, 1000)
+
+
+@EVERY_RECIPE
+def test_every_recipe_is_named_told_and_trains_what_it_renders(recipe: Recipe) -> None:
+    assert RECIPES[recipe.name] is recipe
+    assert recipe.about.endswith(".")
+    core = {"means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest"}
+    assert core <= set(recipe.rates)
+    assert ("strength_logits" in recipe.rates) == recipe.reflects
+    assert list(recipe.sh_fractions) == sorted(recipe.sh_fractions)
+
+
+@EVERY_RECIPE
+def test_priors_are_refreshed_before_a_stage_that_uses_them(recipe: Recipe) -> None:
+    """A stage compares with priors only where it, or one before it, refreshes them."""
+    refreshed = False
+    for stage in recipe.stages:
+        refreshed = refreshed or "refresh_priors" in stage.on_enter
+        weights = stage.weights
+        if weights.specular or weights.diffuse or weights.normal or weights.azimuth:
+            assert refreshed, stage.name
+
+
+@EVERY_RECIPE
+@pytest.mark.parametrize("steps", [500, 5000])
+def test_no_recipe_resets_and_propagates_at_once(recipe: Recipe, steps: int) -> None:
+    schedule = Schedule(recipe, steps)
+    for step in range(steps):
+        assert not {"reset_opacity", "propagate_normals"} <= set(schedule.at(step).actions)
+
+
+def test_the_command_line_offers_every_recipe() -> None:
+    offered = get_type_hints(train_verb.train)["recipe"]
+    assert get_args(offered) == tuple(RECIPES)

@@ -1,0 +1,163 @@
+"""Every recipe trains; going on from a checkpoint gives the same bits as never having stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene
+from polarguide.errors import PolarguideError
+from polarguide.raster import choose_backend
+from polarguide.recipes import RECIPES
+from polarguide.training.run import load_checkpoint, save_checkpoint
+from polarguide.training.stages import Recipe
+from polarguide.training.trainer import StepReport, Trainer, TrainSettings, first_state
+
+STEPS, STOP = 60, 25
+
+
+def train(
+    scene: Scene, recipe: Recipe, *, until: int | None = None, steps: int = STEPS, seed: int = 3
+) -> tuple[Trainer, list[StepReport]]:
+    reports: list[StepReport] = []
+    trainer = Trainer(scene, recipe, TrainSettings(steps, seed), choose_backend("cpu"))
+    trainer.run(reports.append, until=until)
+    return trainer, reports
+
+
+def different(a: dict[str, Tensor], b: dict[str, Tensor]) -> list[str]:
+    """Names of the tensors that are not the same bits."""
+    missing = set(a) ^ set(b)
+    return sorted(missing | {name for name in a if name not in missing and not same_bits(a[name], b[name])})
+
+
+def same_bits(a: Tensor, b: Tensor) -> bool:
+    return a.dtype == b.dtype and a.shape == b.shape and a.numpy().tobytes() == b.numpy().tobytes()
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_recipe_trains(tiny_scene: Scene, name: str) -> None:
+    trainer, reports = train(tiny_scene, RECIPES[name], steps=30)
+    assert [report.step for report in reports] == list(range(30))
+    assert all(math.isfinite(report.loss) and math.isfinite(report.psnr) for report in reports)
+    assert {report.stage for report in reports} == {stage.name for stage in RECIPES[name].stages}
+    floats = {k: t for k, t in trainer.state.tensors().items() if t.is_floating_point()}
+    assert all(bool(torch.isfinite(t).all()) for t in floats.values())
+    assert ("rows.strength_logits" in floats) == RECIPES[name].reflects == ("environment.texels" in floats)
+
+
+@pytest.mark.parametrize("name", ["3dgs", "polarguide"])
+def test_training_brings_the_picture_closer(tiny_scene: Scene, name: str) -> None:
+    _, reports = train(tiny_scene, RECIPES[name], steps=200)
+    views = len(tiny_scene.train_views)
+    first = sum(report.psnr for report in reports[:views]) / views
+    last = sum(report.psnr for report in reports[-views:]) / views
+    assert last > first + 3
+
+
+def test_the_busy_recipe_is_busy_on_both_sides_of_the_stop(tiny_scene: Scene, busy_recipe: Recipe) -> None:
+    trainer, reports = train(tiny_scene, busy_recipe)
+    actions = [trainer.schedule.at(step).actions for step in range(STEPS)]
+    for side in (range(STOP), range(STOP, STEPS)):
+        seen = {action for step in side for action in actions[step]}
+        assert seen == {"reset_opacity", "propagate_normals", "refresh_priors"}
+        counts = [reports[step].gaussians for step in side]
+        assert len(set(counts)) > 1, "the density control did nothing"
+    assert trainer.state.opacity_was_reset
+
+
+def test_resumed_is_uninterrupted_bit_by_bit(tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path) -> None:
+    whole, reports = train(tiny_scene, busy_recipe)
+    begun, first = train(tiny_scene, busy_recipe, until=STOP)
+    save_checkpoint(tmp_path, begun.state)
+    state = load_checkpoint(tmp_path, busy_recipe)
+    assert different(state.tensors(), begun.state.tensors()) == []
+    rest: list[StepReport] = []
+    Trainer(tiny_scene, busy_recipe, TrainSettings(STEPS, 3), choose_backend("cpu"), state).run(rest.append)
+    assert first + rest == reports
+    assert different(state.tensors(), whole.state.tensors()) == []
+
+
+@pytest.mark.parametrize("stop", [1, 6, 7, 16, 24, 40, 59])
+def test_any_step_can_be_resumed_from(
+    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, stop: int
+) -> None:
+    """Also just before and just after stage changes, refreshes, rounds of densification and propagations."""
+    ahead = min(stop + 9, STEPS)
+    whole, _ = train(tiny_scene, busy_recipe, until=ahead)
+    begun, _ = train(tiny_scene, busy_recipe, until=stop)
+    save_checkpoint(tmp_path, begun.state)
+    state = load_checkpoint(tmp_path, busy_recipe)
+    settings = TrainSettings(STEPS, 3)
+    Trainer(tiny_scene, busy_recipe, settings, choose_backend("cpu"), state).run(lambda _: None, until=ahead)
+    assert different(state.tensors(), whole.state.tensors()) == []
+
+
+def test_the_seed_decides(tiny_scene: Scene, busy_recipe: Recipe) -> None:
+    first, _ = train(tiny_scene, busy_recipe, until=20)
+    again, _ = train(tiny_scene, busy_recipe, until=20)
+    other, _ = train(tiny_scene, busy_recipe, until=20, seed=4)
+    assert different(first.state.tensors(), again.state.tensors()) == []
+    assert "rows.means" in different(first.state.tensors(), other.state.tensors())
+
+
+def test_global_random_state_neither_matters_nor_changes(tiny_scene: Scene, busy_recipe: Recipe) -> None:
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    first, _ = train(tiny_scene, busy_recipe, until=30)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(2)
+    second, _ = train(tiny_scene, busy_recipe, until=30)
+    assert different(first.state.tensors(), second.state.tensors()) == []
+
+
+def test_every_epoch_visits_every_training_view_once(tiny_scene: Scene) -> None:
+    trainer = Trainer(tiny_scene, RECIPES["3dgs"], TrainSettings(100, 0), choose_backend("cpu"))
+    names = sorted(view.name for view in tiny_scene.train_views)
+    count = len(names)
+    epochs = [
+        [trainer._view_of(step).name for step in range(begin, begin + count)]
+        for begin in range(0, 8 * count, count)
+    ]
+    assert all(sorted(epoch) == names for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 1
+
+
+def test_test_views_are_never_trained_on(tiny_scene: Scene) -> None:
+    recipe = RECIPES["polarguide"]
+    blackened = dataclasses.replace(
+        tiny_scene,
+        views=tuple(
+            dataclasses.replace(view, codes=torch.zeros_like(view.codes))
+            if view.name in tiny_scene.test_names
+            else view
+            for view in tiny_scene.views
+        ),
+    )
+    shown, _ = train(tiny_scene, recipe, steps=20)
+    hidden, _ = train(blackened, recipe, steps=20)
+    assert different(shown.state.tensors(), hidden.state.tensors()) == []
+
+
+def test_the_first_state_has_one_row_per_point_and_added_gaussian(
+    tiny_scene: Scene, busy_recipe: Recipe
+) -> None:
+    state = first_state(tiny_scene, busy_recipe, TrainSettings(10, 0))
+    count = len(tiny_scene.points) + busy_recipe.initialisation.shell
+    assert len(state.rows) == count
+    assert state.step == 0
+    assert state.statistics.seen.shape == (count,)
+    assert torch.equal(state.rows["means"][: len(tiny_scene.points)].detach(), tiny_scene.points)
+
+
+def test_a_loss_that_is_not_finite_stops_the_training(tiny_scene: Scene) -> None:
+    trainer = Trainer(tiny_scene, RECIPES["polarguide"], TrainSettings(30, 0), choose_backend("cpu"))
+    with torch.no_grad():
+        trainer.state.rows["sh_dc"][0, 0] = math.nan
+    with pytest.raises(PolarguideError, match="finite"):
+        trainer.step()
