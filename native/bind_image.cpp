@@ -1,23 +1,21 @@
+#include "arrays.h"
 #include "image.h"
 #include "parallel.h"
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <memory>
 #include <optional>
 #include <stdexcept>
 #include <string>
 #include <tuple>
-#include <vector>
 
 namespace nb = nanobind;
 using namespace polarguide;
 
 namespace {
 
-using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using Indices = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
 
 void expect_size(const Array &array, const char *name, int64_t size) {
@@ -26,52 +24,55 @@ void expect_size(const Array &array, const char *name, int64_t size) {
                                     std::to_string(array.size()));
 }
 
-constexpr int64_t row_chunk = 4, item_chunk = 2048;
-constexpr int maximum_width = 4096;
+int64_t rows(const Array &array) { return array.ndim() ? int64_t(array.shape(0)) : 0; }
+
+constexpr int64_t row_chunk = 8, item_chunk = 2048;
+
+// Work memory of the photometric loss: five planes and a scratch for each worker. Not cleared: every float is written
+// before it is read.
+class PhotometricMemory {
+  public:
+    PhotometricMemory(PhotometricArgs &a, int workers)
+        : planes_(new float[size_t(a.stride) * size_t(a.height) * 5]), sums_(new double[size_t(a.height) * 2]),
+          size_(photometric_scratch(a.stride)), scratch_(new float[size_t(size_) * size_t(workers)]) {
+        float *next = planes_.get();
+        for (float **plane : {&a.shown, &a.goal, &a.parts[0], &a.parts[1], &a.parts[2]})
+            *plane = next, next += a.stride * a.height;
+        a.row_l1 = sums_.get(), a.row_ssim = a.row_l1 + a.height;
+    }
+    float *scratch(int worker) { return scratch_.get() + worker * size_; }
+
+  private:
+    std::unique_ptr<float[]> planes_;
+    std::unique_ptr<double[]> sums_;
+    int64_t size_;
+    std::unique_ptr<float[]> scratch_;
+};
 
 std::tuple<double, double> photometric(const Array &prediction, const Array &target, std::optional<Array> weight,
                                        double weight_sum, float ssim_weight, std::optional<Array> gradient) {
-    if (prediction.ndim() != 3 || prediction.shape(2) != 3)
-        throw std::invalid_argument("prediction: expected shape [H, W, 3]");
+    const int64_t height = rows(prediction), width = prediction.ndim() > 1 ? int64_t(prediction.shape(1)) : 0;
+    expect_shape(prediction, "prediction", {height, width, 3}), expect_shape(target, "target", {height, width, 3});
+    if (weight) expect_shape(*weight, "weight", {height, width});
+    if (gradient) expect_shape(*gradient, "gradient", {height, width, 3});
+    if (height * width == 0) return {0.0, 0.0};
     PhotometricArgs a{};
-    a.height = int(prediction.shape(0)), a.width = int(prediction.shape(1));
-    if (a.width > maximum_width) throw std::invalid_argument("prediction: expected a width of at most 4096");
-    const int64_t pixels = int64_t(a.width) * a.height;
-    expect_size(target, "target", pixels * 3);
-    if (weight) expect_size(*weight, "weight", pixels);
-    if (gradient) expect_size(*gradient, "gradient", pixels * 3);
-    nb::gil_scoped_release release;
-    // Planes are read sixteen columns at a time: room behind the last.
-    const int64_t plane = 3 * pixels, room = plane + 16;
-    std::vector<float> memory(size_t(room) * 11, 0.0f);
-    float *next = memory.data();
-    auto take = [&] {
-        float *p = next;
-        next += room;
-        return p;
-    };
-    a.shown = take(), a.slope = take(), a.goal = take();
-    for (float *&p : a.rows) p = take();
-    for (float *&p : a.parts) p = take();
-    std::vector<double> l1(size_t(a.height), 0.0), ssim(size_t(a.height), 0.0);
-    a.row_l1 = l1.data(), a.row_ssim = ssim.data();
+    a.height = int(height), a.width = int(width), a.stride = (3 * width + 15) / 16 * 16;
     a.prediction = prediction.data(), a.target = target.data(), a.weight = weight ? weight->data() : nullptr;
     a.gradient = gradient ? gradient->data() : nullptr;
     a.ssim_weight = ssim_weight, a.inverse_count = float(1.0 / (3.0 * weight_sum));
-    auto show = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_show)(a, b, e); };
-    auto statistics = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_statistics)(a, b, e); };
-    auto spread = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_spread)(a, b, e); };
-    auto derive = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(photometric_gradient)(a, b, e); };
-    parallel_chunks(a.height, row_chunk, show);
-    parallel_chunks(a.height, row_chunk, statistics);
-    if (gradient) {
-        parallel_chunks(a.height, row_chunk, spread);
-        parallel_chunks(a.height, row_chunk, derive);
-    }
-    double sum_l1 = 0.0, sum_ssim = 0.0;
-    for (double x : l1) sum_l1 += x;
-    for (double x : ssim) sum_ssim += x;
-    return {sum_l1 / (3.0 * weight_sum), sum_ssim / (3.0 * weight_sum)};
+    nb::gil_scoped_release release;
+    PhotometricMemory memory(a, thread_count());
+    auto run = [&](void (*kernel)(const PhotometricArgs &, int64_t, int64_t, float *)) {
+        auto body = [&](int64_t b, int64_t e, int worker) { kernel(a, b, e, memory.scratch(worker)); };
+        parallel_chunks(height, row_chunk, body);
+    };
+    run(POLARGUIDE_DISPATCH(photometric_show));
+    run(POLARGUIDE_DISPATCH(photometric_statistics));
+    if (gradient) run(POLARGUIDE_DISPATCH(photometric_gradient));
+    double l1 = 0.0, ssim = 0.0;
+    for (int64_t y = 0; y < height; ++y) l1 += a.row_l1[y], ssim += a.row_ssim[y];
+    return {l1 / (3.0 * weight_sum), ssim / (3.0 * weight_sum)};
 }
 
 CubemapArgs cubemap_args(const Array &texture, const Indices &border, const Array &directions) {
@@ -88,10 +89,11 @@ CubemapArgs cubemap_args(const Array &texture, const Indices &border, const Arra
 }
 
 HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest) {
-    const int64_t n = int64_t(means.shape(0));
-    if (degree < 0 || degree > 3) throw std::invalid_argument("degree: expected 0 to 3");
-    expect_size(means, "means", 3 * n), expect_size(centre, "centre", 3), expect_size(dc, "dc", 3 * n);
-    expect_size(rest, "rest", 45 * n);
+    if (degree < 0 || degree > 3)
+        throw std::invalid_argument("degree: expected 0 to 3, found " + std::to_string(degree));
+    const int64_t n = rows(means);
+    expect_shape(means, "means", {n, 3}), expect_shape(centre, "centre", {3}), expect_shape(dc, "dc", {n, 3});
+    expect_shape(rest, "rest", {n, 15, 3});
     HarmonicsArgs a{};
     a.degree = degree, a.means = means.data(), a.centre = centre.data(), a.dc = dc.data(), a.rest = rest.data();
     return a;
@@ -138,22 +140,23 @@ void bind_image(nb::module_ &module) {
         "harmonics_forward",
         [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest, Array out) {
             HarmonicsArgs a = harmonics_args(degree, means, centre, dc, rest);
-            const int64_t n = int64_t(means.shape(0));
-            expect_size(out, "out", 3 * n);
+            const int64_t n = rows(means);
+            expect_shape(out, "out", {n, 3});
             a.out = out.data();
             nb::gil_scoped_release release;
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_forward)(a, b, e); };
             parallel_chunks(n, item_chunk, body);
         },
-        nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"));
+        nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"),
+        "Sum of the harmonics towards each Gaussian.");
     module.def(
         "harmonics_backward",
         [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest,
            const Array &grad_out, Array grad_means, Array grad_dc, Array grad_rest) {
             HarmonicsArgs a = harmonics_args(degree, means, centre, dc, rest);
-            const int64_t n = int64_t(means.shape(0));
-            expect_size(grad_out, "grad_out", 3 * n), expect_size(grad_means, "grad_means", 3 * n);
-            expect_size(grad_dc, "grad_dc", 3 * n), expect_size(grad_rest, "grad_rest", 45 * n);
+            const int64_t n = rows(means);
+            expect_shape(grad_out, "grad_out", {n, 3}), expect_shape(grad_means, "grad_means", {n, 3});
+            expect_shape(grad_dc, "grad_dc", {n, 3}), expect_shape(grad_rest, "grad_rest", {n, 15, 3});
             a.grad_out = grad_out.data(), a.grad_means = grad_means.data(), a.grad_dc = grad_dc.data();
             a.grad_rest = grad_rest.data();
             nb::gil_scoped_release release;
@@ -161,5 +164,5 @@ void bind_image(nb::module_ &module) {
             parallel_chunks(n, item_chunk, body);
         },
         nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("grad_out"),
-        nb::arg("grad_means"), nb::arg("grad_dc"), nb::arg("grad_rest"));
+        nb::arg("grad_means"), nb::arg("grad_dc"), nb::arg("grad_rest"), "Fills the three gradients.");
 }

@@ -1,8 +1,7 @@
+#include "arrays.h"
 #include "parallel.h"
 #include "rasteriser.h"
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
@@ -18,21 +17,6 @@ namespace nb = nanobind;
 using namespace polarguide;
 
 namespace {
-
-using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-
-void expect_shape(const Array &array, const char *name, std::initializer_list<int64_t> shape) {
-    bool same = array.ndim() == shape.size();
-    std::string wanted, found;
-    size_t axis = 0;
-    for (int64_t n : shape) {
-        if (same && int64_t(array.shape(axis)) != n) same = false;
-        wanted += (axis++ ? ", " : "") + std::to_string(n);
-    }
-    if (same) return;
-    for (size_t i = 0; i < array.ndim(); ++i) found += (i ? ", " : "") + std::to_string(array.shape(i));
-    throw std::invalid_argument(std::string(name) + ": expected shape [" + wanted + "], found [" + found + "]");
-}
 
 GaussianInputs inputs(const Array &means, const Array &quats, const Array &scales, const Array &opacities,
                       const Array &features) {

@@ -6,24 +6,25 @@
 
 namespace polarguide {
 
-// Photometric loss of one picture, in passes over rows. Planes are [3][height][width].
+// Photometric loss of one picture, in passes over rows. Planes are [height][stride]: interleaved colours, zero beyond
+// 3 * width; `stride` is a multiple of 16. `scratch` is a worker's own: see photometric_scratch.
 struct PhotometricArgs {
     int width, height;
-    const float *prediction; // [H,W,3] linear
-    const float *target;     // [H,W,3] shown
-    const float *weight;     // [H,W] or null
+    int64_t stride;
+    const float *prediction;          // [H,W,3] linear
+    const float *target;              // [H,W,3] shown
+    const float *weight;              // [H,W] or null
     float ssim_weight, inverse_count; // 1 / (3 * sum of weights)
-    float *shown, *slope;    // planes: sRGB of the clipped prediction; its derivative
-    float *goal;             // planes: target
-    float *rows[5];          // planes: horizontally blurred x, y, xx, yy, xy; then, backward, three of them
-    float *parts[3];         // planes: derivative of the SSIM sum with respect to the mean, xx and xy
-    double *row_l1, *row_ssim; // [height]
-    float *gradient;         // [H,W,3]
+    float *shown, *goal;              // planes: sRGB of the clipped prediction; target
+    float *parts[3];                  // planes: derivative of the SSIM sum by the mean of x, by that of xx and of xy
+    double *row_l1, *row_ssim;        // [height]
+    float *gradient;                  // [H,W,3]; null: not wanted
 };
-POLARGUIDE_DECLARE(void photometric_show(const PhotometricArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void photometric_statistics(const PhotometricArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void photometric_spread(const PhotometricArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void photometric_gradient(const PhotometricArgs &a, int64_t begin, int64_t end))
+constexpr int photometric_margin = 16; // floats on both sides of a scratch line
+inline int64_t photometric_scratch(int64_t stride) { return 9 * (stride + 2 * photometric_margin); }
+POLARGUIDE_DECLARE(void photometric_show(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch))
+POLARGUIDE_DECLARE(void photometric_statistics(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch))
+POLARGUIDE_DECLARE(void photometric_gradient(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch))
 
 // Seamless bilinear look-up. `border` maps (face, row + 1, column + 1), one texel beyond each edge, to a flat texel.
 struct CubemapArgs {

@@ -1,4 +1,7 @@
 // The photometric loss: sRGB, L1 and SSIM of a picture, and the gradient with respect to the linear prediction.
+//
+// Rows stay interleaved (red, green, blue, red, ...): a horizontal tap is three floats away. SSIM needs four blurred
+// moments, x, y, xx + yy and xy; a row's vertical blur forms the products on the way, so no picture of them is kept.
 #include "image.h"
 #include "simd.h"
 
@@ -8,159 +11,179 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-constexpr int reach = 5; // the window has 2 * reach + 1 taps
-alignas(64) const float tap[11] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
-                                   0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
-constexpr float c1 = 0.0001f, c2 = 0.0009f;
+constexpr int reach = 5, taps = 11, moments = 4, colours = 3;
+constexpr float tap[taps] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
+                             0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
+constexpr float c1 = 0.0001f, c2 = 0.0009f; // (0.01)^2 and (0.03)^2, of a range of 1
+constexpr float knee = 0.0031308f;          // sRGB is linear below
 
-// log2 of positive normal numbers, relative error about 1e-7 in what is raised to it.
-POLARGUIDE_INLINE vf log2_of(vf x) {
-    vi raw = as_int(x);
-    vi exponent = (raw - 0x3f3504f3) >> 23; // mantissa to [sqrt(1/2), sqrt(2))
-    vf m = as_float(raw - (exponent << 23));
-    vf s = (m - 1.0f) / (m + 1.0f), q = s * s;
-    vf series = s * (((((q * 0.111111111f + 0.142857143f) * q + 0.2f) * q + 0.333333333f) * q) + 1.0f);
-    return __builtin_convertvector(exponent, vf) + series * 2.88539008f;
+// sRGB of the clipped value: exactly 1 where saturated, so that a saturated target is met. NaN stays NaN.
+POLARGUIDE_INLINE reg show(reg x) {
+    const reg u = clamp(x, reg{}, reg_splat(1.0f));
+    const reg curved = exp2(log2(max(u, reg_splat(knee))) * (1.0f / 2.4f)) * 1.055f - 0.055f;
+    const reg value = u <= knee ? u * 12.92f : u == 1.0f ? u : curved;
+    return x != x ? x : value;
 }
 
-// Shown value of a linear one, and the slope; beyond [0, 1] the slope at the boundary (see photometric_gradient).
-POLARGUIDE_INLINE void show(vf x, vf *value, vf *slope) {
-    vf u = clamp(x, vf{}, splat(1.0f));
-    vf safe = max(u, splat(0.0031308f));
-    vf power = exp2(log2_of(safe) * (1.0f / 2.4f)) * 1.055f;
-    vi dark = u <= splat(0.0031308f);
-    *value = dark ? u * 12.92f : power - 0.055f;
-    *slope = dark ? splat(12.92f) : power / (safe * 2.4f);
+// Slope of sRGB at the clipped value, given its sRGB.
+POLARGUIDE_INLINE reg slope_of(reg x, reg shown) {
+    const reg u = clamp(x, reg{}, reg_splat(1.0f));
+    return u <= knee ? reg_splat(12.92f) : (shown + 0.055f) * reciprocal(max(u, reg_splat(knee)) * 2.4f);
 }
 
-POLARGUIDE_INLINE int64_t plane(const PhotometricArgs &a, int channel) { return int64_t(channel) * a.width * a.height; }
-
-// out[x] = sum of taps over in[x - 5 .. x + 5], zero outside [0, width).
-POLARGUIDE_INLINE void blur_row(const float *padded, float *out, int width) {
-    int x = 0;
-    for (; x + lanes <= width; x += lanes) {
-        vf sum = vf{};
-        for (int t = 0; t < 11; ++t) sum += load(padded + x + t) * tap[t];
-        store(out + x, sum);
-    }
-    for (; x < width; ++x) {
-        float sum = 0.0f;
-        for (int t = 0; t < 11; ++t) sum += padded[x + t] * tap[t];
-        out[x] = sum;
-    }
+// The last vector of a row may be short; the missing reg_lanes are zero.
+POLARGUIDE_INLINE reg load_some(const float *p, int64_t n) {
+    if (n >= reg_lanes) return reg_load(p);
+    alignas(64) float t[reg_lanes] = {};
+    for (int64_t l = 0; l < n; ++l) t[l] = p[l];
+    return reg_load(t);
+}
+POLARGUIDE_INLINE void store_some(float *p, int64_t n, reg x) {
+    if (n >= reg_lanes) return reg_store(p, x);
+    alignas(64) float t[reg_lanes];
+    reg_store(t, x);
+    for (int64_t l = 0; l < n; ++l) p[l] = t[l];
 }
 
-// The vertical blur of a plane at sixteen columns of row y.
-POLARGUIDE_INLINE vf blur_column(const float *rows, int64_t stride, int y, int height) {
-    vf sum = vf{};
-    const int first = y < reach ? reach - y : 0, last = y + reach >= height ? height - 1 - y + reach : 10;
-    for (int t = first; t <= last; ++t) sum += load(rows + (y + t - reach) * stride) * tap[t];
+POLARGUIDE_INLINE double sum_of(reg x) {
+    double sum = 0.0;
+    for (int l = 0; l < reg_lanes; ++l) sum += double(x[l]);
     return sum;
+}
+
+// The weights of row y, once per colour; zero in the padding.
+POLARGUIDE_INLINE void spread_weights(const PhotometricArgs &a, int64_t y, float *line) {
+    for (int x = 0; x < a.width; ++x)
+        for (int c = 0; c < colours; ++c) line[colours * x + c] = a.weight ? a.weight[y * a.width + x] : 1.0f;
+    for (int64_t x = int64_t(colours) * a.width; x < a.stride; ++x) line[x] = 0.0f;
+}
+
+// A worker's scratch: lines with room for the taps on both sides, which stays zero.
+struct Lines {
+    float *line[moments], *blurred[moments], *weight;
+};
+POLARGUIDE_INLINE Lines lay_out(const PhotometricArgs &a, float *scratch) {
+    const int64_t room = a.stride + 2 * photometric_margin;
+    Lines l;
+    for (int k = 0; k < moments; ++k) {
+        float *start = scratch + k * room;
+        for (int i = 0; i < photometric_margin; ++i) start[i] = start[photometric_margin + a.stride + i] = 0.0f;
+        l.line[k] = start + photometric_margin;
+        l.blurred[k] = scratch + (moments + k) * room;
+    }
+    l.weight = scratch + 2 * moments * room;
+    return l;
+}
+
+// The window's rows that lie in the picture: y - reach + first .. y - reach + last.
+struct Window {
+    int first, last;
+};
+POLARGUIDE_INLINE Window window_of(int64_t y, int height) {
+    return {y < reach ? int(reach - y) : 0, y + reach >= height ? int(height - 1 - y) + reach : taps - 1};
+}
+
+// Vertical blur of the four moments of row y.
+void blur_moments(const PhotometricArgs &a, int64_t y, const Lines &l) {
+    const Window w = window_of(y, a.height);
+    for (int64_t x = 0; x < a.stride; x += reg_lanes) {
+        const float *px = a.shown + (y - reach + w.first) * a.stride + x, *py = a.goal + (px - a.shown);
+        reg mx = {}, my = {}, squares = {}, product = {};
+        for (int t = w.first; t <= w.last; ++t, px += a.stride, py += a.stride) {
+            const reg u = reg_load(px), v = reg_load(py), tu = u * tap[t], tv = v * tap[t];
+            mx += tu, my += tv;
+            squares += tu * u, squares += tv * v;
+            product += tu * v;
+        }
+        reg_store(l.line[0] + x, mx), reg_store(l.line[1] + x, my), reg_store(l.line[2] + x, squares), reg_store(l.line[3] + x, product);
+    }
+}
+
+// Vertical blur of the three derivatives at row y.
+void blur_parts(const PhotometricArgs &a, int64_t y, const Lines &l) {
+    const Window w = window_of(y, a.height);
+    for (int64_t x = 0; x < a.stride; x += reg_lanes) {
+        const int64_t top = (y - reach + w.first) * a.stride + x;
+        const float *p0 = a.parts[0] + top, *p1 = a.parts[1] + top, *p2 = a.parts[2] + top;
+        reg s0 = {}, s1 = {}, s2 = {};
+        for (int t = w.first; t <= w.last; ++t, p0 += a.stride, p1 += a.stride, p2 += a.stride)
+            s0 += reg_load(p0) * tap[t], s1 += reg_load(p1) * tap[t], s2 += reg_load(p2) * tap[t];
+        reg_store(l.line[0] + x, s0), reg_store(l.line[1] + x, s1), reg_store(l.line[2] + x, s2);
+    }
+}
+
+void blur_line(const float *line, float *out, int64_t stride) {
+    for (int64_t x = 0; x < stride; x += reg_lanes) {
+        reg sum = reg_load(line + x) * tap[reach];
+        for (int t = 1; t <= reach; ++t)
+            sum += (reg_load(line + x - colours * t) + reg_load(line + x + colours * t)) * tap[reach + t];
+        reg_store(out + x, sum);
+    }
 }
 
 } // namespace
 
-void photometric_show(const PhotometricArgs &a, int64_t begin, int64_t end) {
-    float line[5][4096 + 2 * lanes];
-    const int w = a.width;
+void photometric_show(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch) {
+    const int64_t used = int64_t(colours) * a.width;
+    const Lines l = lay_out(a, scratch);
     for (int64_t y = begin; y < end; ++y) {
-        double l1 = 0.0;
-        for (int c = 0; c < 3; ++c) {
-            float *shown = a.shown + plane(a, c) + y * w, *slope = a.slope + plane(a, c) + y * w;
-            float *goal = a.goal + plane(a, c) + y * w;
-            const float *p = a.prediction + y * w * 3 + c, *t = a.target + y * w * 3 + c;
-            for (int x = 0; x < w; x += lanes) {
-                alignas(64) float in[lanes] = {0}, v[lanes], s[lanes];
-                const int n = w - x < lanes ? w - x : lanes;
-                for (int l = 0; l < n; ++l) in[l] = p[3 * (x + l)];
-                vf value, derivative;
-                show(load(in), &value, &derivative);
-                store(v, value), store(s, derivative);
-                for (int l = 0; l < n; ++l) {
-                    shown[x + l] = v[l], slope[x + l] = s[l], goal[x + l] = t[3 * (x + l)];
-                    l1 += double(a.weight ? a.weight[y * w + x + l] : 1.0f) * double(fabsf(v[l] - t[3 * (x + l)]));
-                }
-            }
-            for (int k = 0; k < 5; ++k)
-                for (int x = 0; x < reach; ++x) line[k][x] = line[k][reach + w + x] = 0.0f;
-            for (int x = 0; x < w; ++x) {
-                const float u = shown[x], v = goal[x];
-                line[0][reach + x] = u, line[1][reach + x] = v;
-                line[2][reach + x] = u * u, line[3][reach + x] = v * v, line[4][reach + x] = u * v;
-            }
-            for (int k = 0; k < 5; ++k) blur_row(line[k], a.rows[k] + plane(a, c) + y * w, w);
+        if (a.weight || y == begin) spread_weights(a, y, l.weight);
+        reg sum = reg{};
+        for (int64_t x = 0; x < a.stride; x += reg_lanes) {
+            const reg value = show(load_some(a.prediction + y * used + x, used - x));
+            const reg goal = load_some(a.target + y * used + x, used - x), d = value - goal;
+            reg_store(a.shown + y * a.stride + x, value), reg_store(a.goal + y * a.stride + x, goal);
+            sum += (d < reg{} ? -d : d) * reg_load(l.weight + x);
         }
-        a.row_l1[y] = l1;
+        a.row_l1[y] = sum_of(sum);
     }
 }
 
-void photometric_statistics(const PhotometricArgs &a, int64_t begin, int64_t end) {
-    const int w = a.width, h = a.height;
+void photometric_statistics(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch) {
+    const Lines l = lay_out(a, scratch);
     for (int64_t y = begin; y < end; ++y) {
-        double total = 0.0;
-        for (int c = 0; c < 3; ++c)
-            for (int x = 0; x < w; x += lanes) {
-                const int64_t at = plane(a, c) + x, here = at + y * w;
-                vf m[5];
-                for (int k = 0; k < 5; ++k) m[k] = blur_column(a.rows[k] + at, w, int(y), h);
-                vf a1 = m[0] * m[1] * 2.0f + c1, a2 = (m[4] - m[0] * m[1]) * 2.0f + c2;
-                vf b1 = m[0] * m[0] + m[1] * m[1] + c1;
-                vf b2 = (m[2] - m[0] * m[0]) + (m[3] - m[1] * m[1]) + c2;
-                vf inverse = 1.0f / (b1 * b2), s = a1 * a2 * inverse;
-                vf by_xy = a1 * inverse * 2.0f, by_xx = -s / b2;
-                vf by_mean = m[1] * a2 * inverse * 2.0f - s * m[0] * 2.0f / b1 - by_xx * m[0] * 2.0f - by_xy * m[1];
-                alignas(64) float values[4][lanes];
-                store(values[0], by_mean), store(values[1], by_xx), store(values[2], by_xy), store(values[3], s);
-                const int n = w - x < lanes ? w - x : lanes;
-                for (int l = 0; l < n; ++l) {
-                    const float weight = a.weight ? a.weight[y * w + x + l] : 1.0f;
-                    for (int k = 0; k < 3; ++k) a.parts[k][here + l] = values[k][l] * weight;
-                    total += double(weight * values[3][l]);
-                }
-            }
-        a.row_ssim[y] = total;
+        if (a.weight || y == begin) spread_weights(a, y, l.weight);
+        blur_moments(a, y, l);
+        for (int k = 0; k < moments; ++k) blur_line(l.line[k], l.blurred[k], a.stride);
+        reg sum = reg{};
+        for (int64_t x = 0; x < a.stride; x += reg_lanes) {
+            const reg mx = reg_load(l.blurred[0] + x), my = reg_load(l.blurred[1] + x), weight = reg_load(l.weight + x);
+            const reg both = mx * my, a1 = both * 2.0f + c1, a2 = (reg_load(l.blurred[3] + x) - both) * 2.0f + c2;
+            const reg means = mx * mx + my * my, b1 = means + c1, b2 = reg_load(l.blurred[2] + x) - means + c2;
+            const reg inverse = reciprocal(b1 * b2), s = a1 * a2 * inverse;
+            const reg by_xy = a1 * inverse * 2.0f, by_xx = -s * b1 * inverse; // -s / b2
+            const reg by_mean = (my * (a2 - a1) * inverse - s * mx * b2 * inverse - by_xx * mx) * 2.0f;
+            const auto left_out = weight == 0.0f; // also keeps a NaN out of the padding
+            sum += left_out ? reg{} : s * weight;
+            if (!a.gradient) continue;
+            const int64_t at = y * a.stride + x;
+            reg_store(a.parts[0] + at, left_out ? reg{} : by_mean * weight);
+            reg_store(a.parts[1] + at, left_out ? reg{} : by_xx * weight);
+            reg_store(a.parts[2] + at, left_out ? reg{} : by_xy * weight);
+        }
+        a.row_ssim[y] = sum_of(sum);
     }
 }
 
-void photometric_spread(const PhotometricArgs &a, int64_t begin, int64_t end) {
-    float line[4096 + 2 * lanes];
-    const int w = a.width;
-    for (int64_t y = begin; y < end; ++y)
-        for (int c = 0; c < 3; ++c)
-            for (int k = 0; k < 3; ++k) {
-                const float *in = a.parts[k] + plane(a, c) + y * w;
-                for (int x = 0; x < reach; ++x) line[x] = line[reach + w + x] = 0.0f;
-                for (int x = 0; x < w; ++x) line[reach + x] = in[x];
-                blur_row(line, a.rows[k] + plane(a, c) + y * w, w);
-            }
-}
-
-void photometric_gradient(const PhotometricArgs &a, int64_t begin, int64_t end) {
-    const int w = a.width, h = a.height;
-    const float for_l1 = (1.0f - a.ssim_weight) * a.inverse_count, for_ssim = -a.ssim_weight * a.inverse_count;
-    for (int64_t y = begin; y < end; ++y)
-        for (int c = 0; c < 3; ++c)
-            for (int x = 0; x < w; x += lanes) {
-                const int64_t at = plane(a, c) + x, here = at + y * w;
-                vf part[3];
-                for (int k = 0; k < 3; ++k) part[k] = blur_column(a.rows[k] + at, w, int(y), h);
-                vf shown = load(a.shown + here), goal = load(a.goal + here), slope = load(a.slope + here);
-                vf difference = shown - goal;
-                vf sign = difference > vf{} ? splat(1.0f) : difference < vf{} ? splat(-1.0f) : vf{};
-                alignas(64) float l1[lanes], ssim[lanes], slopes[lanes];
-                store(l1, sign * for_l1);
-                store(ssim, (part[0] + shown * part[1] * 2.0f + goal * part[2]) * for_ssim);
-                store(slopes, slope);
-                const int n = w - x < lanes ? w - x : lanes;
-                for (int l = 0; l < n; ++l) {
-                    const int64_t pixel = (y * w + x + l) * 3 + c;
-                    const float weight = a.weight ? a.weight[y * w + x + l] : 1.0f;
-                    const float g = l1[l] * weight + ssim[l], p = a.prediction[pixel];
-                    // Outside [0, 1] only a gradient that brings the value back passes.
-                    const bool stuck = (p < 0.0f && g > 0.0f) || (p > 1.0f && g < 0.0f);
-                    a.gradient[pixel] = stuck ? 0.0f : g * slopes[l];
-                }
-            }
+void photometric_gradient(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch) {
+    const int64_t used = int64_t(colours) * a.width;
+    const reg for_l1 = reg_splat((1.0f - a.ssim_weight) * a.inverse_count), for_ssim = reg_splat(-a.ssim_weight * a.inverse_count);
+    const Lines l = lay_out(a, scratch);
+    for (int64_t y = begin; y < end; ++y) {
+        if (a.weight || y == begin) spread_weights(a, y, l.weight);
+        blur_parts(a, y, l);
+        for (int k = 0; k < 3; ++k) blur_line(l.line[k], l.blurred[k], a.stride);
+        for (int64_t x = 0; x < a.stride && x < used; x += reg_lanes) {
+            const reg shown = reg_load(a.shown + y * a.stride + x), goal = reg_load(a.goal + y * a.stride + x);
+            const reg d = shown - goal, pull = d > reg{} ? for_l1 : d < reg{} ? -for_l1 : reg{};
+            const reg spread = reg_load(l.blurred[0] + x) + shown * reg_load(l.blurred[1] + x) * 2.0f + goal * reg_load(l.blurred[2] + x);
+            const reg g = pull * reg_load(l.weight + x) + spread * for_ssim;
+            const reg p = load_some(a.prediction + y * used + x, used - x);
+            // Beyond [0, 1] only a gradient that brings the value back passes.
+            const auto stuck = ((p < 0.0f) & (g > 0.0f)) | ((p > 1.0f) & (g < 0.0f));
+            store_some(a.gradient + y * used + x, used - x, stuck ? reg{} : g * slope_of(p, shown));
+        }
+    }
 }
 
 } // namespace POLARGUIDE_ISA

@@ -4,7 +4,15 @@
 #include <stdint.h>
 
 #if defined(__AVX512F__) || defined(__AVX2__)
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wmaybe-uninitialized" // GCC 12 warns about its own "undefined" vectors
+#pragma GCC diagnostic ignored "-Wuninitialized"
+#endif
 #include <immintrin.h>
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC diagnostic pop
+#endif
 #endif
 
 #define POLARGUIDE_INLINE static inline __attribute__((always_inline))
@@ -24,9 +32,26 @@ POLARGUIDE_INLINE vf load(const float *p) { return *reinterpret_cast<const vf_un
 POLARGUIDE_INLINE void store(float *p, vf x) { *reinterpret_cast<vf_unaligned *>(p) = x; }
 POLARGUIDE_INLINE vf as_float(vi x) { return reinterpret_cast<vf &>(x); }
 POLARGUIDE_INLINE vi as_int(vf x) { return reinterpret_cast<vi &>(x); }
-POLARGUIDE_INLINE vf min(vf a, vf b) { return a < b ? a : b; }
-POLARGUIDE_INLINE vf max(vf a, vf b) { return a > b ? a : b; }
-POLARGUIDE_INLINE vf clamp(vf x, vf low, vf high) { return max(low, min(x, high)); }
+template <class V> POLARGUIDE_INLINE V min(V a, V b) { return a < b ? a : b; }
+template <class V> POLARGUIDE_INLINE V max(V a, V b) { return a > b ? a : b; }
+template <class V> POLARGUIDE_INLINE V clamp(V x, V low, V high) { return max(low, min(x, high)); }
+
+// One register of the target. GCC compares and selects lane by lane in vectors wider than that, so code with many
+// comparisons, or with more sums than a small register file holds as wide vectors, is written with this type.
+#if defined(__AVX512F__)
+typedef vf reg;
+typedef vf_unaligned reg_unaligned;
+#elif defined(__AVX2__)
+typedef float reg __attribute__((vector_size(32), may_alias));
+typedef float reg_unaligned __attribute__((vector_size(32), aligned(4), may_alias));
+#else
+typedef float reg __attribute__((vector_size(16), may_alias));
+typedef v4f reg_unaligned;
+#endif
+constexpr int reg_lanes = sizeof(reg) / sizeof(float);
+POLARGUIDE_INLINE reg reg_splat(float x) { return reg{} + x; }
+POLARGUIDE_INLINE reg reg_load(const float *p) { return *reinterpret_cast<const reg_unaligned *>(p); }
+POLARGUIDE_INLINE void reg_store(float *p, reg x) { *reinterpret_cast<reg_unaligned *>(p) = x; }
 
 // Bit l is set where lane l of a comparison result is true.
 POLARGUIDE_INLINE uint32_t bits(vi mask) {
@@ -55,33 +80,44 @@ POLARGUIDE_INLINE bool any(vi mask) {
 }
 
 // 1/x to about 1e-7 relative; x in a normal range.
-POLARGUIDE_INLINE vf reciprocal(vf x) {
+template <class V> POLARGUIDE_INLINE V reciprocal(V x) {
 #if defined(__AVX512F__)
     __m512 v = reinterpret_cast<__m512 &>(x);
     __m512 r = _mm512_rcp14_ps(v);
     r = _mm512_mul_ps(r, _mm512_fnmadd_ps(v, r, _mm512_set1_ps(2.0f)));
-    return reinterpret_cast<vf &>(r);
+    return reinterpret_cast<V &>(r);
 #else
     return 1.0f / x;
 #endif
 }
 
 // 2^x for x in [-120, 120], relative error about 1e-7 (a fifth-degree minimax polynomial on [-1/2, 1/2]).
-POLARGUIDE_INLINE vf exp2(vf x) {
+template <class V> POLARGUIDE_INLINE V exp2(V x) {
+    using I = decltype(x < x); // integers of the same width
     const float magic = 12582912.0f; // 1.5 * 2^23: adding it rounds to the nearest integer
-    vf shifted = x + magic;
-    vf f = x - (shifted - magic);
-    vf p = ((((splat(0.00132764719f) * f + 0.00967553685f) * f + 0.0555071325f) * f + 0.240221197f) * f + 0.693146967f) *
-               f +
-           1.00000007f;
-    return as_float(as_int(p) + (as_int(shifted) << 23));
+    V shifted = x + magic;
+    V f = x - (shifted - magic);
+    V p = ((((f * 0.00132764719f + 0.00967553685f) * f + 0.0555071325f) * f + 0.240221197f) * f + 0.693146967f) * f +
+          1.00000007f;
+    return (V)((I)p + ((I)shifted << 23));
 }
 
-// out[c][r] = in[r][c] for 16 x 16 floats.
-POLARGUIDE_INLINE void transpose16(const float *in, float *out) {
+// log2 of positive normal numbers, to about 1e-7 of its value.
+template <class V> POLARGUIDE_INLINE V log2(V x) {
+    using I = decltype(x < x);
+    I raw = (I)x;
+    I exponent = (raw - 0x3f3504f3) >> 23; // leaves a mantissa in [sqrt(1/2), sqrt(2))
+    V m = (V)(raw - (exponent << 23));
+    V s = (m - 1.0f) * reciprocal(m + 1.0f), q = s * s; // log m = 2 artanh s
+    V series = (((q * 0.111111111f + 0.142857143f) * q + 0.2f) * q + 0.333333333f) * q + 1.0f;
+    return __builtin_convertvector(exponent, V) + s * series * 2.88539008f;
+}
+
+// out[c][r] = in[r][c] for 16 x 16 floats; rows are `in_stride` and `out_stride` apart.
+POLARGUIDE_INLINE void transpose16(const float *in, int64_t in_stride, float *out, int64_t out_stride) {
 #if defined(__AVX512F__)
     __m512 r[16], t[16];
-    for (int i = 0; i < 16; ++i) r[i] = _mm512_loadu_ps(in + 16 * i);
+    for (int i = 0; i < 16; ++i) r[i] = _mm512_loadu_ps(in + in_stride * i);
     for (int i = 0; i < 16; i += 2) {
         t[i] = _mm512_unpacklo_ps(r[i], r[i + 1]);
         t[i + 1] = _mm512_unpackhi_ps(r[i], r[i + 1]);
@@ -96,26 +132,27 @@ POLARGUIDE_INLINE void transpose16(const float *in, float *out) {
     for (int c = 0; c < 4; ++c) {
         __m512 x = _mm512_shuffle_f32x4(r[c], r[4 + c], 0x88), y = _mm512_shuffle_f32x4(r[8 + c], r[12 + c], 0x88);
         __m512 z = _mm512_shuffle_f32x4(r[c], r[4 + c], 0xdd), w = _mm512_shuffle_f32x4(r[8 + c], r[12 + c], 0xdd);
-        _mm512_storeu_ps(out + 16 * c, _mm512_shuffle_f32x4(x, y, 0x88));
-        _mm512_storeu_ps(out + 16 * (c + 4), _mm512_shuffle_f32x4(z, w, 0x88));
-        _mm512_storeu_ps(out + 16 * (c + 8), _mm512_shuffle_f32x4(x, y, 0xdd));
-        _mm512_storeu_ps(out + 16 * (c + 12), _mm512_shuffle_f32x4(z, w, 0xdd));
+        _mm512_storeu_ps(out + out_stride * c, _mm512_shuffle_f32x4(x, y, 0x88));
+        _mm512_storeu_ps(out + out_stride * (c + 4), _mm512_shuffle_f32x4(z, w, 0x88));
+        _mm512_storeu_ps(out + out_stride * (c + 8), _mm512_shuffle_f32x4(x, y, 0xdd));
+        _mm512_storeu_ps(out + out_stride * (c + 12), _mm512_shuffle_f32x4(z, w, 0xdd));
     }
 #else
     typedef float v4 __attribute__((vector_size(16), aligned(4), may_alias));
     for (int i = 0; i < 16; i += 4)
         for (int j = 0; j < 16; j += 4) {
-            v4 a = *(const v4 *)(in + 16 * i + j), b = *(const v4 *)(in + 16 * (i + 1) + j);
-            v4 c = *(const v4 *)(in + 16 * (i + 2) + j), d = *(const v4 *)(in + 16 * (i + 3) + j);
+            v4 a = *(const v4 *)(in + in_stride * i + j), b = *(const v4 *)(in + in_stride * (i + 1) + j);
+            v4 c = *(const v4 *)(in + in_stride * (i + 2) + j), d = *(const v4 *)(in + in_stride * (i + 3) + j);
             v4 ab0 = __builtin_shufflevector(a, b, 0, 4, 1, 5), ab1 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
             v4 cd0 = __builtin_shufflevector(c, d, 0, 4, 1, 5), cd1 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
-            *(v4 *)(out + 16 * j + i) = __builtin_shufflevector(ab0, cd0, 0, 1, 4, 5);
-            *(v4 *)(out + 16 * (j + 1) + i) = __builtin_shufflevector(ab0, cd0, 2, 3, 6, 7);
-            *(v4 *)(out + 16 * (j + 2) + i) = __builtin_shufflevector(ab1, cd1, 0, 1, 4, 5);
-            *(v4 *)(out + 16 * (j + 3) + i) = __builtin_shufflevector(ab1, cd1, 2, 3, 6, 7);
+            *(v4 *)(out + out_stride * j + i) = __builtin_shufflevector(ab0, cd0, 0, 1, 4, 5);
+            *(v4 *)(out + out_stride * (j + 1) + i) = __builtin_shufflevector(ab0, cd0, 2, 3, 6, 7);
+            *(v4 *)(out + out_stride * (j + 2) + i) = __builtin_shufflevector(ab1, cd1, 0, 1, 4, 5);
+            *(v4 *)(out + out_stride * (j + 3) + i) = __builtin_shufflevector(ab1, cd1, 2, 3, 6, 7);
         }
 #endif
 }
+POLARGUIDE_INLINE void transpose16(const float *in, float *out) { transpose16(in, 16, out, 16); }
 
 } // namespace
 } // namespace POLARGUIDE_ISA

@@ -1,4 +1,8 @@
-"""Real spherical harmonics to degree 3, in the order and with the signs of the 3DGS release."""
+"""Real spherical harmonics to degree 3, in the order and with the signs of the 3DGS release.
+
+Degree 1 is in the order -y, z, -x. On the CPU in float32 a native kernel evaluates the colours;
+``evaluate_sh_reference`` is its twin in plain torch.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import normalize
 
 from polarguide import _native
 
@@ -26,7 +29,20 @@ _C3 = (
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """The basis functions at unit directions [..., 3]: [..., (degree + 1)^2], degree 0 to 3."""
+    """The basis functions at unit directions.
+
+    Args:
+        directions: [..., 3], unit length.
+        degree: 0 to 3.
+
+    Returns:
+        [..., (degree + 1)^2], differentiable.
+
+    Raises:
+        ValueError: for another degree.
+    """
+    if not 0 <= degree <= 3:
+        raise ValueError(f"degree: expected 0 to 3, found {degree}")
     x, y, z = directions.unbind(-1)
     basis = [torch.full_like(x, SH_C0)]
     if degree > 0:
@@ -53,9 +69,16 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis, dim=-1)
 
 
+def _directions(means: Tensor, centre: Tensor) -> Tensor:
+    """Unit vectors from the centre to the means; zero, with gradient zero, for a mean at the centre."""
+    offsets = means - centre
+    squared = offsets.square().sum(dim=-1, keepdim=True)
+    return offsets * squared.masked_fill(squared <= 1e-24, torch.inf).rsqrt()
+
+
 def evaluate_sh_reference(means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
     """The slow twin of ``evaluate_sh``: plain torch, any dtype and device."""
-    basis = sh_basis(normalize(means - centre, dim=-1, eps=1e-12), degree)
+    basis = sh_basis(_directions(means, centre), degree)
     coefficients = torch.cat((dc[:, None], rest), dim=1)[:, : basis.shape[-1]]
     return (basis[..., None] * coefficients).sum(dim=1)
 
@@ -82,17 +105,32 @@ class _Harmonics(torch.autograd.Function):
 
 
 def evaluate_sh(means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
-    """Sum of the harmonics towards each Gaussian (without the 0.5 that 3DGS adds to a colour).
+    """Each Gaussian's colour from a camera: ``sum_k basis_k(d) coefficient_k``, ``d`` from centre to mean.
+
+    ``d`` has unit length, or is 0 for a Gaussian at the centre. The 0.5 that 3DGS adds is not in it.
 
     Args:
-        means: [N, 3]. centre: [3] camera centre; the direction is from it to the mean.
-        dc: [N, 3] and rest: [N, 15, 3], coefficients of degree 0 and of degrees 1 to 3.
-        degree: 0 to 3; coefficients beyond it count as zero and get no gradient.
+        means: [N, 3] Gaussian centres.
+        centre: [3] camera centre; of any dtype and device, and gets no gradient.
+        dc: [N, 3] coefficients of degree 0.
+        rest: [N, 15, 3] coefficients of degrees 1 to 3.
+        degree: 0 to 3; coefficients beyond it count as zero and get a zero gradient.
 
     Returns:
-        [N, 3], differentiable in means, dc and rest.
+        [N, 3], differentiable in means (through the direction), dc and rest.
+
+    Raises:
+        ValueError: if a shape or the degree is not as above.
     """
-    if means.device.type == "cpu" and means.dtype == torch.float32:
+    count = means.shape[0]
+    expected = {"means": (means, (count, 3)), "centre": (centre, (3,)), "dc": (dc, (count, 3))}
+    for name, (tensor, shape) in (expected | {"rest": (rest, (count, 15, 3))}).items():
+        if tensor.shape != shape:
+            raise ValueError(f"{name}: expected shape {list(shape)}, found {list(tensor.shape)}")
+    if not 0 <= degree <= 3:
+        raise ValueError(f"degree: expected 0 to 3, found {degree}")
+    centre = centre.detach().to(means)
+    if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (means, dc, rest)):
         result: Tensor = _Harmonics.apply(means, centre, dc, rest, degree)
         return result
     return evaluate_sh_reference(means, centre, dc, rest, degree)

@@ -1,4 +1,8 @@
-"""The photometric loss of Gaussian splatting on shown pictures: (1 - l) L1 + l (1 - SSIM)."""
+"""The photometric loss of Gaussian splatting on shown pictures: (1 - l) L1 + l (1 - SSIM).
+
+On the CPU in float32 a native kernel computes the loss and its gradient in one call;
+``photometric_loss_reference`` is its twin in plain torch.
+"""
 
 from __future__ import annotations
 
@@ -46,15 +50,15 @@ def photometric_loss_reference(
 ) -> Tensor:
     """The slow twin of ``photometric_loss``: plain torch, any dtype and device."""
     shown = srgb_encode(_Clip.apply(prediction))
-    weight = torch.ones_like(prediction[..., 0]) if weight is None else weight
-    count = 3 * weight.sum().clamp(min=1)
-    l1 = ((shown - target).abs() * weight[..., None]).sum() / count
+    weight = (torch.ones_like(prediction[..., 0]) if weight is None else weight)[..., None]
     x, y = shown.permute(2, 0, 1), target.permute(2, 0, 1)
     mx, my, xx, yy, xy = _blur(torch.cat((x, y, x * x, y * y, x * y))).split(3)
     numerator = (2 * mx * my + _C1) * (2 * (xy - mx * my) + _C2)
     denominator = (mx * mx + my * my + _C1) * ((xx - mx * mx) + (yy - my * my) + _C2)
-    ssim = (numerator / denominator * weight).sum() / count
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
+    ssim = (numerator / denominator).permute(1, 2, 0)
+    per_value = (1 - ssim_weight) * (shown - target).abs() + ssim_weight * (1 - ssim)
+    total = 3 * weight.sum()
+    return (weight * per_value).sum() / torch.where(total > 0, total, torch.ones_like(total))
 
 
 class _Photometric(torch.autograd.Function):
@@ -62,15 +66,13 @@ class _Photometric(torch.autograd.Function):
     def forward(
         ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float
     ) -> Tensor:
-        prediction, target = prediction.detach().contiguous(), target.contiguous()
-        total = (
-            float(weight.sum()) if weight is not None else float(prediction.shape[0] * prediction.shape[1])
-        )
+        prediction, target = prediction.detach().contiguous(), target.detach().contiguous()
+        weight = None if weight is None else weight.detach().contiguous()
+        total = prediction.shape[0] * prediction.shape[1] if weight is None else float(weight.sum())
         gradient = torch.empty_like(prediction) if ctx.needs_input_grad[0] else None
-        weight = weight.contiguous() if weight is not None else None
-        l1, ssim = _native.photometric(prediction, target, weight, max(total, 1.0), ssim_weight, gradient)
+        l1, ssim = _native.photometric(prediction, target, weight, total or 1.0, ssim_weight, gradient)
         ctx.save_for_backward(gradient)
-        return torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), dtype=prediction.dtype)
+        return prediction.new_tensor((1 - ssim_weight) * l1 + ssim_weight * (bool(total) - ssim))
 
     @staticmethod
     @once_differentiable
@@ -79,23 +81,44 @@ class _Photometric(torch.autograd.Function):
         return gradient * grad, None, None, None
 
 
-def photometric_loss(
-    prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
-) -> Tensor:
-    """L1 and SSIM between shown pictures (Kerbl et al. 2023, Eq. 7, on sRGB of linear radiance).
+def _check(prediction: Tensor, target: Tensor, weight: Tensor | None) -> None:
+    if prediction.ndim != 3 or prediction.shape[-1] != 3:
+        raise ValueError(f"prediction: expected shape [H, W, 3], found {list(prediction.shape)}")
+    if target.shape != prediction.shape:
+        raise ValueError(f"target: expected shape {list(prediction.shape)}, found {list(target.shape)}")
+    if weight is not None and weight.shape != prediction.shape[:2]:
+        raise ValueError(f"weight: expected shape {list(prediction.shape[:2])}, found {list(weight.shape)}")
 
-    SSIM has an 11 x 11 Gaussian window of sigma 1.5 with zeros beyond the border, K1 = 0.01, K2 = 0.03.
+
+def photometric_loss(
+    prediction: Tensor, target_shown: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
+) -> Tensor:
+    """Mean over valid pixels and colours of ``(1 - l) |x - y| + l (1 - SSIM(x, y))``.
+
+    Here ``x`` is sRGB of the clipped prediction and ``y`` the target (Kerbl et al. 2023, Eq. 7, on shown
+    pictures). SSIM has an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and zeros beyond the
+    border, so within five pixels of it the values differ from those of metrics that mirror the picture.
+    Pixels that are left out still lie in their neighbours' windows.
+
+    A value outside [0, 1] gets the gradient that the boundary would have, where a step against it leads back
+    in, else zero: saturated pixels are not stuck. Not a number anywhere makes the loss not a number.
 
     Args:
-        prediction: [H, W, 3] linear radiance; clipped to [0, 1], with a gradient outside that only leads back in.
-        target: [H, W, 3] shown picture in [0, 1].
-        weight: [H, W] 1 where a pixel counts, 0 where not; None: everywhere.
+        prediction: [H, W, 3] linear radiance, any size.
+        target_shown: [H, W, 3] picture as shown, in [0, 1]; gets no gradient.
+        weight: [H, W] 1 where a pixel counts, 0 where not (at least 0); None: everywhere. Gets no gradient.
         ssim_weight: l in [0, 1].
 
     Returns:
-        The scalar loss, differentiable in the prediction.
+        The scalar loss, differentiable in the prediction; 0 where no pixel counts.
+
+    Raises:
+        ValueError: if a shape is not as above.
     """
+    _check(prediction, target_shown, weight)
+    target_shown = target_shown.detach().to(prediction)
+    weight = None if weight is None else weight.detach().to(prediction)
     if prediction.device.type == "cpu" and prediction.dtype == torch.float32:
-        result: Tensor = _Photometric.apply(prediction, target, weight, ssim_weight)
+        result: Tensor = _Photometric.apply(prediction, target_shown, weight, ssim_weight)
         return result
-    return photometric_loss_reference(prediction, target, weight, ssim_weight)
+    return photometric_loss_reference(prediction, target_shown, weight, ssim_weight)
