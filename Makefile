@@ -1,5 +1,6 @@
 # make demo    train, score and render the demo scene that ships with the package
 # make test    linter, formatter, types and tests, on the package as it is installed
+# make cross-check    compile the kernels for aarch64 (needs aarch64-linux-gnu-g++ and cmake)
 # make clean   remove what these commands made
 #
 # Needs Python 3.10 or newer with its venv module, a C++17 compiler and make; everything else is fetched from PyPI.
@@ -14,7 +15,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
 
-.PHONY: demo test clean
+.PHONY: demo test cross-check clean
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
 
@@ -26,6 +27,9 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
+
+cross-check: $(VENV)/.installed-test
+	$(BIN)/python -m pytest tests/native/test_cross_compilation.py
 
 $(VENV)/.installed: $(SOURCES) | $(VENV)/pyvenv.cfg
 	@echo "Building and installing polarguide into $(VENV); the first time takes minutes."

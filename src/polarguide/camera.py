@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from polarguide.vectors import unit
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -43,7 +45,7 @@ class Camera:
         y = (torch.arange(self.height, dtype=dtype, device=device) + 0.5 - self.cy) / self.fy
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
         directions = torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1)
-        return torch.nn.functional.normalize(directions, dim=-1)
+        return unit(directions)
 
     def world_rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
         """Unit rays through the pixel centres in world axes, [height, width, 3]."""

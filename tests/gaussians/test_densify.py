@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from polarguide.gaussians.densify import Densification, DensityStatistics, densify
+from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.gaussians.rows import CORE_ROWS, GaussianRows
-from polarguide.raster import quaternions_to_rotations
 
 SETTINGS = Densification(
     gradient=1.0, dense_share=0.1, minimum_opacity=0.05, maximum_scale_share=0.5, limit=1000

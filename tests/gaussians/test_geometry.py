@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from polarguide.gaussians.geometry import shortest_axis_normals
-from polarguide.raster import quaternions_to_rotations
+from polarguide.gaussians.geometry import quaternions_to_rotations, shortest_axis_normals
 
 COUNT = 50
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.raster import Rasterise, ScreenStatistic, quaternions_to_rotations, rasterise_reference
+from polarguide.gaussians.geometry import quaternions_to_rotations
+from polarguide.raster import Rasterise, ScreenStatistic, rasterise_reference
 from polarguide.raster.interface import MINIMUM_ALPHA
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.gaussians.rows import GaussianRows
-from polarguide.raster.reference import quaternions_to_rotations
 
 
 @dataclass(frozen=True)

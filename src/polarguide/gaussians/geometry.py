@@ -7,6 +7,17 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 
+def quaternions_to_rotations(quats: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalised first."""
+    w, x, y, z = normalize(quats, dim=-1, eps=1e-12).unbind(-1)
+    entries = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in entries], dim=-2)
+
+
 def shortest_axis_normals(means: Tensor, quaternions: Tensor, log_scales: Tensor, centre: Tensor) -> Tensor:
     """Unit normals of flat Gaussians: the axis of the smallest scale, turned to face the camera.
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from polarguide.vectors import dot
+
 
 def safe_sqrt(x: Tensor) -> Tensor:
     """Square root; value and gradient are zero where ``x <= 0``."""
@@ -32,16 +34,10 @@ def safe_atan2(y: Tensor, x: Tensor) -> Tensor:
 
 def safe_normalize(vectors: Tensor) -> Tensor:
     """Unit vectors along the last axis; zero (gradient too) where the length is below machine epsilon."""
-    length = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
-    live = length > torch.finfo(vectors.dtype).eps
-    return torch.where(live, vectors, torch.zeros_like(vectors)) / torch.where(
-        live, length, torch.ones_like(length)
-    )
-
-
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Scalar product over the last axis."""
-    return (a * b).sum(dim=-1)
+    squared = dot(vectors, vectors)[..., None]
+    live = squared > torch.finfo(vectors.dtype).eps ** 2
+    inverse = torch.rsqrt(torch.where(live, squared, torch.ones_like(squared)))
+    return vectors * torch.where(live, inverse, torch.zeros_like(inverse))
 
 
 def check_leading(tensor: Tensor, count: int, name: str) -> None:

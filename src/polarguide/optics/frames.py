@@ -11,7 +11,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ._guard import dot, safe_atan2
+from polarguide.vectors import dot
+
+from ._guard import safe_atan2
 
 
 def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:

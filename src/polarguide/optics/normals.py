@@ -13,7 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ._guard import check_leading, dot, safe_normalize
+from polarguide.vectors import dot
+
+from ._guard import check_leading, safe_normalize, safe_sqrt
 from .frames import normal_from_angles
 from .fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
 from .stokes import aolp, dolp
@@ -152,7 +154,7 @@ def disambiguate(
         axis = rays[..., None, :]
         guide_across = guide - dot(guide, axis)[..., None] * axis
         across = safe_normalize(normals - dot(normals, axis)[..., None] * axis)
-        weight = azimuth_weight * torch.linalg.vector_norm(guide_across, dim=-1)
+        weight = azimuth_weight * safe_sqrt(dot(guide_across, guide_across))
         # |guide_across| is the sine of the zenith, so the second term below is w * s * cos(difference of
         # azimuths).
         score = (1 - weight) * cosines + azimuth_weight * dot(across, guide_across)

@@ -11,7 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ._guard import check_leading, dot, safe_normalize
+from polarguide.vectors import dot
+
+from ._guard import check_leading, safe_normalize
 from .frames import lens_frame
 from .fresnel import dolp_slopes, reflectances, transmittances
 

@@ -2,7 +2,7 @@
 
 from polarguide.raster.backends import Backend, DeviceName, choose_backend
 from polarguide.raster.interface import Rasterise, Rasterised, ScreenStatistic
-from polarguide.raster.reference import quaternions_to_rotations, rasterise_reference
+from polarguide.raster.reference import rasterise_reference
 
 __all__ = [
     "Backend",
@@ -11,6 +11,5 @@ __all__ = [
     "Rasterised",
     "ScreenStatistic",
     "choose_backend",
-    "quaternions_to_rotations",
     "rasterise_reference",
 ]

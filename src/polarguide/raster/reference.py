@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from polarguide.camera import Camera
+from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.raster.interface import (
     BLUR,
     JACOBIAN_MARGIN,
@@ -22,17 +22,6 @@ from polarguide.raster.interface import (
     check_shapes,
     refuse_not_finite,
 )
-
-
-def quaternions_to_rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalised first."""
-    w, x, y, z = normalize(quats, dim=-1, eps=1e-12).unbind(-1)
-    entries = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=-1) for row in entries], dim=-2)
 
 
 def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
 from polarguide.training.stages import Priors, Recipe, Repeat, Stage, Weights
 
-REFRESH = Repeat("refresh_priors", fraction=0.05, minimum=100)
+REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)
 
 _PLAIN = Stage("plain", 0.1, reflection=False, densify=True)
 

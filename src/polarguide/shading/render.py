@@ -7,7 +7,6 @@ from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from polarguide.camera import Camera
 from polarguide.gaussians.geometry import shortest_axis_normals
@@ -16,6 +15,7 @@ from polarguide.optics import reflectances_from_cosine
 from polarguide.raster.interface import Rasterise, ScreenStatistic
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.result import RenderResult
+from polarguide.vectors import dot, unit
 
 COLOUR_CHANNELS = (0, 1, 2)
 Blend = Literal["lerp", "fresnel"]
@@ -38,7 +38,7 @@ def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
 
 def mirrored(rays: Tensor, normals: Tensor) -> Tensor:
     """Directions of rays [..., 3] after reflection at unit normals [..., 3]."""
-    return rays - 2 * (rays * normals).sum(dim=-1, keepdim=True) * normals
+    return rays - 2 * dot(rays, normals)[..., None] * normals
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ def reflect(
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
     """
     rays = camera.world_rays(dtype=base.dtype, device=base.device)
-    unit = normalize(normal, dim=-1, eps=1e-3)
-    directions = mirrored(rays, unit)
+    facing = unit(normal, 1e-3)
+    directions = mirrored(rays, facing)
     light = shading.light(cubemap_lookup(environment, directions.reshape(-1, 3)).reshape(base.shape))
-    cosine = -(rays * unit).sum(dim=-1, keepdim=True).clamp(-1, 0)
+    cosine = -dot(rays, facing)[..., None].clamp(-1, 0)
     specular, diffuse = shading.layers(base, strength[..., None], light, cosine)
     return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": light}
 

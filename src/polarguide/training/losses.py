@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from polarguide.errors import PolarguideError
 from polarguide.shading.result import RenderResult
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
 from polarguide.training.stages import Weights
+from polarguide.vectors import dot, unit
 
 
 def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
@@ -19,7 +19,7 @@ def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
     Args:
         normal: [H, W, 3] blended normals, world axes, any length.
     """
-    cosine = (normalize(normal, dim=-1, eps=1e-2) * priors.normal).sum(dim=-1)
+    cosine = dot(unit(normal, 1e-2), priors.normal)
     return ((1 - cosine) * priors.weight).sum() / priors.weight.sum().clamp(min=1)
 
 
@@ -28,7 +28,7 @@ def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
 
     Unlike the zenith of a pure-lobe inversion, the plane does not depend on the index or on how lobes mix.
     """
-    distance = (normalize(normal, dim=-1, eps=1e-2) * priors.plane).sum(dim=-1).abs()
+    distance = dot(unit(normal, 1e-2), priors.plane).abs()
     return (distance * priors.weight).sum() / priors.weight.sum().clamp(min=1)
 
 

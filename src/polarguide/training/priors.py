@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from polarguide import optics
 from polarguide.capture import View
 from polarguide.shading.display import srgb_encode
 from polarguide.training.stages import Priors
+from polarguide.vectors import dot, unit
 
 # Rendered normals shorter than this are too mixed to say anything.
 MINIMUM_NORMAL = 0.3
@@ -46,10 +46,10 @@ def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
     A blended normal that faces away (by up to a pixel's slant) is brought to grazing.
     """
-    known = normal.norm(dim=-1) > MINIMUM_NORMAL
-    unit = normalize(normal, dim=-1, eps=1e-6)
-    away = (unit * rays).sum(dim=-1, keepdim=True).clamp(min=0)
-    return normalize(unit - away * 1.001 * rays, dim=-1, eps=1e-6), known
+    known = dot(normal, normal) > MINIMUM_NORMAL**2
+    facing = unit(normal)
+    away = dot(facing, rays)[..., None].clamp(min=0)
+    return unit(facing - away * 1.001 * rays), known
 
 
 @torch.no_grad()
@@ -80,7 +80,7 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
     else:
         layers = optics.exact_separation(stokes, guide, rays, index)
         conditioned = layers.conditioned & known & ~view.saturated
-    plane = normalize(torch.linalg.cross(rays, chosen), dim=-1, eps=1e-6)
+    plane = unit(torch.linalg.cross(rays, chosen))
     weight = (optics.dolp(luminance) / settings.full_dolp).clamp(max=1) * (usable & known)
     return ViewPriors(
         specular=srgb_encode((layers.specular / 2).clamp(0, 1)),

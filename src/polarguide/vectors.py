@@ -1,0 +1,19 @@
+"""Three-vectors along the last axis. Written component by component: torch's reductions over three are slow."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Scalar products [...] of vectors [..., 3]."""
+    ax, ay, az = a.unbind(-1)
+    bx, by, bz = b.unbind(-1)
+    return ax * bx + ay * by + az * bz
+
+
+def unit(vectors: Tensor, floor: float = 1e-6) -> Tensor:
+    """Vectors [..., 3] divided by their length, or by ``floor`` where they are shorter; no NaN at zero."""
+    squared = dot(vectors, vectors)
+    return vectors * torch.rsqrt(squared.clamp(min=floor * floor))[..., None]
