@@ -5,6 +5,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <memory>
 #include <optional>
 #include <stdexcept>
@@ -16,17 +17,10 @@ using namespace polarguide;
 
 namespace {
 
-using Indices = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
-
-void expect_size(const Array &array, const char *name, int64_t size) {
-    if (int64_t(array.size()) != size)
-        throw std::invalid_argument(std::string(name) + ": expected " + std::to_string(size) + " numbers, found " +
-                                    std::to_string(array.size()));
-}
 
 int64_t rows(const Array &array) { return array.ndim() ? int64_t(array.shape(0)) : 0; }
 
-constexpr int64_t row_chunk = 8, item_chunk = 2048;
+constexpr int64_t row_chunk = 8, item_chunk = 2048, merge_chunk = 16384;
 
 // Work memory of the photometric loss: five planes and a scratch for each worker. Not cleared: every float is written
 // before it is read.
@@ -75,17 +69,42 @@ std::tuple<double, double> photometric(const Array &prediction, const Array &tar
     return {l1 / (3.0 * weight_sum), ssim / (3.0 * weight_sum)};
 }
 
-CubemapArgs cubemap_args(const Array &texture, const Indices &border, const Array &directions) {
-    if (texture.ndim() != 4 || texture.shape(0) != 6 || texture.shape(1) != texture.shape(2))
-        throw std::invalid_argument("texture: expected shape [6, R, R, C]");
+CubemapArgs cubemap_args(const Array &texture, const Array &directions) {
+    const int64_t side = texture.ndim() == 4 ? int64_t(texture.shape(1)) : 0;
+    const int64_t channels = texture.ndim() == 4 ? int64_t(texture.shape(3)) : 0;
+    expect_shape(texture, "texture", {6, side, side, channels});
+    if (side < 1 || side > 16384) throw std::invalid_argument("texture: expected 1 to 16384 texels along an edge");
+    expect_shape(directions, "directions", {rows(directions), 3});
     CubemapArgs a{};
-    a.resolution = int(texture.shape(1)), a.channels = int(texture.shape(3));
-    int64_t side = a.resolution + 2;
-    if (int64_t(border.size()) != 6 * side * side) throw std::invalid_argument("border: expected [6, R + 2, R + 2]");
-    if (directions.ndim() != 2 || directions.shape(1) != 3)
-        throw std::invalid_argument("directions: expected shape [P, 3]");
-    a.texture = texture.data(), a.border = border.data(), a.directions = directions.data();
+    a.resolution = int(side), a.channels = int(channels);
+    a.texture = texture.data(), a.directions = directions.data();
     return a;
+}
+
+// The gradient of the texels is summed in slices of the directions, which are then added in order: the number of slices
+// follows from the sizes alone, so that the result does not depend on the number of threads. A slice costs a pass over
+// the texels: worth it only where it brings at least as many taps.
+void sum_texture_gradient(const CubemapArgs &a, int64_t count, float *gradient) {
+    const int64_t texels = int64_t(6) * a.resolution * a.resolution, size = texels * a.channels;
+    const int64_t worth = std::min(count / 16384, 4 * count / texels), slices = std::clamp<int64_t>(worth, 1, 8);
+    const int64_t share = (count + slices - 1) / slices;
+    std::unique_ptr<float[]> others(new float[size_t(size) * size_t(slices - 1)]);
+    auto sums = [&](int64_t slice) { return slice ? others.get() + (slice - 1) * size : gradient; };
+    auto slice = [&](int64_t b, int64_t e, int) {
+        for (int64_t i = b; i < e; ++i) {
+            std::fill_n(sums(i), size, 0.0f);
+            POLARGUIDE_DISPATCH(cubemap_backward_texture)
+            (a, std::min(count, i * share), std::min(count, (i + 1) * share), sums(i));
+        }
+    };
+    parallel_chunks(slices, 1, slice);
+    auto merge = [&](int64_t b, int64_t e, int) {
+        for (int64_t other = 1; other < slices; ++other) {
+            const float *from = sums(other);
+            for (int64_t k = b; k < e; ++k) gradient[k] += from[k];
+        }
+    };
+    if (slices > 1) parallel_chunks(size, merge_chunk, merge);
 }
 
 HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest) {
@@ -107,35 +126,34 @@ void bind_image(nb::module_ &module) {
                "Mean absolute difference and mean SSIM of shown pictures; fills the gradient of their mix.");
     module.def(
         "cubemap_forward",
-        [](const Array &texture, const Indices &border, const Array &directions, Array out) {
-            CubemapArgs a = cubemap_args(texture, border, directions);
-            const int64_t count = int64_t(directions.shape(0));
-            expect_size(out, "out", count * a.channels);
+        [](const Array &texture, const Array &directions, Array out) {
+            CubemapArgs a = cubemap_args(texture, directions);
+            const int64_t count = rows(directions);
+            expect_shape(out, "out", {count, a.channels});
             a.out = out.data();
             nb::gil_scoped_release release;
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(cubemap_forward)(a, b, e); };
             parallel_chunks(count, item_chunk, body);
         },
-        nb::arg("texture"), nb::arg("border"), nb::arg("directions"), nb::arg("out"));
+        nb::arg("texture"), nb::arg("directions"), nb::arg("out"), "Seamless bilinear look-up.");
     module.def(
         "cubemap_backward",
-        [](const Array &texture, const Indices &border, const Array &directions, const Array &grad_out,
-           std::optional<Array> grad_texture, std::optional<Array> grad_directions) {
-            CubemapArgs a = cubemap_args(texture, border, directions);
-            const int64_t count = int64_t(directions.shape(0));
-            expect_size(grad_out, "grad_out", count * a.channels);
+        [](const Array &texture, const Array &directions, const Array &grad_out, std::optional<Array> grad_texture,
+           std::optional<Array> grad_directions) {
+            CubemapArgs a = cubemap_args(texture, directions);
+            const int64_t count = rows(directions), side = a.resolution;
+            expect_shape(grad_out, "grad_out", {count, a.channels});
+            if (grad_texture) expect_shape(*grad_texture, "grad_texture", {6, side, side, a.channels});
+            if (grad_directions) expect_shape(*grad_directions, "grad_directions", {count, 3});
             a.grad_out = grad_out.data();
-            if (grad_texture) expect_size(*grad_texture, "grad_texture", int64_t(texture.size()));
-            if (grad_directions) expect_size(*grad_directions, "grad_directions", 3 * count);
-            a.grad_texture = grad_texture ? grad_texture->data() : nullptr;
             a.grad_directions = grad_directions ? grad_directions->data() : nullptr;
             nb::gil_scoped_release release;
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(cubemap_backward_directions)(a, b, e); };
             if (grad_directions) parallel_chunks(count, item_chunk, body);
-            if (grad_texture) POLARGUIDE_DISPATCH(cubemap_backward_texture)(a, 0, count); // one thread: one order of sums
+            if (grad_texture) sum_texture_gradient(a, count, grad_texture->data());
         },
-        nb::arg("texture"), nb::arg("border"), nb::arg("directions"), nb::arg("grad_out"),
-        nb::arg("grad_texture").none(), nb::arg("grad_directions").none());
+        nb::arg("texture"), nb::arg("directions"), nb::arg("grad_out"), nb::arg("grad_texture").none(),
+        nb::arg("grad_directions").none(), "Fills the gradients that are not None.");
     module.def(
         "harmonics_forward",
         [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest, Array out) {

@@ -1,94 +1,213 @@
-// The seamless cubemap.
+// The seamless cubemap: bilinear look-up and its gradients.
+//
+// A direction is located sixteen at a time; the taps are then read one direction at a time. Cells (the squares between
+// four texel centres) are counted with one ring of texels beyond each face, so that a cell whose column or row is 0 or
+// the resolution has taps on a neighbouring face. Those few take the slow way.
 #include "image.h"
 #include "simd.h"
-
-#include <math.h>
 
 namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-struct Tap {
-    const int32_t *border; // of the top-left texel
-    float fu, fv, major;   // fractions, and the length of the major axis
-    int face, axis_s, axis_t, axis_m;
-    float sign_s, sign_t, sign_m, s, t;
-};
-
 // OpenGL's faces +x -x +y -y +z -z: which component is s and t, with which sign.
 constexpr int s_axis[6] = {2, 2, 0, 0, 0, 0}, t_axis[6] = {1, 1, 2, 2, 1, 1};
-constexpr float s_sign[6] = {-1, 1, 1, 1, 1, -1}, t_sign[6] = {-1, -1, 1, -1, -1, -1};
+constexpr int s_sign[6] = {-1, 1, 1, 1, 1, -1}, t_sign[6] = {-1, -1, 1, -1, -1, -1};
 
-POLARGUIDE_INLINE Tap tap_of(const CubemapArgs &a, const float *d) {
-    const float ax = fabsf(d[0]), ay = fabsf(d[1]), az = fabsf(d[2]);
-    Tap p;
-    p.axis_m = ax >= ay && ax >= az ? 0 : ay >= az ? 1 : 2;
-    p.face = 2 * p.axis_m + (d[p.axis_m] < 0.0f);
-    p.sign_m = d[p.axis_m] < 0.0f ? -1.0f : 1.0f;
-    p.axis_s = s_axis[p.face], p.axis_t = t_axis[p.face], p.sign_s = s_sign[p.face], p.sign_t = t_sign[p.face];
-    p.major = fabsf(d[p.axis_m]);
-    const float inverse = p.major > 1e-20f ? 1.0f / p.major : 0.0f;
-    p.s = p.sign_s * d[p.axis_s] * inverse, p.t = p.sign_t * d[p.axis_t] * inverse;
-    const float half = 0.5f * float(a.resolution);
-    // Texel centres at half-integers; one is added for the border row and column.
-    const float u = (p.s + 1.0f) * half + 0.5f, v = (p.t + 1.0f) * half + 0.5f;
-    float u0 = floorf(u), v0 = floorf(v);
-    const float top = float(a.resolution);
-    u0 = u0 >= 0.0f ? (u0 < top ? u0 : top) : 0.0f, v0 = v0 >= 0.0f ? (v0 < top ? v0 : top) : 0.0f;
-    p.fu = u - u0, p.fv = v - v0;
-    const int64_t width = a.resolution + 2;
-    p.border = a.border + (int64_t(p.face) * width + int64_t(v0)) * width + int64_t(u0);
-    return p;
+// Sixteen located directions. `scale` is the slope of the cell coordinates along the face: R / 2 / major component.
+struct Cells {
+    alignas(64) float fu[lanes], fv[lanes], s[lanes], t[lanes], scale[lanes];
+    alignas(64) int32_t u[lanes], v[lanes], face[lanes];
+};
+
+typedef decltype(reg{} < reg{}) ireg;
+
+// Column (or row) and fraction of a coordinate in [0.5, R + 0.5]; NaN lands in cell 0 and stays in the fraction.
+POLARGUIDE_INLINE void split(reg u, float resolution, int32_t *cell, float *fraction) {
+    const reg low = u > 0.0f ? u : reg{}, inside = low < resolution ? low : reg_splat(resolution);
+    const ireg whole = __builtin_convertvector(inside, ireg);
+    reg_store(fraction, u - __builtin_convertvector(whole, reg));
+    for (int l = 0; l < reg_lanes; ++l) cell[l] = whole[l];
 }
 
-POLARGUIDE_INLINE void texels(const CubemapArgs &a, const Tap &p, const float **t) {
-    const int width = a.resolution + 2;
-    t[0] = a.texture + int64_t(p.border[0]) * a.channels, t[1] = a.texture + int64_t(p.border[1]) * a.channels;
-    t[2] = a.texture + int64_t(p.border[width]) * a.channels, t[3] = a.texture + int64_t(p.border[width + 1]) * a.channels;
+POLARGUIDE_INLINE void locate(const CubemapArgs &a, int64_t first, int n, Cells *cells) {
+    alignas(64) float d[3][lanes] = {};
+    for (int l = 0; l < n; ++l)
+        for (int i = 0; i < 3; ++i) d[i][l] = a.directions[3 * (first + l) + i];
+    const float resolution = float(a.resolution), half = 0.5f * resolution;
+    for (int b = 0; b < lanes; b += reg_lanes) {
+        const reg x = reg_load(d[0] + b), y = reg_load(d[1] + b), z = reg_load(d[2] + b);
+        const reg ax = x < 0.0f ? -x : x, ay = y < 0.0f ? -y : y, az = z < 0.0f ? -z : z;
+        const ireg on_x = (ax >= ay) & (ax >= az), on_y = ~on_x & (ay >= az), on_z = ~(on_x | on_y);
+        const reg major = on_x ? x : on_y ? y : z, size = on_x ? ax : on_y ? ay : az;
+        const ireg negative = major < 0.0f;
+        const reg flipped_x = negative ? -x : x, flipped_z = negative ? -z : z;
+        const reg inverse = size <= 1e-20f ? reg{} : 1.0f / size; // no direction: the centre of +x, without a gradient
+        const reg s = (on_x ? -flipped_z : on_y ? x : flipped_x) * inverse, t = (on_y ? flipped_z : -y) * inverse;
+        const ireg face = (on_y & 2) | (on_z & 4) | (negative & 1);
+        for (int l = 0; l < reg_lanes; ++l) cells->face[b + l] = face[l];
+        reg_store(cells->s + b, s), reg_store(cells->t + b, t), reg_store(cells->scale + b, inverse * half);
+        split(s * half + (half + 0.5f), resolution, cells->u + b, cells->fu + b);
+        split(t * half + (half + 0.5f), resolution, cells->v + b, cells->fv + b);
+    }
+}
+
+// The texels that a tap stands for: one, or at a corner of the cube the three that meet there, averaged.
+struct Tap {
+    int count;
+    int64_t texel[3];
+};
+
+// The texel of the neighbouring face next to (column, row), one of which is one step off `face`. Positions on the cube
+// are counted in half texels from its centre: a face lies at +-R, its texels' centres at -(R - 1) .. R - 1.
+POLARGUIDE_INLINE int64_t across(int face, int column, int row, int resolution) {
+    const int last = resolution - 1, axis = face / 2;
+    int p[3];
+    p[axis] = face % 2 ? -last : last;
+    p[s_axis[face]] = s_sign[face] * (2 * column - last), p[t_axis[face]] = t_sign[face] * (2 * row - last);
+    const int other = column < 0 || column > last ? s_axis[face] : t_axis[face], next = 2 * other + (p[other] < 0);
+    const int next_column = (s_sign[next] * p[s_axis[next]] + last) / 2;
+    const int next_row = (t_sign[next] * p[t_axis[next]] + last) / 2;
+    return (int64_t(next) * resolution + next_row) * resolution + next_column;
+}
+
+Tap tap_at(int face, int column, int row, int resolution) {
+    const int last = resolution - 1;
+    const int inner_column = column < 0 ? 0 : column > last ? last : column, inner_row = row < 0 ? 0 : row > last ? last : row;
+    const int64_t own = (int64_t(face) * resolution + inner_row) * resolution + inner_column;
+    if (column == inner_column && row == inner_row) return {1, {own, 0, 0}};
+    if (column == inner_column || row == inner_row) return {1, {across(face, column, row, resolution), 0, 0}};
+    return {3, {own, across(face, column, inner_row, resolution), across(face, inner_column, row, resolution)}};
+}
+
+// The four taps of cell l.
+POLARGUIDE_INLINE void taps_of(const CubemapArgs &a, const Cells &cells, int l, Tap *taps) {
+    for (int k = 0; k < 4; ++k)
+        taps[k] = tap_at(cells.face[l], cells.u[l] - 1 + k % 2, cells.v[l] - 1 + k / 2, a.resolution);
+}
+
+POLARGUIDE_INLINE float value_of(const CubemapArgs &a, const Tap &tap, int c) {
+    const float first = a.texture[tap.texel[0] * a.channels + c];
+    if (tap.count == 1) return first;
+    return (first + a.texture[tap.texel[1] * a.channels + c] + a.texture[tap.texel[2] * a.channels + c]) * (1.0f / 3.0f);
+}
+
+POLARGUIDE_INLINE bool within_face(const CubemapArgs &a, const Cells &cells, int l) {
+    const unsigned inner = unsigned(a.resolution - 1);
+    return unsigned(cells.u[l] - 1) < inner && unsigned(cells.v[l] - 1) < inner;
+}
+POLARGUIDE_INLINE int64_t first_texel(const CubemapArgs &a, const Cells &cells, int l) {
+    return (int64_t(cells.face[l]) * a.resolution + cells.v[l] - 1) * a.resolution + cells.u[l] - 1;
+}
+
+// C channels; 0: any number of them.
+template <int C> void forward(const CubemapArgs &a, int64_t begin, int64_t end) {
+    const int channels = C ? C : a.channels;
+    const int64_t down = int64_t(a.resolution) * channels;
+    Cells cells;
+    for (int64_t first = begin; first < end; first += lanes) {
+        const int n = end - first < lanes ? int(end - first) : lanes;
+        locate(a, first, n, &cells);
+        for (int l = 0; l < n; ++l) {
+            float *out = a.out + (first + l) * channels;
+            const float fu = cells.fu[l], fv = cells.fv[l];
+            if (within_face(a, cells, l)) {
+                const float *p = a.texture + first_texel(a, cells, l) * channels, *q = p + down;
+                for (int c = 0; c < channels; ++c) {
+                    const float top = p[c] + fu * (p[c + channels] - p[c]), bottom = q[c] + fu * (q[c + channels] - q[c]);
+                    out[c] = top + fv * (bottom - top);
+                }
+            } else {
+                Tap taps[4];
+                taps_of(a, cells, l, taps);
+                for (int c = 0; c < channels; ++c) {
+                    float v[4];
+                    for (int k = 0; k < 4; ++k) v[k] = value_of(a, taps[k], c);
+                    const float top = v[0] + fu * (v[1] - v[0]), bottom = v[2] + fu * (v[3] - v[2]);
+                    out[c] = top + fv * (bottom - top);
+                }
+            }
+        }
+    }
+}
+
+template <int C> void backward_directions(const CubemapArgs &a, int64_t begin, int64_t end) {
+    const int channels = C ? C : a.channels;
+    const int64_t down = int64_t(a.resolution) * channels;
+    Cells cells;
+    for (int64_t first = begin; first < end; first += lanes) {
+        const int n = end - first < lanes ? int(end - first) : lanes;
+        locate(a, first, n, &cells);
+        for (int l = 0; l < n; ++l) {
+            const float *g = a.grad_out + (first + l) * channels;
+            const float fu = cells.fu[l], fv = cells.fv[l];
+            float by_u = 0.0f, by_v = 0.0f;
+            Tap taps[4];
+            const bool within = within_face(a, cells, l);
+            const float *p = a.texture + (within ? first_texel(a, cells, l) * channels : 0), *q = p + down;
+            if (!within) taps_of(a, cells, l, taps);
+            for (int c = 0; c < channels; ++c) {
+                float v[4];
+                if (within)
+                    v[0] = p[c], v[1] = p[c + channels], v[2] = q[c], v[3] = q[c + channels];
+                else
+                    for (int k = 0; k < 4; ++k) v[k] = value_of(a, taps[k], c);
+                const float top = v[1] - v[0], bottom = v[3] - v[2], left = v[2] - v[0], right = v[3] - v[1];
+                by_u += g[c] * (top + fv * (bottom - top)), by_v += g[c] * (left + fu * (right - left));
+            }
+            const int face = cells.face[l], axis = face / 2;
+            const float by_s = by_u * cells.scale[l], by_t = by_v * cells.scale[l];
+            const float by_major = -(by_s * cells.s[l] + by_t * cells.t[l]);
+            float *out = a.grad_directions + 3 * (first + l);
+            out[s_axis[face]] = s_sign[face] > 0 ? by_s : -by_s, out[t_axis[face]] = t_sign[face] > 0 ? by_t : -by_t;
+            out[axis] = face % 2 ? -by_major : by_major;
+        }
+    }
+}
+
+template <int C> void backward_texture(const CubemapArgs &a, int64_t begin, int64_t end, float *sums) {
+    const int channels = C ? C : a.channels;
+    const int64_t down = int64_t(a.resolution) * channels;
+    Cells cells;
+    for (int64_t first = begin; first < end; first += lanes) {
+        const int n = end - first < lanes ? int(end - first) : lanes;
+        locate(a, first, n, &cells);
+        for (int l = 0; l < n; ++l) {
+            const float *g = a.grad_out + (first + l) * channels;
+            const float fu = cells.fu[l], fv = cells.fv[l];
+            const float w[4] = {(1 - fu) * (1 - fv), fu * (1 - fv), (1 - fu) * fv, fu * fv};
+            if (within_face(a, cells, l)) {
+                float *p = sums + first_texel(a, cells, l) * channels, *q = p + down;
+                for (int c = 0; c < channels; ++c) {
+                    p[c] += w[0] * g[c], p[c + channels] += w[1] * g[c];
+                    q[c] += w[2] * g[c], q[c + channels] += w[3] * g[c];
+                }
+            } else {
+                Tap taps[4];
+                taps_of(a, cells, l, taps);
+                for (int k = 0; k < 4; ++k)
+                    for (int i = 0; i < taps[k].count; ++i)
+                        for (int c = 0; c < channels; ++c)
+                            sums[taps[k].texel[i] * channels + c] += w[k] * g[c] * (taps[k].count == 1 ? 1.0f : 1.0f / 3.0f);
+            }
+        }
+    }
 }
 
 } // namespace
 
 void cubemap_forward(const CubemapArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-        const Tap p = tap_of(a, a.directions + 3 * i);
-        const float *t[4];
-        texels(a, p, t);
-        const float w[4] = {(1 - p.fu) * (1 - p.fv), p.fu * (1 - p.fv), (1 - p.fu) * p.fv, p.fu * p.fv};
-        for (int c = 0; c < a.channels; ++c)
-            a.out[i * a.channels + c] = w[0] * t[0][c] + w[1] * t[1][c] + w[2] * t[2][c] + w[3] * t[3][c];
-    }
+    (a.channels == 3 ? forward<3> : a.channels == 1 ? forward<1> : forward<0>)(a, begin, end);
 }
 
 void cubemap_backward_directions(const CubemapArgs &a, int64_t begin, int64_t end) {
-    const float half = 0.5f * float(a.resolution);
-    for (int64_t i = begin; i < end; ++i) {
-        const Tap p = tap_of(a, a.directions + 3 * i);
-        const float *t[4], *g = a.grad_out + i * a.channels;
-        texels(a, p, t);
-        float by_u = 0.0f, by_v = 0.0f;
-        for (int c = 0; c < a.channels; ++c) {
-            by_u += g[c] * ((t[1][c] - t[0][c]) * (1 - p.fv) + (t[3][c] - t[2][c]) * p.fv);
-            by_v += g[c] * ((t[2][c] - t[0][c]) * (1 - p.fu) + (t[3][c] - t[1][c]) * p.fu);
-        }
-        const float inverse = p.major > 1e-20f ? half / p.major : 0.0f;
-        float *out = a.grad_directions + 3 * i;
-        out[p.axis_s] = by_u * inverse * p.sign_s;
-        out[p.axis_t] = by_v * inverse * p.sign_t;
-        out[p.axis_m] = -(by_u * p.s + by_v * p.t) * inverse * p.sign_m;
-    }
+    (a.channels == 3 ? backward_directions<3> : a.channels == 1 ? backward_directions<1> : backward_directions<0>)(
+        a, begin, end);
 }
 
-void cubemap_backward_texture(const CubemapArgs &a, int64_t begin, int64_t end) {
-    const int width = a.resolution + 2;
-    for (int64_t i = begin; i < end; ++i) {
-        const Tap p = tap_of(a, a.directions + 3 * i);
-        const int32_t at[4] = {p.border[0], p.border[1], p.border[width], p.border[width + 1]};
-        const float w[4] = {(1 - p.fu) * (1 - p.fv), p.fu * (1 - p.fv), (1 - p.fu) * p.fv, p.fu * p.fv};
-        const float *g = a.grad_out + i * a.channels;
-        for (int k = 0; k < 4; ++k)
-            for (int c = 0; c < a.channels; ++c) a.grad_texture[int64_t(at[k]) * a.channels + c] += w[k] * g[c];
-    }
+void cubemap_backward_texture(const CubemapArgs &a, int64_t begin, int64_t end, float *sums) {
+    (a.channels == 3 ? backward_texture<3> : a.channels == 1 ? backward_texture<1> : backward_texture<0>)(
+        a, begin, end, sums);
 }
 
 } // namespace POLARGUIDE_ISA

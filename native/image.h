@@ -26,20 +26,19 @@ POLARGUIDE_DECLARE(void photometric_show(const PhotometricArgs &a, int64_t begin
 POLARGUIDE_DECLARE(void photometric_statistics(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch))
 POLARGUIDE_DECLARE(void photometric_gradient(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch))
 
-// Seamless bilinear look-up. `border` maps (face, row + 1, column + 1), one texel beyond each edge, to a flat texel.
+// Seamless bilinear look-up in a cubemap, and its gradients with respect to the directions and the texels.
 struct CubemapArgs {
     int resolution, channels;
-    const float *texture;     // [6,R,R,C]
-    const int32_t *border;    // [6,R+2,R+2]
-    const float *directions;  // [P,3]
-    float *out;               // [P,C]
-    const float *grad_out;    // [P,C]
-    float *grad_directions;   // [P,3]
-    float *grad_texture;      // [6,R,R,C], added to
+    const float *texture;    // [6,R,R,C]
+    const float *directions; // [P,3]
+    float *out;              // [P,C]
+    const float *grad_out;   // [P,C]
+    float *grad_directions;  // [P,3]
 };
 POLARGUIDE_DECLARE(void cubemap_forward(const CubemapArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void cubemap_backward_directions(const CubemapArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void cubemap_backward_texture(const CubemapArgs &a, int64_t begin, int64_t end))
+// Adds to `sums` [6,R,R,C], in the order of the directions.
+POLARGUIDE_DECLARE(void cubemap_backward_texture(const CubemapArgs &a, int64_t begin, int64_t end, float *sums))
 
 struct HarmonicsArgs {
     int degree;

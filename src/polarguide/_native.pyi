@@ -67,10 +67,9 @@ def photometric(
     ssim_weight: float,
     gradient: Tensor | None,
 ) -> tuple[float, float]: ...
-def cubemap_forward(texture: Tensor, border: Tensor, directions: Tensor, out: Tensor) -> None: ...
+def cubemap_forward(texture: Tensor, directions: Tensor, out: Tensor) -> None: ...
 def cubemap_backward(
     texture: Tensor,
-    border: Tensor,
     directions: Tensor,
     grad_out: Tensor,
     grad_texture: Tensor | None,

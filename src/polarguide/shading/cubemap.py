@@ -1,13 +1,29 @@
 """A cubemap of learned light: seamless bilinear look-up, differentiable in texels and directions.
 
-Faces are in OpenGL's order +x, -x, +y, -y, +z, -z with OpenGL's s to the right and t downwards on each face. At a
-face's edge the taps beyond it come from the neighbouring face.
+Faces are in OpenGL's order and orientation. On each, s runs with the columns and t with the rows, both from -1 to 1:
+
+==== ===== ===== =====
+face major s     t
+==== ===== ===== =====
+0    +x    -z    -y
+1    -x    +z    -y
+2    +y    +x    +z
+3    -y    +x    -z
+4    +z    +x    -y
+5    -z    -x    -y
+==== ===== ===== =====
+
+so that the direction of face 0 at (s, t) is (1, -t, -s). Seen from within the cube, pictures are upright with +y up.
+At a face's edge the taps beyond it are the texels of the neighbouring face; beyond a corner, where only three faces
+meet, the missing tap is the mean of their three corner texels. So the look-up is continuous everywhere. On the CPU in
+float32 it is a native kernel; ``cubemap_lookup_reference`` is its twin in plain torch.
 """
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,87 +31,113 @@ from torch.autograd.function import once_differentiable
 
 from polarguide import _native
 
-# Per face: axis of the face, of s and of t, and their signs.
+# Per face: axis and sign of the major component, of s and of t.
 _FACES = (
-    (0, 1.0, 2, -1.0, 1, -1.0),
-    (0, -1.0, 2, 1.0, 1, -1.0),
-    (1, 1.0, 0, 1.0, 2, 1.0),
-    (1, -1.0, 0, 1.0, 2, -1.0),
-    (2, 1.0, 0, 1.0, 1, -1.0),
-    (2, -1.0, 0, -1.0, 1, -1.0),
+    (0, 1, 2, -1, 1, -1),
+    (0, -1, 2, 1, 1, -1),
+    (1, 1, 0, 1, 2, 1),
+    (1, -1, 0, 1, 2, -1),
+    (2, 1, 0, 1, 1, -1),
+    (2, -1, 0, -1, 1, -1),
 )
 
 
-def _face_points(coordinates: Tensor) -> Tensor:
-    """Points [6, n, n, 3] on the (extended) faces of the cube [-1, 1]^3 at coordinates [n] along s and t."""
+def _face_points(coordinates: Tensor, distance: int) -> Tensor:
+    """Points [6, n, n, 3] on (extended) faces ``distance`` from the centre, at coordinates [n] along s and t."""
     t, s = torch.meshgrid(coordinates, coordinates, indexing="ij")
     points = torch.empty(6, *s.shape, 3, dtype=coordinates.dtype)
     for face, (axis, sign, s_axis, s_sign, t_axis, t_sign) in enumerate(_FACES):
-        points[face, ..., axis] = sign
+        points[face, ..., axis] = sign * distance
         points[face, ..., s_axis] = s_sign * s
         points[face, ..., t_axis] = t_sign * t
     return points
 
 
 def texel_directions(resolution: int) -> Tensor:
-    """Unit directions of the texel centres, [6, R, R, 3]."""
+    """Unit directions of the texel centres, [6, R, R, 3] float32; R at least 1."""
     coordinates = (torch.arange(resolution) + 0.5) * 2 / resolution - 1
-    return torch.nn.functional.normalize(_face_points(coordinates), dim=-1)
+    return torch.nn.functional.normalize(_face_points(coordinates, 1), dim=-1)
 
 
-def _face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Face [...], and s and t [...] in [-1, 1] of directions [..., 3]; ties go to the earlier axis."""
-    size = directions.abs()
-    x, y, z = size.unbind(-1)
-    axis = torch.where((x >= y) & (x >= z), 0, torch.where(y >= z, 1, 2))
-    major = directions.gather(-1, axis[..., None])[..., 0]
-    face = 2 * axis + (major < 0)
-    table = torch.tensor(_FACES, dtype=directions.dtype, device=directions.device)[face]
-    length = major.abs().clamp(min=1e-20)
-    s = table[..., 3] * directions.gather(-1, table[..., 2:3].long())[..., 0] / length
-    t = table[..., 5] * directions.gather(-1, table[..., 4:5].long())[..., 0] / length
-    return face, s, t
+class _Ring(NamedTuple):
+    """The faces with a ring of texels around each, [6, R + 2, R + 2] flattened, as indices into [6, R, R]."""
+
+    source: Tensor  # [6 (R + 2)^2]; at a corner, the face's own corner texel
+    corners: Tensor  # [24] places in the ring
+    around: Tensor  # [24, 3] the texels that meet there
+
+
+def _texel_index(face: Tensor, points: Tensor, resolution: int) -> Tensor:
+    """Flat texel of points [..., 3] in half texels from the cube's centre, on the given faces [...]."""
+    table = torch.tensor(_FACES)[face]
+    s = table[..., 3] * points.gather(-1, table[..., 2:3])[..., 0]
+    t = table[..., 5] * points.gather(-1, table[..., 4:5])[..., 0]
+    column, row = (s + resolution - 1) // 2, (t + resolution - 1) // 2
+    return (face * resolution + row) * resolution + column
 
 
 @lru_cache(maxsize=8)
-def border_table(resolution: int) -> Tensor:
-    """Flat texel of (face, row + 1, column + 1), one texel beyond each edge included: [6, R + 2, R + 2] int32.
+def _ring(resolution: int, device: torch.device) -> _Ring:
+    """A texel beyond an edge is the one that touches the edge from the other side."""
+    last = resolution - 1
+    place = 2 * torch.arange(-1, resolution + 1) - last  # in half texels from the middle of a face
+    inner = place.clamp(-last, last)
+    face = torch.arange(6)[:, None, None].expand(6, resolution + 2, resolution + 2)
+    own = _texel_index(face, _face_points(inner, resolution), resolution)
 
-    A place beyond an edge is the texel of the neighbouring face in which the extended texel's direction lies.
-    """
-    coordinates = (torch.arange(-1, resolution + 1, dtype=torch.float64) + 0.5) * 2 / resolution - 1
-    face, s, t = _face_coordinates(_face_points(coordinates))
-    column = ((s + 1) / 2 * resolution).floor().clamp(0, resolution - 1)
-    row = ((t + 1) / 2 * resolution).floor().clamp(0, resolution - 1)
-    return ((face * resolution + row) * resolution + column).to(torch.int32).contiguous()
+    points, outer = _face_points(inner, last), _face_points(place, last)
+
+    def across(axis_column: int) -> Tensor:
+        """The texel over the edge in s (column 2 of the table) or t (column 4)."""
+        axis = torch.tensor(_FACES)[face][..., axis_column]
+        negative = outer.gather(-1, axis[..., None])[..., 0] < 0
+        return _texel_index(2 * axis + negative.long(), points, resolution)
+
+    out_s = (place.abs() > last)[None, None, :].expand_as(own)
+    out_t = (place.abs() > last)[None, :, None].expand_as(own)
+    source = torch.where(out_s & ~out_t, across(2), torch.where(out_t & ~out_s, across(4), own))
+    corners = (out_s & out_t).flatten().nonzero()[:, 0]
+    around = torch.stack([texels.flatten()[corners] for texels in (own, across(2), across(4))], dim=1)
+    return _Ring(source.flatten().to(device), corners.to(device), around.to(device))
+
+
+def _face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Face [P], and s and t [P] in [-1, 1], of directions [P, 3]; ties go to the earlier axis, zero to +x's centre."""
+    x, y, z = directions.abs().unbind(-1)
+    axis = torch.where((x >= y) & (x >= z), 0, torch.where(y >= z, 1, 2))
+    major = directions.gather(-1, axis[:, None])[:, 0]
+    face = 2 * axis + (major < 0)
+    table = torch.tensor(_FACES, device=directions.device)[face]
+    inverse = 1 / major.abs().masked_fill(major.abs() <= 1e-20, torch.inf)
+    s = table[:, 3] * directions.gather(-1, table[:, 2:3])[:, 0] * inverse
+    t = table[:, 5] * directions.gather(-1, table[:, 4:5])[:, 0] * inverse
+    return face, s, t
 
 
 def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
     """The slow twin of ``cubemap_lookup``: plain torch, any dtype and device."""
-    resolution = texture.shape[1]
+    resolution, channels = texture.shape[1], texture.shape[-1]
+    ring = _ring(resolution, texture.device)
+    texels = texture.reshape(-1, channels)
+    ringed = texels[ring.source].index_put((ring.corners,), texels[ring.around].mean(dim=1))
     face, s, t = _face_coordinates(directions)
-    u, v = (s + 1) * resolution / 2 + 0.5, (t + 1) * resolution / 2 + 0.5
-    u0 = u.detach().floor().clamp(0, resolution)
-    v0 = v.detach().floor().clamp(0, resolution)
-    fu, fv = (u - u0)[:, None], (v - v0)[:, None]
-    table = border_table(resolution).to(texture.device).long()
-    texels = texture.reshape(-1, texture.shape[-1])
-    row, column = v0.long(), u0.long()
-
-    def tap(down: int, right: int) -> Tensor:
-        return texels[table[face, row + down, column + right]]
-
-    top = tap(0, 0) * (1 - fu) + tap(0, 1) * fu
-    bottom = tap(1, 0) * (1 - fu) + tap(1, 1) * fu
-    return top * (1 - fv) + bottom * fv
+    # Texel centres are at half-integers; one is added for the ring. A NaN reads cell 0 and stays in the fraction.
+    u, v = (s + 1) * (resolution / 2) + 0.5, (t + 1) * (resolution / 2) + 0.5
+    column, row = (x.detach().nan_to_num(0).clamp(0, resolution).floor().long() for x in (u, v))
+    fu, fv = (u - column)[:, None], (v - row)[:, None]
+    first = (face * (resolution + 2) + row) * (resolution + 2) + column
+    top = torch.lerp(ringed[first], ringed[first + 1], fu.expand(-1, channels))
+    second = first + resolution + 2
+    bottom = torch.lerp(ringed[second], ringed[second + 1], fu.expand(-1, channels))
+    return torch.lerp(top, bottom, fv.expand(-1, channels))
 
 
 class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, texture: Tensor, directions: Tensor) -> Tensor:
         texture, directions = texture.detach().contiguous(), directions.detach().contiguous()
-        out = torch.empty(directions.shape[0], texture.shape[-1])
-        _native.cubemap_forward(texture, border_table(texture.shape[1]), directions, out)
+        out = texture.new_empty(directions.shape[0], texture.shape[-1])
+        _native.cubemap_forward(texture, directions, out)
         ctx.save_for_backward(texture, directions)
         return out
 
@@ -103,23 +145,62 @@ class _Lookup(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
         texture, directions = ctx.saved_tensors
-        to_texture = torch.zeros_like(texture) if ctx.needs_input_grad[0] else None
+        to_texture = torch.empty_like(texture) if ctx.needs_input_grad[0] else None
         to_directions = torch.empty_like(directions) if ctx.needs_input_grad[1] else None
-        border = border_table(texture.shape[1])
-        _native.cubemap_backward(texture, border, directions, grad.contiguous(), to_texture, to_directions)
+        _native.cubemap_backward(texture, directions, grad.contiguous(), to_texture, to_directions)
         return to_texture, to_directions
 
 
 def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
-    """Bilinear look-up.
+    """Seamless bilinear look-up, ``sum_k w_k(direction) texel_k`` over four taps; see the module for the faces.
+
+    The gradient with respect to a direction is that of the weights: it is constant along the ray, so orthogonal to
+    the direction, and jumps where the direction passes between cells of four texel centres. A direction of length
+    zero reads the middle of +x and gets no gradient; one with a NaN reads NaN.
 
     Args:
-        texture: [6, R, R, C]. directions: [P, 3], any length but 0.
+        texture: [6, R, R, C], R at least 1.
+        directions: [P, 3], of any length.
 
     Returns:
-        [P, C], differentiable in both.
+        [P, C], differentiable in both; on the CPU the same bits for any number of threads.
+
+    Raises:
+        ValueError: if a shape is not as above.
     """
-    if texture.device.type == "cpu" and texture.dtype == torch.float32:
+    if (
+        texture.ndim != 4
+        or texture.shape[0] != 6
+        or texture.shape[1] != texture.shape[2]
+        or not texture.shape[1]
+    ):
+        raise ValueError(f"texture: expected shape [6, R, R, C], found {list(texture.shape)}")
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise ValueError(f"directions: expected shape [P, 3], found {list(directions.shape)}")
+    if all(x.device.type == "cpu" and x.dtype == torch.float32 for x in (texture, directions)):
         result: Tensor = _Lookup.apply(texture, directions)
         return result
     return cubemap_lookup_reference(texture, directions)
+
+
+def cubemap_to_equirectangular(texture: Tensor, height: int) -> Tensor:
+    """The cubemap as a panorama, for looking at: +y is up, -z in the middle, +x to its right.
+
+    Row i, column j look at latitude ``pi (1/2 - (i + 1/2) / H)`` and longitude ``2 pi ((j + 1/2) / 2H - 1/2)``, with
+    direction ``(cos lat sin lon, sin lat, -cos lat cos lon)``.
+
+    Args:
+        texture: [6, R, R, C].
+        height: H, at least 1.
+
+    Returns:
+        [H, 2 H, C], differentiable.
+    """
+    steps = torch.arange(2 * height, dtype=texture.dtype, device=texture.device) + 0.5
+    latitude = math.pi * (0.5 - steps[:height, None] / height)
+    longitude = math.pi * (steps[None, :] / height - 1)
+    x, y, z = torch.broadcast_tensors(
+        latitude.cos() * longitude.sin(), latitude.sin(), -latitude.cos() * longitude.cos()
+    )
+    directions = torch.stack((x, y, z), dim=-1)
+    return cubemap_lookup(texture, directions.reshape(-1, 3)).reshape(height, 2 * height, -1)
