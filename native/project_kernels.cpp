@@ -24,6 +24,7 @@ struct Projection {
     float v[9];          // camera-space covariance
     float j[4];          // Jacobian: j0 = fx/z, j1 = -fx tx/z^2, j2 = fy/z, j3 = -fy ty/z^2
     float a, b, c;       // 2D covariance with the blur
+    float determinant;   // of it
 };
 
 POLARGUIDE_INLINE void multiply(const float *x, const float *y, float *out) { // 3 x 3
@@ -66,10 +67,15 @@ POLARGUIDE_INLINE bool project_one(const ProjectArgs &p, int64_t g, Projection *
     const float h = limited(o->t[1] * rz, -cam.cy / cam.fy - margin_y, (cam.height - cam.cy) / cam.fy + margin_y, &o->clamped_y);
     o->tx = u * z, o->ty = h * z;
     o->j[0] = cam.fx * rz, o->j[1] = -cam.fx * u * rz, o->j[2] = cam.fy * rz, o->j[3] = -cam.fy * h * rz;
-    const float *v = o->v, *j = o->j;
-    o->a = j[0] * j[0] * v[0] + 2 * j[0] * j[1] * v[2] + j[1] * j[1] * v[8] + blur;
-    o->b = j[0] * j[2] * v[1] + j[0] * j[3] * v[2] + j[1] * j[2] * v[5] + j[1] * j[3] * v[8];
-    o->c = j[2] * j[2] * v[4] + 2 * j[2] * j[3] * v[5] + j[3] * j[3] * v[8] + blur;
+    const float *j = o->j;
+    float p0[3], p1[3]; // rows of J N, whose products are the covariance
+    for (int c = 0; c < 3; ++c) p0[c] = j[0] * n[c] + j[1] * n[6 + c], p1[c] = j[2] * n[3 + c] + j[3] * n[6 + c];
+    const float a = p0[0] * p0[0] + p0[1] * p0[1] + p0[2] * p0[2], c = p1[0] * p1[0] + p1[1] * p1[1] + p1[2] * p1[2];
+    o->a = a + blur, o->c = c + blur;
+    o->b = p0[0] * p1[0] + p0[1] * p1[1] + p0[2] * p1[2];
+    // a c - b^2 would cancel for needles: a sum of squared minors does not.
+    const float m0 = p0[1] * p1[2] - p0[2] * p1[1], m1 = p0[2] * p1[0] - p0[0] * p1[2], m2 = p0[0] * p1[1] - p0[1] * p1[0];
+    o->determinant = m0 * m0 + m1 * m1 + m2 * m2 + blur * (a + c) + blur * blur;
     return true;
 }
 
@@ -88,7 +94,7 @@ void project(const ProjectArgs &p, int64_t begin, int64_t end) {
         box[0] = box[1] = box[2] = box[3] = 0;
         p.radius[g] = p.depth[g] = 0.0f;
         if (!project_one(p, g, &o)) continue;
-        const float determinant = o.a * o.c - o.b * o.b;
+        const float determinant = o.determinant;
         if (!(determinant > 0.0f) || !(determinant < 1e30f)) continue;
         const float inverse = 1.0f / determinant, rz = 1.0f / o.t[2];
         float *screen = p.screen + g * screen_values;
@@ -140,7 +146,7 @@ namespace {
 // From gradients of the 2D mean and conic to those of the 3D mean, quaternion and scales.
 POLARGUIDE_INLINE void pull_back(const PinholeCamera &cam, const Projection &o, const float *grad, float *mean, float *quat, float *scale) {
     // conic = inverse of [[a, b], [b, c]]: gradient of the covariance is -conic G conic.
-    const float inverse = 1.0f / (o.a * o.c - o.b * o.b);
+    const float inverse = 1.0f / o.determinant;
     const float ka = o.c * inverse, kb = -o.b * inverse, kc = o.a * inverse;
     const float ga = grad[2], gb = 0.5f * grad[3], gc = grad[4];
     const float m00 = ka * ga + kb * gb, m01 = ka * gb + kb * gc, m10 = kb * ga + kc * gb, m11 = kb * gb + kc * gc;

@@ -17,7 +17,7 @@ from polarguide.raster import Backend, DeviceName, choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.shading.render import Shading, render
 from polarguide.shading.result import RenderResult
-from polarguide.training.run import RunConfiguration, load_checkpoint
+from polarguide.training.run import RunConfiguration, load_checkpoint, recipe_data
 from polarguide.training.stages import Recipe
 from polarguide.training.state import TrainingState
 
@@ -113,6 +113,11 @@ def open_run(folder: Path, *, device: DeviceName = "auto") -> OpenRun:
     if scene.digest != configuration.scene_digest:
         console.print(
             f"[yellow]warning:[/] {configuration.scene} has changed since {folder} was trained on it."
+        )
+    if recipe_data(recipe) != configuration.recipe_data:
+        console.print(
+            f"[yellow]warning:[/] {folder} was trained with other values of the recipe {recipe.name} than this "
+            "version has; its pictures are shaded with this version's."
         )
     return OpenRun(folder, configuration, scene, recipe, state, choose_backend(device))
 

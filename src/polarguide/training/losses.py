@@ -53,8 +53,21 @@ def step_loss(
     """
     photometric = photometric_loss(result.final, shown, valid, ssim_weight)
     total = weights.photometric * photometric
-    if priors is None:
-        return total, photometric
+    if priors is not None:
+        total = total + _prior_terms(result, weights, priors, ssim_weight)
+    if not torch.isfinite(total):
+        raise PolarguideError(
+            "training",
+            expected="a finite loss",
+            found=str(float(total.detach())),
+            remedy="Lower the learning rates, or resume from an earlier checkpoint.",
+        )
+    return total, photometric
+
+
+def _prior_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssim_weight: float) -> Tensor:
+    """The weighted sum of the terms that compare with a view's priors."""
+    total = result.final.new_zeros(())
     if weights.specular and result.specular is not None:
         total = total + weights.specular * photometric_loss(
             result.specular, priors.specular, priors.separated, ssim_weight
@@ -67,11 +80,4 @@ def step_loss(
         total = total + weights.normal * normal_loss(result.normal, priors)
     if weights.azimuth and result.normal is not None:
         total = total + weights.azimuth * azimuth_loss(result.normal, priors)
-    if not torch.isfinite(total):
-        raise PolarguideError(
-            "training",
-            expected="a finite loss",
-            found=str(float(total.detach())),
-            remedy="Lower the learning rates, or resume from an earlier checkpoint.",
-        )
-    return total, photometric
+    return total

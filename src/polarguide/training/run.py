@@ -72,7 +72,10 @@ class RunConfiguration:
         try:
             data = json.loads(path.read_text())
             data["settings"] = TrainSettings(**data["settings"])
-            return cls(**data)
+            configuration = cls(**data)
+            _check_types(configuration)
+            _check_types(configuration.settings)
+            return configuration
         except FileNotFoundError:
             raise PolarguideError(
                 run,
@@ -87,6 +90,15 @@ class RunConfiguration:
                 found=f"something else ({error})",
                 remedy="Restore the file, or train again into a new folder.",
             ) from None
+
+
+def _check_types(record: Any) -> None:
+    """TypeError where a field of a dataclass with plain types holds another type."""
+    plain = {"str": str, "int": int, "float": (int, float)}
+    for field in dataclasses.fields(record):
+        expected, value = plain.get(str(field.type)), getattr(record, field.name)
+        if expected is not None and (not isinstance(value, expected) or isinstance(value, bool)):
+            raise TypeError(f"{field.name} is {value!r}, not {field.type}")
 
 
 def recipe_data(recipe: Recipe) -> dict[str, Any]:
