@@ -67,20 +67,24 @@ def harmonics_pair(count: int, degree: int) -> tuple[Callable[[], None], Callabl
     return ours, twin
 
 
-def milliseconds(sides: tuple[Callable[[], None], ...], repeats: int) -> list[list[float]]:
+def milliseconds(sides: tuple[Callable[[], None], ...], repeats: int, seconds: float) -> list[list[float]]:
+    """Times of each side after a first round that does not count; fewer than ``repeats`` where they are slow."""
     times: list[list[float]] = [[] for _ in sides]
-    for repeat in range(repeats + 3):
+    for run in sides:
+        run()
+    end = time.perf_counter() + seconds
+    while len(times[0]) < repeats and (time.perf_counter() < end or len(times[0]) < 3):
         for side, run in enumerate(sides):
             start = time.perf_counter()
             run()
-            if repeat >= 3:
-                times[side].append((time.perf_counter() - start) * 1e3)
+            times[side].append((time.perf_counter() - start) * 1e3)
     return times
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--repeats", type=int, default=100)
+    parser.add_argument("--seconds", type=float, default=10, help="at most this long for an operation")
     parser.add_argument(
         "--simd", nargs="*", default=["auto"], help="instruction sets to time, e.g. baseline avx2"
     )
@@ -100,7 +104,7 @@ def main() -> None:
         )
         print("| operation | ours ms | twin ms | ratio |\n|---|---|---|---|")
         for name, sides in operations.items():
-            ours, twin = milliseconds(sides, arguments.repeats)
+            ours, twin = milliseconds(sides, arguments.repeats, arguments.seconds)
             a, b = statistics.median(ours), statistics.median(twin)
             print(
                 f"| {name} | {a:.2f} ({min(ours):.2f}) | {b:.2f} ({min(twin):.2f}) | {b / a:.1f} |",
