@@ -70,7 +70,8 @@ def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out:
     missing: set[str] = set()
     for view in views:
         result = opened.render(view, depth=True)
-        pictures = {name: layer_picture(result, name, view.camera) for name in layers}
+        depths = _true_depth_range(view)
+        pictures = {name: layer_picture(result, name, view.camera, depths) for name in layers}
         for name, picture in pictures.items():
             if picture is None:
                 missing.add(name)
@@ -89,26 +90,40 @@ def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out:
     return sheet
 
 
-def layer_picture(result: RenderResult, name: str, camera: Camera) -> Picture | None:
-    """One layer as an 8-bit picture, or None where the recipe has no such layer."""
+def layer_picture(
+    result: RenderResult, name: str, camera: Camera, depths: tuple[float, float] | None = None
+) -> Picture | None:
+    """One layer as an 8-bit picture, or None where the recipe has no such layer; ``depths`` sets depth's colours."""
     values: Tensor | None = getattr(result, name)
     if values is None:
         return None
+    near, far = depths or (0.0, 1.0)
+    if name == "depth" and depths is None:
+        near, far = _depth_range(values, result.alpha > 0.5)
     draw: dict[str, Callable[[Tensor], Picture]] = {
         "normal": lambda v: figures.normal_to_rgb(v, camera),
-        "depth": lambda v: _depth_picture(v, result.alpha),
+        "depth": lambda v: figures.scalar_to_rgb(v, near, far),
         "strength": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
         "alpha": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
     }
     return draw.get(name, figures.radiance_to_rgb)(values)
 
 
-def _depth_picture(depth: Tensor, alpha: Tensor) -> Picture:
-    seen = depth[alpha > 0.5]
-    if seen.numel() == 0:
-        return figures.scalar_to_rgb(depth, 0.0, 1.0)
-    near, far = float(seen.quantile(0.02)), float(seen.quantile(0.9))
-    return figures.scalar_to_rgb(depth, near, max(far, near + 1e-6))
+def _depth_range(depth: Tensor, seen: Tensor) -> tuple[float, float]:
+    """Nearest and farthest depth [H, W] worth a colour where ``seen`` [H, W]."""
+    values = depth[seen]
+    if values.numel() == 0:
+        return 0.0, 1.0
+    near, far = float(values.quantile(0.02)), float(values.quantile(0.9))
+    return near, max(far, near + 1e-6)
+
+
+def _true_depth_range(view: View) -> tuple[float, float] | None:
+    """The range of the true depths, so that rendered and true pictures share their colours; None without truth."""
+    truth = view.truth
+    if truth is None or truth.depth is None or truth.mask is None:
+        return None
+    return _depth_range(truth.depth, truth.mask)
 
 
 def _truth_pictures(view: View) -> dict[str, Picture]:
@@ -121,6 +136,7 @@ def _truth_pictures(view: View) -> dict[str, Picture]:
     for name, layer in (("specular", truth.specular), ("diffuse", truth.diffuse)):
         if layer is not None:
             pictures[name] = figures.radiance_to_rgb(layer / 2)
-    if truth.depth is not None and truth.mask is not None:
-        pictures["depth"] = _depth_picture(truth.depth, truth.mask.float())
+    depths = _true_depth_range(view)
+    if truth.depth is not None and depths is not None:
+        pictures["depth"] = figures.scalar_to_rgb(truth.depth, *depths)
     return pictures

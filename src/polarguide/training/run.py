@@ -94,7 +94,7 @@ class RunConfiguration:
 
 def _check_types(record: Any) -> None:
     """TypeError where a field of a dataclass with plain types holds another type."""
-    plain = {"str": str, "int": int, "float": (int, float)}
+    plain: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
     for field in dataclasses.fields(record):
         expected, value = plain.get(str(field.type)), getattr(record, field.name)
         if expected is not None and (not isinstance(value, expected) or isinstance(value, bool)):
