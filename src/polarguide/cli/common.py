@@ -90,8 +90,8 @@ class OpenRun:
         return self.recipe.shading(self.configuration.settings.refractive_index)
 
     @torch.no_grad()
-    def render(self, view: View, *, depth: bool = False) -> RenderResult:
-        """All layers of a view."""
+    def render(self, view: View, *, normals: bool = True, depth: bool = False) -> RenderResult:
+        """All layers of a view; ``normals`` where the recipe can do without them, and ``depth``, on request."""
         environment = self.state.environment
         return render(
             self.state.rows,
@@ -99,6 +99,7 @@ class OpenRun:
             self.backend.rasterise,
             environment=environment.texels if environment else None,
             shading=self.shading,
+            normals=normals,
             depth=depth,
         )
 

@@ -14,12 +14,10 @@ from rich.table import Table
 
 import polarguide
 from polarguide import _native
-from polarguide.capture import View
 from polarguide.cli.common import OpenRun, console, open_run, use_threads
 from polarguide.evaluation import score_view, write_metrics
 from polarguide.evaluation.speed import frames_per_second
 from polarguide.raster import DeviceName
-from polarguide.shading.render import render
 from polarguide.training.run import RunLog
 
 METRICS = "metrics.json"
@@ -64,7 +62,9 @@ def evaluate_run(opened: OpenRun) -> dict[str, Any]:
         opened.folder / METRICS,
         views=views,
         run={
-            "fps": frames_per_second(lambda view: _final(opened, view), opened.scene.test_views),
+            "fps": frames_per_second(
+                lambda view: opened.render(view, normals=False), opened.scene.test_views
+            ),
             "fps_layers": frames_per_second(
                 lambda view: opened.render(view, depth=True), opened.scene.test_views
             ),
@@ -77,19 +77,6 @@ def evaluate_run(opened: OpenRun) -> dict[str, Any]:
     )
     _print(record, opened)
     return record
-
-
-@torch.no_grad()
-def _final(opened: OpenRun, view: View) -> object:
-    environment = opened.state.environment
-    return render(
-        opened.state.rows,
-        view.camera,
-        opened.backend.rasterise,
-        environment=environment.texels if environment else None,
-        shading=opened.shading,
-        normals=False,
-    ).final
 
 
 def _provenance(opened: OpenRun) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class Weights:
         photometric: final picture against S0/2.
         specular, diffuse: the two contributions against the separated pictures.
         normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
-        azimuth: squared distance of the normal from the plane of incidence that the AoLP names (azimuth alone).
+        azimuth: distance of the normal from the plane of incidence that the AoLP names (azimuth alone).
     """
 
     photometric: float = 1.0
