@@ -12,9 +12,7 @@ from polarguide.gaussians.densify import Densification, DensityStatistics, densi
 from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.gaussians.rows import CORE_ROWS, GaussianRows
 
-SETTINGS = Densification(
-    gradient=1.0, dense_share=0.1, minimum_opacity=0.05, maximum_scale_share=0.5, limit=1000
-)
+SETTINGS = Densification(gradient=1.0, dense_share=0.1, minimum_opacity=0.05, maximum_scale_share=0.5)
 EXTENT = 2.0
 SMALL, LARGE = 0.05, 0.5  # the border is dense_share * extent = 0.2
 RATES = dict.fromkeys(CORE_ROWS, 0.01)
@@ -43,6 +41,7 @@ def round_of(
     settings: Densification = SETTINGS,
     *,
     prune_large: bool = False,
+    limit: int = 100_000,
     seed: int = 1,
 ) -> None:
     densify(
@@ -52,6 +51,7 @@ def round_of(
         extent=EXTENT,
         middle=torch.zeros(3),
         prune_large=prune_large,
+        limit=limit,
         generator=torch.Generator().manual_seed(seed),
     )
 
@@ -91,7 +91,7 @@ def test_children_are_drawn_from_the_parent() -> None:
     rows = rows_of([LARGE])
     rows.keep(torch.zeros(count, dtype=torch.long))
     before = rows.snapshot()
-    round_of(rows, pulled([2.0] * count), Densification(gradient=1.0, dense_share=0.1, limit=100_000))
+    round_of(rows, pulled([2.0] * count), Densification(gradient=1.0, dense_share=0.1))
     offsets = rows["means"].detach() - before["means"][0]
     assert len(offsets) == 2 * count
     axes = quaternions_to_rotations(before["quaternions"][:1])[0] * before["log_scales"][0].exp()
@@ -132,15 +132,15 @@ def test_huge_ones_are_pruned_only_when_asked_and_far_ones_are_exempt() -> None:
 def test_the_limit_is_kept_by_those_that_pull_hardest(size: float) -> None:
     rows = rows_of([size] * 6)
     before = rows.snapshot()
-    settings = Densification(gradient=1.0, dense_share=0.1, limit=8)
-    round_of(rows, pulled([2.0, 5.0, 3.0, 9.0, 0.5, 4.0]), settings)
+    settings = Densification(gradient=1.0, dense_share=0.1)
+    round_of(rows, pulled([2.0, 5.0, 3.0, 9.0, 0.5, 4.0]), settings, limit=8)
     assert len(rows) == 8
     assert counted(rows, before) == [1, 2, 1, 2, 1, 1]
 
 
 def test_at_the_limit_nothing_is_added() -> None:
     rows = rows_of([SMALL] * 6)
-    round_of(rows, pulled([2.0] * 6), Densification(gradient=1.0, limit=4))
+    round_of(rows, pulled([2.0] * 6), Densification(gradient=1.0), limit=4)
     assert len(rows) == 6
 
 

@@ -198,3 +198,22 @@ def test_noise_alone_rarely_passes_the_mask() -> None:
 def test_noise_without_light_is_infinite() -> None:
     light = torch.zeros(3, 2, dtype=F64)
     assert torch.isinf(optics.dolp_noise(light, 0.01)).all()
+
+
+@pytest.mark.parametrize("sigma", [1e-3, 1e-2])
+def test_noise_of_the_intensities_is_read_from_their_sums_whatever_the_gains(sigma: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    light = torch.rand(3, 60, 80, generator=generator, dtype=torch.float64) * 0.3
+    light[0] += 0.5
+    clean = torch.stack([optics.intensity(light, math.radians(a)) for a in optics.ANGLES_DEG])
+    noise = torch.randn(clean.shape, generator=generator, dtype=torch.float64) * sigma
+    found = optics.intensity_noise(clean + noise)
+    assert float((found / sigma - 1)[8:-8, 8:-8].abs().max()) < 0.3
+    assert float(found.mean() / sigma) == pytest.approx(1, abs=0.03)
+    gains = torch.tensor([1.0, 1.01, 0.99, 1.01], dtype=torch.float64)[:, None, None]
+    flat = torch.stack([torch.full((60, 80), 0.4, dtype=torch.float64)] * 4)
+    assert float(optics.intensity_noise(flat * gains).max()) < 1e-7
+    with pytest.raises(ValueError, match="intensities"):
+        optics.intensity_noise(clean[..., None])
+    with pytest.raises(ValueError, match="window"):
+        optics.intensity_noise(clean, window=4)

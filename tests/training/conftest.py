@@ -99,6 +99,11 @@ def busy_recipe() -> Recipe:
         environment_resolution=16,
         initialisation=dataclasses.replace(recipe.initialisation, shell=50),
         densification=dataclasses.replace(
-            recipe.densification, every=8, gradient=1e-5, dense_share=0.02, minimum_opacity=0.006, limit=800
+            recipe.densification,
+            every=8,
+            gradient=1e-5,
+            dense_share=0.02,
+            minimum_opacity=0.006,
+            pixels_each=100.0,
         ),
     )

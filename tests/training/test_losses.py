@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,12 +13,20 @@ from torch.nn.functional import normalize
 from polarguide.errors import PolarguideError
 from polarguide.shading.display import srgb_encode
 from polarguide.shading.result import RenderResult
-from polarguide.training.losses import azimuth_loss, normal_loss, step_loss
+from polarguide.training.losses import (
+    agreement_loss,
+    azimuth_loss,
+    chromatic_loss,
+    flatness_loss,
+    normal_loss,
+    step_loss,
+)
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
 from polarguide.training.stages import Weights
 
 SIZE = (12, 14)
+SCALES = torch.tensor([[-3.0, -2.0, -1.0], [-1.0, -4.0, -2.0], [0.0, 0.0, -5.0]])
 
 
 def unit(seed: int) -> Tensor:
@@ -34,7 +43,14 @@ def priors() -> ViewPriors:
     plane = normalize(torch.linalg.cross(normal, unit(1)), dim=-1)
     weight = torch.rand(SIZE, generator=torch.Generator().manual_seed(2))
     return ViewPriors(
-        srgb_encode(picture(3)), srgb_encode(picture(4)), torch.ones(SIZE), normal, plane, weight
+        srgb_encode(picture(3)),
+        srgb_encode(picture(4)),
+        torch.ones(SIZE),
+        normal,
+        plane,
+        weight,
+        normal,
+        weight.square(),
     )
 
 
@@ -91,12 +107,52 @@ def test_a_blended_normal_of_length_zero_has_a_finite_gradient(priors: ViewPrior
     assert bool(torch.isfinite(normal.grad).all())
 
 
+def test_chromatic_loss_has_a_weight_of_its_own(priors: ViewPriors) -> None:
+    assert float(chromatic_loss(2 * priors.chromatic, priors)) == pytest.approx(0.0, abs=1e-6)
+    assert float(chromatic_loss(-priors.chromatic, priors)) == pytest.approx(2.0, rel=1e-5)
+    none = replace(priors, chromatic_weight=torch.zeros(SIZE))
+    assert float(chromatic_loss(-priors.chromatic, none)) == 0
+
+
+def test_agreement_loss_is_what_scatter_takes_from_the_length() -> None:
+    alpha, weight = torch.full(SIZE, 0.8), torch.ones(SIZE)
+    assert float(agreement_loss(0.8 * unit(0), alpha, weight)) == pytest.approx(0.0, abs=1e-6)
+    assert float(agreement_loss(0.3 * unit(0), alpha, weight)) == pytest.approx(0.5, rel=1e-5)
+    assert float(agreement_loss(0.3 * unit(0), alpha, 0.2 * weight)) == pytest.approx(0.1, rel=1e-5)
+    # Two normals of equal weight: following the gradient brings them together.
+    pair = torch.stack((unit(1), unit(2))).requires_grad_()
+    before = agreement_loss(pair.mean(dim=0), torch.ones(SIZE), weight)
+    before.backward()
+    assert pair.grad is not None
+    with torch.no_grad():
+        after = normalize(pair - 10 * pair.grad, dim=-1)
+    assert float(agreement_loss(after.mean(dim=0), torch.ones(SIZE), weight)) < float(before.detach())
+
+
+def test_flatness_is_the_shortest_scale_of_what_is_visible() -> None:
+    radii = torch.tensor([4.0, 0.0, 1.0])
+    expected = 100 / 2 * (math.exp(-3) + math.exp(-5)) / 2
+    assert float(flatness_loss(SCALES, radii, 2.0)) == pytest.approx(expected, rel=1e-5)
+    assert float(flatness_loss(SCALES, torch.zeros(3), 2.0)) == 0
+
+
 def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> None:
     shown = srgb_encode(picture(6))
     rendered = result(specular=picture(7), diffuse=picture(8), normal=unit(9))
     valid = (picture(11)[..., 0] > 0.2).float()
-    weights = Weights(photometric=0.7, specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
-    total, photometric = step_loss(rendered, shown, valid, weights, priors, ssim_weight=0.3)
+    weights = Weights(
+        photometric=0.7,
+        specular=0.5,
+        diffuse=0.2,
+        normal=0.3,
+        azimuth=0.4,
+        chromatic=0.6,
+        agreement=0.8,
+        flatness=0.9,
+    )
+    total, photometric = step_loss(
+        rendered, shown, valid, weights, priors, ssim_weight=0.3, log_scales=SCALES, extent=2.0
+    )
     assert rendered.specular is not None
     assert rendered.diffuse is not None
     assert rendered.normal is not None
@@ -107,6 +163,9 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         + 0.2 * photometric_loss(rendered.diffuse, priors.diffuse, priors.separated, 0.3)
         + 0.3 * normal_loss(rendered.normal, priors)
         + 0.4 * azimuth_loss(rendered.normal, priors)
+        + 0.6 * chromatic_loss(rendered.normal, priors)
+        + 0.8 * agreement_loss(rendered.normal, rendered.alpha, priors.weight)
+        + 0.9 * flatness_loss(SCALES, rendered.radii, 2.0)
     )
     assert float(total) == pytest.approx(float(expected), rel=1e-5)
     assert float(photometric) == pytest.approx(float(expected_photometric), rel=1e-6)
@@ -116,20 +175,42 @@ def test_a_perfect_picture_costs_nothing(priors: ViewPriors) -> None:
     assert priors.separated.all()
     rendered = result(final=picture(6), specular=picture(3), diffuse=picture(4), normal=priors.normal)
     weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
-    total, _ = step_loss(rendered, srgb_encode(picture(6)), None, weights, priors, ssim_weight=0.2)
+    total, _ = step_loss(
+        rendered,
+        srgb_encode(picture(6)),
+        None,
+        weights,
+        priors,
+        ssim_weight=0.2,
+        log_scales=SCALES,
+        extent=2.0,
+    )
     assert float(total) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_layers_that_a_recipe_lacks_are_left_out(priors: ViewPriors) -> None:
     weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
     shown = srgb_encode(picture(6))
-    total, photometric = step_loss(result(), shown, None, weights, priors, ssim_weight=0.2)
+    total, photometric = step_loss(
+        result(), shown, None, weights, priors, ssim_weight=0.2, log_scales=SCALES, extent=2.0
+    )
     assert torch.equal(total, photometric)
-    total, photometric = step_loss(result(normal=unit(1)), shown, None, weights, None, ssim_weight=0.2)
+    total, photometric = step_loss(
+        result(normal=unit(1)), shown, None, weights, None, ssim_weight=0.2, log_scales=SCALES, extent=2.0
+    )
     assert torch.equal(total, photometric)
 
 
 def test_a_loss_that_is_not_finite_is_an_error(priors: ViewPriors) -> None:
     rendered = result(normal=torch.full((*SIZE, 3), torch.nan))
     with pytest.raises(PolarguideError, match="finite loss"):
-        step_loss(rendered, picture(6), None, Weights(normal=0.1), priors, ssim_weight=0.2)
+        step_loss(
+            rendered,
+            picture(6),
+            None,
+            Weights(normal=0.1),
+            priors,
+            ssim_weight=0.2,
+            log_scales=SCALES,
+            extent=2.0,
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,26 @@ def test_the_true_normals_lie_near_the_planes_of_incidence(view: View) -> None:
     assert float(azimuth_loss(guide_of(view), priors)) < 0.07
     turned = view.camera.to_world(torch.tensor([1.0, 1.0, -1.0]).expand_as(guide_of(view)))
     assert float(azimuth_loss(turned, priors)) > 0.3
+
+
+def test_colour_differences_find_the_plane_that_a_wrong_guide_misses(view: View) -> None:
+    """The guide is turned by a quarter about each ray, so that it prefers the other lobe everywhere."""
+    rays = view.camera.world_rays()
+    truth = guide_of(view)
+    along = (truth * rays).sum(-1, keepdim=True) * rays
+    turned = along + torch.linalg.cross(rays, truth - along)
+    distance = {}
+    for chromatic in (False, True):
+        priors = view_priors(view, turned, replace(EXACT, chromatic=chromatic), INDEX)
+        distance[chromatic] = (priors.plane * truth).sum(-1).abs()
+        if chromatic:
+            decided = priors.chromatic_weight > 0
+            assert float(decided.sum()) > 1000
+        else:
+            assert not priors.chromatic_weight.any()
+    assert float(distance[False][decided].mean()) > 0.5
+    assert float(distance[True][decided].mean()) < 0.1
+    assert torch.equal(distance[True][~decided], distance[False][~decided])
 
 
 def test_shapes_ranges_and_units(view: View) -> None:

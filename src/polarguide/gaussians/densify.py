@@ -23,7 +23,8 @@ class Densification:
         minimum_opacity: below it a Gaussian is pruned.
         maximum_scale_share: wider than this share of the extent is pruned once opacities have been reset; far
             surroundings are exempt in proportion to their distance.
-        limit: no more Gaussians than this.
+        pixels_each: pixels of all training pictures for each Gaussian at least. A Gaussian has some sixty values to
+            learn and a pixel three to teach: fewer pixels each, and held-out views get worse.
     """
 
     every: int = 100
@@ -31,7 +32,7 @@ class Densification:
     dense_share: float = 0.01
     minimum_opacity: float = 0.005
     maximum_scale_share: float = 0.1
-    limit: int = 3_000_000
+    pixels_each: float = 40.0
 
 
 class DensityStatistics:
@@ -66,6 +67,7 @@ def densify(
     extent: float,
     middle: Tensor,
     prune_large: bool,
+    limit: int,
     generator: torch.Generator,
 ) -> None:
     """One round: clone small Gaussians that pull hard, split large ones, prune the transparent and the huge.
@@ -73,11 +75,12 @@ def densify(
     Args:
         extent: the scene's extent (``scene_extent``). middle: [3], the cameras' mean position.
         prune_large: also prune the huge ones (after the first opacity reset).
+        limit: no more Gaussians than this.
         generator: draws the positions of the split ones' children.
     """
     pulled = statistics.mean() >= settings.gradient
     wide = rows["log_scales"].exp().amax(dim=1) > settings.dense_share * extent
-    room = max(0, settings.limit - len(rows))
+    room = max(0, limit - len(rows))
     if int(pulled.sum()) > room:
         strongest = statistics.mean().argsort(descending=True)[:room]
         pulled = torch.zeros_like(pulled)

@@ -4,6 +4,7 @@ They are differentiable, and value and gradient stay finite at every degenerate 
 polarization, normal and grazing incidence).
 """
 
+from .chromatic import ChromaticNormals, chromatic_normals
 from .frames import azimuth, lens_frame, normal_from_angles, zenith
 from .fresnel import (
     brewster,
@@ -23,6 +24,7 @@ from .normals import (
     PhysicalCandidates,
     disambiguate,
     dolp_noise,
+    intensity_noise,
     paper_candidates,
     physical_candidates,
     polarization_mask,
@@ -39,12 +41,14 @@ from .stokes import ANGLES_DEG, aolp, dolp, intensity, luminance, photograph, st
 __all__ = [
     "ANGLES_DEG",
     "Candidates",
+    "ChromaticNormals",
     "Disambiguated",
     "PhysicalCandidates",
     "Separation",
     "aolp",
     "azimuth",
     "brewster",
+    "chromatic_normals",
     "diffuse_dolp",
     "diffuse_dolp_limit",
     "diffuse_zenith",
@@ -54,6 +58,7 @@ __all__ = [
     "dolp_slopes",
     "exact_separation",
     "intensity",
+    "intensity_noise",
     "lens_frame",
     "luminance",
     "normal_from_angles",

@@ -16,6 +16,7 @@ from torch import Tensor
 from polarguide.vectors import dot
 
 from ._guard import check_leading, safe_normalize, safe_sqrt
+from ._window import window_mean
 from .frames import normal_from_angles
 from .fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
 from .stokes import aolp, dolp
@@ -186,6 +187,32 @@ def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
     s0 = stokes[0].clamp(min=0)
     spread = noise_sigma * torch.sqrt(2 + dolp(stokes) ** 2)
     return torch.where(s0 > 0, spread / torch.where(s0 > 0, s0, torch.ones_like(s0)), spread * math.inf)
+
+
+def intensity_noise(intensities: Tensor, window: int = 15) -> Tensor:
+    """Standard deviation of the noise of one of the four intensities, read from the pictures themselves.
+
+    Four angles measure three unknowns: ``I0 + I90 - I45 - I135`` is zero but for noise, whose variance it has
+    four times. Taken about its mean over the window, unequal gains of the angles do not count as noise; light
+    that moved between the shots does, as it should.
+
+    Args:
+        intensities: [4, H, W], of one channel or of the mean over the colours.
+        window: odd side of the window in pixels.
+
+    Returns:
+        [H, W] in the units of the intensities.
+
+    Raises:
+        ValueError: ``intensities`` is not [4, H, W], or ``window`` is not a positive odd number.
+    """
+    check_leading(intensities, 4, "intensities")
+    if intensities.ndim != 3:
+        raise ValueError(f"intensities: expected shape [4, H, W], found {list(intensities.shape)}")
+    i0, i45, i90, i135 = intensities.unbind(0)
+    excess = i0 + i90 - i45 - i135
+    mean, square = window_mean(torch.stack((excess, excess**2)), window).unbind(0)
+    return safe_sqrt(square - mean**2) / 2
 
 
 def polarization_mask(

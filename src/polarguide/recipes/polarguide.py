@@ -38,9 +38,12 @@ RECIPE_POLARGUIDE: Recipe = replace(
     RECIPE_3DGS_DR,
     name="polarguide",
     about="The paper's three stages with repaired physics: physical candidates, azimuth, exact separation.",
-    stages=_stages(Weights(specular=0.5, diffuse=0.2, azimuth=0.3), Weights(azimuth=0.3)),
+    stages=_stages(
+        Weights(specular=0.5, diffuse=0.2, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
+        Weights(azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
+    ),
     # An ideal sensor tells the azimuth down to a DoLP of a percent; noise has its own mask.
-    priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0),
+    priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0, snr=3.0, chromatic=True),
 )
 
 RECIPE_POLARGUIDE_PAPER: Recipe = replace(

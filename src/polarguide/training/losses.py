@@ -32,6 +32,40 @@ def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
     return (distance * priors.weight).sum() / priors.weight.sum().clamp(min=1)
 
 
+def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
+    """Mean of 1 - cos(normal, normal from colour differences) over the pixels that these decide.
+
+    Args:
+        normal: [H, W, 3] blended normals, world axes, any length.
+    """
+    cosine = dot(unit(normal, 1e-2), priors.chromatic)
+    return ((1 - cosine) * priors.chromatic_weight).sum() / priors.chromatic_weight.sum().clamp(min=1)
+
+
+def agreement_loss(normal: Tensor, alpha: Tensor, weight: Tensor) -> Tensor:
+    """Mean by which blended normals are shorter than their weights allow: 0 where all of a pixel agree.
+
+    Normals that scatter blend to one that leans to the camera, since each is turned to face it. This term pulls
+    each towards the mean of its pixel, and does not say where that points: it belongs where something else does.
+
+    Args:
+        normal: [H, W, 3] blended unit normals. alpha: [H, W] the sum of the blending weights. weight: [H, W].
+    """
+    length = torch.sqrt(dot(normal, normal) + 1e-8)
+    return (weight * (alpha.detach() - length).clamp(min=0)).mean()
+
+
+def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
+    """Mean shortest scale of the visible Gaussians in percent of the scene's extent.
+
+    Args:
+        log_scales: [N, 3]. radii: [N], 0 where not visible. extent: of the scene.
+    """
+    visible = (radii > 0).to(log_scales)
+    shortest = log_scales.amin(dim=1).exp()
+    return 100 / extent * (shortest * visible).sum() / visible.sum().clamp(min=1)
+
+
 def step_loss(
     result: RenderResult,
     shown: Tensor,
@@ -40,6 +74,8 @@ def step_loss(
     priors: ViewPriors | None,
     *,
     ssim_weight: float,
+    log_scales: Tensor,
+    extent: float,
 ) -> tuple[Tensor, Tensor]:
     """The weighted sum of a stage's terms, and its photometric term alone (for the display).
 
@@ -50,11 +86,14 @@ def step_loss(
         weights: of the stage.
         priors: of the view; needed where a weight asks for them.
         ssim_weight: lambda of the image terms.
+        log_scales: [N, 3] of the Gaussians. extent: of the scene.
     """
     photometric = photometric_loss(result.final, shown, valid, ssim_weight)
     total = weights.photometric * photometric
     if priors is not None:
         total = total + _prior_terms(result, weights, priors, ssim_weight)
+    if weights.flatness:
+        total = total + weights.flatness * flatness_loss(log_scales, result.radii, extent)
     if not torch.isfinite(total):
         raise PolarguideError(
             "training",
@@ -80,4 +119,8 @@ def _prior_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssi
         total = total + weights.normal * normal_loss(result.normal, priors)
     if weights.azimuth and result.normal is not None:
         total = total + weights.azimuth * azimuth_loss(result.normal, priors)
+    if weights.chromatic and result.normal is not None:
+        total = total + weights.chromatic * chromatic_loss(result.normal, priors)
+    if weights.agreement and result.normal is not None:
+        total = total + weights.agreement * agreement_loss(result.normal, result.alpha, priors.weight)
     return total

@@ -19,6 +19,10 @@ from polarguide.vectors import dot, unit
 
 # Rendered normals shorter than this are too mixed to say anything.
 MINIMUM_NORMAL = 0.3
+# Colour differences that explain their polarization this much better than not count fully.
+FULL_CERTAINTY = 3.0
+# Below this degree of polarization their plane takes the place of the AoLP's.
+CHROMATIC_PLANE_DOLP = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +35,8 @@ class ViewPriors:
         normal: [H, W, 3] disambiguated polarization normal, world axes.
         plane: [H, W, 3] world normal of the plane of incidence that the AoLP names.
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
+        chromatic: [H, W, 3] normal that the polarization of colour differences tells, world axes.
+        chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
     """
 
     specular: Tensor
@@ -39,6 +45,8 @@ class ViewPriors:
     normal: Tensor
     plane: Tensor
     weight: Tensor
+    chromatic: Tensor
+    chromatic_weight: Tensor
 
 
 def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -63,15 +71,26 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
         index: refractive index.
     """
     rays = view.camera.rays()
-    stokes = optics.stokes(view.intensities())
+    intensities = view.intensities()
+    stokes = optics.stokes(intensities)
     luminance = optics.luminance(stokes)
     guide, known = guide_normals(view.camera.to_camera(normal), rays)
     usable = optics.polarization_mask(
-        luminance, threshold=settings.threshold, invalid=view.invalid, saturated=view.saturated
+        luminance,
+        threshold=settings.threshold,
+        invalid=view.invalid,
+        noise_sigma=optics.intensity_noise(intensities.mean(dim=-1)) if settings.snr else 0.0,
+        snr=settings.snr,
+        saturated=view.saturated,
     )
+    nearest_to = guide
+    if settings.chromatic:
+        chromatic, chromatic_weight = _chromatic(stokes, guide, rays, index, ~(view.invalid | view.saturated))
+        chromatic_weight = chromatic_weight * known
+        nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
     make = optics.paper_candidates if settings.candidates == "paper" else optics.physical_candidates
     chosen = optics.disambiguate(
-        make(luminance, rays, index), guide, rays, azimuth_weight=settings.azimuth_weight
+        make(luminance, rays, index), nearest_to, rays, azimuth_weight=settings.azimuth_weight
     ).normal
     if settings.separation == "paper":
         zenith = optics.diffuse_zenith(optics.dolp(luminance), index)
@@ -81,7 +100,15 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
         layers = optics.exact_separation(stokes, guide, rays, index)
         conditioned = layers.conditioned & known & ~view.saturated
     plane = unit(torch.linalg.cross(rays, chosen))
-    weight = (optics.dolp(luminance) / settings.full_dolp).clamp(max=1) * (usable & known)
+    degree = optics.dolp(luminance)
+    weight = (degree / settings.full_dolp).clamp(max=1) * (usable & known)
+    if settings.chromatic:
+        # Nearly unpolarized light has no AoLP to speak of; the slope among its colours may still have one.
+        better = (chromatic_weight > 0) & (degree < CHROMATIC_PLANE_DOLP)
+        plane = torch.where(better[..., None], unit(torch.linalg.cross(rays, chromatic)), plane)
+        weight = torch.maximum(weight, chromatic_weight)
+    else:
+        chromatic, chromatic_weight = chosen, torch.zeros_like(weight)
     return ViewPriors(
         specular=srgb_encode((layers.specular / 2).clamp(0, 1)),
         diffuse=srgb_encode((layers.diffuse / 2).clamp(0, 1)),
@@ -89,4 +116,18 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
         normal=view.camera.to_world(chosen),
         plane=view.camera.to_world(plane),
         weight=weight,
+        chromatic=view.camera.to_world(chromatic),
+        chromatic_weight=chromatic_weight,
     )
+
+
+def _chromatic(
+    stokes: Tensor, guide: Tensor, rays: Tensor, index: float, good: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Normals of the colour differences on the guide's side [H, W, 3], and their weights [H, W]."""
+    told = optics.chromatic_normals(stokes, index)
+    normal = optics.normal_from_angles(told.zenith, told.azimuth, rays)
+    mirrored = optics.normal_from_angles(told.zenith, told.azimuth + torch.pi, rays)
+    nearer = dot(normal, guide) >= dot(mirrored, guide)
+    weight = (told.certainty / FULL_CERTAINTY).clamp(max=1) * (told.decided & good)
+    return torch.where(nearer[..., None], normal, mirrored), weight

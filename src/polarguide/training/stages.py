@@ -45,6 +45,9 @@ class Weights:
         specular, diffuse: the two contributions against the separated pictures.
         normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
         azimuth: distance of the normal from the plane of incidence that the AoLP names (azimuth alone).
+        chromatic: 1 - cosine with the normal that colour differences tell, where they do.
+        agreement: how far the normals that a pixel blends disagree, where polarization says something.
+        flatness: shortest scale of the Gaussians, in percent of the scene's extent.
     """
 
     photometric: float = 1.0
@@ -52,6 +55,19 @@ class Weights:
     diffuse: float = 0.0
     normal: float = 0.0
     azimuth: float = 0.0
+    chromatic: float = 0.0
+    agreement: float = 0.0
+    flatness: float = 0.0
+
+    @property
+    def priors(self) -> bool:
+        """Whether a term compares with the priors of a view."""
+        return any((self.specular, self.diffuse, self.normals))
+
+    @property
+    def normals(self) -> bool:
+        """Whether a term looks at the rendered normals."""
+        return any((self.normal, self.azimuth, self.chromatic, self.agreement))
 
 
 @dataclass(frozen=True)
@@ -87,6 +103,8 @@ class Priors:
         threshold: DoLP above which a pixel's normal is used.
         full_dolp: DoLP from which on a pixel's normal counts fully; below, in proportion.
         azimuth_weight: in [0, 1], how much the choice among candidates trusts azimuth over zenith.
+        snr: ratio of the DoLP to its noise above which a pixel's normal is used; 0 switches the test off.
+        chromatic: whether the polarization of colour differences names the plane where it is decided.
     """
 
     candidates: Candidates = "physical"
@@ -94,6 +112,8 @@ class Priors:
     threshold: float = 0.05
     full_dolp: float = 0.3
     azimuth_weight: float = 0.5
+    snr: float = 0.0
+    chromatic: bool = False
 
 
 @dataclass(frozen=True)

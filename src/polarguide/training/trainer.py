@@ -98,6 +98,8 @@ class Trainer:
         centres = torch.stack([view.camera.centre for view in scene.train_views])
         self._extent = scene_extent(centres)
         self._middle = centres.mean(dim=0).float()
+        pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
+        self._limit = int(pixels / recipe.densification.pixels_each)
         self._shown: dict[str, Tensor] = {}
         self._priors: dict[str, ViewPriors] = {}
 
@@ -122,13 +124,20 @@ class Trainer:
             sh_degree=self.schedule.sh_degree(state.step),
             environment=state.environment.texels if state.environment and stage.reflection else None,
             shading=recipe.shading(self.settings.refractive_index),
-            normals=bool(stage.weights.normal or stage.weights.azimuth),
+            normals=stage.weights.normals,
             statistic=statistic,
         )
         shown = self._shown_photograph(view)
         valid = None if not bool(view.invalid.any()) else (~view.invalid).float()
         loss, photometric = step_loss(
-            result, shown, valid, stage.weights, self._priors_of(view, stage), ssim_weight=recipe.ssim_weight
+            result,
+            shown,
+            valid,
+            stage.weights,
+            self._priors_of(view, stage),
+            ssim_weight=recipe.ssim_weight,
+            log_scales=state.rows["log_scales"],
+            extent=self._extent,
         )
         loss.backward()
         if statistic is not None and statistic.gradient is not None:
@@ -145,6 +154,7 @@ class Trainer:
                 extent=self._extent,
                 middle=self._middle,
                 prune_large=state.opacity_was_reset,
+                limit=self._limit,
                 generator=_seeded(self.settings.seed, 2, state.step),
             )
         return report
@@ -182,8 +192,7 @@ class Trainer:
         return self._shown[view.name]
 
     def _priors_of(self, view: View, stage: Stage) -> ViewPriors | None:
-        weights = stage.weights
-        if not (weights.specular or weights.diffuse or weights.normal or weights.azimuth):
+        if not stage.weights.priors:
             return None
         if view.name not in self._priors:
             if self.state.frozen is None:
