@@ -24,7 +24,7 @@ class Densification:
         maximum_scale_share: wider than this share of the extent is pruned once opacities have been reset; far
             surroundings are exempt in proportion to their distance.
         pixels_each: pixels of all training pictures for each Gaussian at least. A Gaussian has some sixty values to
-            learn and a pixel three to teach: fewer pixels each, and held-out views get worse.
+            learn and a pixel three to teach: with fewer than twenty pixels each, unknowns outnumber data.
     """
 
     every: int = 100
@@ -32,7 +32,7 @@ class Densification:
     dense_share: float = 0.01
     minimum_opacity: float = 0.005
     maximum_scale_share: float = 0.1
-    pixels_each: float = 40.0
+    pixels_each: float = 20.0
 
 
 class DensityStatistics:
