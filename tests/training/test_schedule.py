@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import get_args, get_type_hints
 
 import pytest
 
-from polarguide.cli import train as train_verb
-from polarguide.recipes import RECIPES
+from polarguide.errors import PolarguideError
+from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
 from polarguide.training.stages import Recipe, Repeat, Schedule, Stage
 
 EVERY_RECIPE = pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES.keys())
@@ -123,7 +122,7 @@ def test_priors_are_refreshed_before_a_stage_that_uses_them(recipe: Recipe) -> N
     for stage in recipe.stages:
         refreshed = refreshed or "refresh_priors" in stage.on_enter
         weights = stage.weights
-        if weights.specular or weights.diffuse or weights.normal or weights.azimuth:
+        if weights.priors:
             assert refreshed, stage.name
 
 
@@ -135,6 +134,21 @@ def test_no_recipe_resets_and_propagates_at_once(recipe: Recipe, steps: int) -> 
         assert not {"reset_opacity", "propagate_normals"} <= set(schedule.at(step).actions)
 
 
-def test_the_command_line_offers_every_recipe() -> None:
-    offered = get_type_hints(train_verb.train)["recipe"]
-    assert get_args(offered) == tuple(RECIPES)
+def test_an_ablation_changes_something_and_is_found_by_its_name() -> None:
+    for base, variations in ABLATIONS.items():
+        names = [recipe.name for recipe in variations]
+        assert len(set(names)) == len(names)
+        for recipe in variations:
+            assert recipe.name.startswith(base + ":")
+            assert recipe.about.endswith(".")
+            assert recipe_named(recipe.name) is recipe
+            same = replace(recipe, name=base, about=RECIPES[base].about)
+            assert same != RECIPES[base], recipe.name
+            Schedule(recipe, 1000)
+
+
+def test_an_unknown_recipe_is_refused_with_the_names_there_are() -> None:
+    with pytest.raises(PolarguideError, match="3dgs-dr, polarguide"):
+        recipe_named("magic")
+    with pytest.raises(PolarguideError, match="polarguide:without-normals"):
+        recipe_named("polarguide:magic")

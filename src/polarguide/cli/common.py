@@ -14,7 +14,7 @@ from polarguide import _native
 from polarguide.capture import Scene, View, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, DeviceName, choose_backend
-from polarguide.recipes import RECIPES
+from polarguide.recipes import recipe_named
 from polarguide.shading.render import Shading, render
 from polarguide.shading.result import RenderResult
 from polarguide.training.run import RunConfiguration, load_checkpoint, recipe_data
@@ -59,18 +59,6 @@ def read_scene(path: Path, *, downscale: int, transfer: Transfer) -> Scene:
         console.print("[yellow]warning:[/] ", end="")
         console.print(warning, markup=False)
     return scene
-
-
-def recipe_named(name: str) -> Recipe:
-    """A recipe by name, or a clear error."""
-    if name not in RECIPES:
-        raise PolarguideError(
-            "recipe",
-            expected="one of " + ", ".join(RECIPES),
-            found=name,
-            remedy="Train again with this version.",
-        )
-    return RECIPES[name]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,15 +8,16 @@ import signal
 import time
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from polarguide.cli.common import Transfer, console, read_scene, recipe_named, use_threads
+from polarguide.cli.common import Transfer, console, read_scene, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.export import write_run_ply
 from polarguide.raster import DeviceName, choose_backend
+from polarguide.recipes import recipe_named
 from polarguide.training.run import (
     CHECKPOINT,
     CONFIGURATION,
@@ -30,7 +31,6 @@ from polarguide.training.run import (
 from polarguide.training.stopwatch import Stopwatch
 from polarguide.training.trainer import StepReport, Trainer, TrainSettings
 
-RecipeName = Literal["3dgs", "3dgs-dr", "polarguide", "polarguide-paper"]
 LOG_EVERY = 10
 
 
@@ -39,7 +39,7 @@ def train(
     /,
     *,
     out: Path,
-    recipe: RecipeName = "polarguide",
+    recipe: str = "polarguide",
     steps: int = 5000,
     downscale: int = 1,
     seed: int = 0,
@@ -58,7 +58,8 @@ def train(
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
             model in sparse/0.
         out: Run folder to write (configuration, checkpoint, log, PLY).
-        recipe: Which method: the plain baselines 3dgs and 3dgs-dr ignore polarization.
+        recipe: Which method: 3dgs, 3dgs-dr (both ignore polarization), polarguide, polarguide-paper, or an ablation
+            of one, such as polarguide:without-normals.
         steps: Optimiser steps in all. 3,000 show the scene, 5,000 and more settle it.
         downscale: Average the pictures over boxes of this many pixels first.
         seed: Seed of every random draw.
@@ -82,11 +83,11 @@ def train(
             found=str(refractive_index),
             remedy="1.5 suits most.",
         )
+    chosen = recipe_named(recipe)
     _check_out(out, resume)
     backend = choose_backend(device)
     loaded = read_scene(scene, downscale=downscale, transfer=transfer)
     settings = TrainSettings(steps, seed, refractive_index)
-    chosen = recipe_named(recipe)
     configuration = RunConfiguration(
         scene=str(scene.resolve()),
         scene_digest=loaded.digest,

@@ -1,5 +1,9 @@
-"""Recipes by name. Data only."""
+"""Recipes by name: the methods that ``train`` offers, and their ablations."""
 
+from __future__ import annotations
+
+from polarguide.errors import PolarguideError
+from polarguide.recipes.ablations import ABLATIONS_POLARGUIDE
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER
 from polarguide.training.stages import Recipe
@@ -8,5 +12,26 @@ RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (RECIPE_3DGS, RECIPE_3DGS_DR, RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER)
 }
+ABLATIONS: dict[str, tuple[Recipe, ...]] = {"polarguide": ABLATIONS_POLARGUIDE}
+"""Variations of a recipe by its name, each with one thing changed, named ``recipe:variation``."""
 
-__all__ = ["RECIPES"]
+
+def recipe_named(name: str) -> Recipe:
+    """A recipe or a variation by name.
+
+    Raises:
+        PolarguideError: there is none of that name.
+    """
+    base = name.partition(":")[0]
+    known = {**RECIPES, **{recipe.name: recipe for recipe in ABLATIONS.get(base, ())}}
+    if name not in known:
+        raise PolarguideError(
+            "recipe",
+            expected="one of " + ", ".join(known),
+            found=name,
+            remedy="Take one of these; a recipe of another version needs that version.",
+        )
+    return known[name]
+
+
+__all__ = ["ABLATIONS", "RECIPES", "recipe_named"]

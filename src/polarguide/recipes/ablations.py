@@ -1,0 +1,114 @@
+"""Ablations: a recipe with one thing changed, each a row of data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from polarguide.recipes.polarguide import RECIPE_POLARGUIDE
+from polarguide.training.stages import Recipe, Weights
+
+
+def varied(
+    base: Recipe,
+    name: str,
+    about: str,
+    *,
+    weights: dict[str, float] | None = None,
+    priors: dict[str, Any] | None = None,
+    refresh: bool = True,
+    **fields: Any,
+) -> Recipe:
+    """A recipe named ``base:name`` that differs from ``base`` in what is given.
+
+    Args:
+        weights: new values in every stage that has polarization terms.
+        priors: new values of its ``Priors``.
+        refresh: False: priors are computed once, when they are first needed.
+        fields: new values of the recipe itself.
+    """
+
+    def weights_of(old: Weights) -> Weights:
+        return replace(old, **(weights or {})) if old.priors else old
+
+    stages = tuple(
+        replace(
+            stage,
+            weights=weights_of(stage.weights),
+            repeats=stage.repeats
+            if refresh
+            else tuple(r for r in stage.repeats if r.action != "refresh_priors"),
+            on_enter=stage.on_enter if refresh else tuple(a for a in stage.on_enter if a != "refresh_priors"),
+        )
+        for stage in base.stages
+    )
+    changed = replace(base.priors, **(priors or {}))
+    return replace(base, name=f"{base.name}:{name}", about=about, stages=stages, priors=changed, **fields)
+
+
+_NORMAL_TERMS_OFF = {"normal": 0.0, "azimuth": 0.0, "chromatic": 0.0, "agreement": 0.0}
+
+ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
+    varied(
+        RECIPE_POLARGUIDE,
+        "only-normals",
+        "Polarization normals alone: no term on the separated layers.",
+        weights={"specular": 0.0, "diffuse": 0.0},
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "without-normals",
+        "Separated layers alone: no term on the normals.",
+        weights=_NORMAL_TERMS_OFF,
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "paper-candidates",
+        "The paper's four candidates in place of the six that physics allows.",
+        priors={"candidates": "paper"},
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "paper-separation",
+        "The paper's separation cue in place of the exact solution.",
+        priors={"separation": "paper"},
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "without-azimuth-weighting",
+        "Zenith trusted like azimuth, in the choice and in the term.",
+        weights={"azimuth": 0.0, "normal": 0.15},
+        priors={"azimuth_weight": 0.0},
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "without-refresh",
+        "Priors computed once, not again as the Gaussians improve.",
+        refresh=False,
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "without-mask",
+        "Every pixel's polarization counts fully, however weak and noisy.",
+        priors={"threshold": 0.0, "full_dolp": 1e-6, "snr": 0.0},
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "without-colour",
+        "Nothing is read from the polarization of colour differences.",
+        weights={"chromatic": 0.0},
+        priors={"chromatic": False},
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "without-agreement",
+        "The normals that a pixel blends need not agree.",
+        weights={"agreement": 0.0},
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
+        "without-flatness",
+        "Gaussians need not be flat.",
+        weights={"flatness": 0.0},
+    ),
+)
