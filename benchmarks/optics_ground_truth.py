@@ -134,7 +134,28 @@ def score(view: View, index: float) -> dict[str, float]:
         error = angle(optics.disambiguate(candidates, view.normals).normal, view.normals)[pixels]
         result[f"best of {label}, mean"] = float(error.mean())
         result[f"best of {label}, median"] = float(error.median())
-    return result
+    return result | colour_scores(view, true_zenith, index)
+
+
+def colour_scores(view: View, true_zenith: Tensor, index: float) -> dict[str, float]:
+    """How often and how well the polarization of colour differences tells the normal.
+
+    The half turn that it leaves open is resolved by the true normal, as in the other rows.
+    """
+    told = optics.chromatic_normals(view.stokes, index)
+    where = view.mask & told.decided
+    turn = fold(told.azimuth - optics.azimuth(view.normals, view.rays), math.pi)
+    two = torch.stack(
+        [optics.normal_from_angles(told.zenith, told.azimuth + t, view.rays) for t in (0.0, math.pi)], dim=-2
+    )
+    error = angle(optics.disambiguate(two, view.normals).normal, view.normals)[where]
+    wrong = (turn > 45) & where & (true_zenith > math.radians(15))
+    return {
+        "colour: share of mask decided, percent": 100 * float(where.sum() / view.mask.sum()),
+        "colour: of those the wrong lobe, percent": 100 * float(wrong.sum() / where.sum()),
+        "colour: normal error, mean": float(error.mean()),
+        "colour: normal error, median": float(error.median()),
+    }
 
 
 def main() -> None:

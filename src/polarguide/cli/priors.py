@@ -16,7 +16,7 @@ from polarguide.capture import View
 from polarguide.cli.common import OpenRun, Transfer, console, open_run, read_scene, select_views, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import figures
-from polarguide.training.priors import guide_normals
+from polarguide.training.priors import facing_chromatic, guide_normals
 
 Picture = NDArray[np.uint8]
 SHEET_VIEWS = 8
@@ -37,7 +37,8 @@ def priors(
 ) -> None:
     """Pictures of what polarization says about a scene, before or after training.
 
-    S0, DoLP, AoLP, zenith, both separations, polarization normals and the mask of usable pixels. The exact separation
+    S0, DoLP, AoLP, zenith, both separations, polarization normals, those that colour differences tell (grey where they
+    decide nothing), and the mask of usable pixels. The exact separation
     needs normals: those of a trained run with --run, else the polarization normals themselves, with their ambiguity
     resolved only by the surface facing the camera (a rough guess, and named so in the file).
 
@@ -95,6 +96,8 @@ def prior_pictures(view: View, opened: OpenRun | None, index: float, threshold: 
     )
     candidates = optics.physical_candidates(luminance, rays, index)
     normal = optics.disambiguate(candidates, guide, rays, azimuth_weight=0.5).normal
+    good = ~(view.invalid | view.saturated)
+    chromatic, certain = facing_chromatic(stokes, guide, rays, index, good)
     paper = optics.paper_separation(stokes, zenith, index)
     exact = optics.exact_separation(stokes, guide, rays, index)
     degrees = torch.rad2deg(zenith)
@@ -109,6 +112,9 @@ def prior_pictures(view: View, opened: OpenRun | None, index: float, threshold: 
         f"diffuse_exact_{source}": figures.radiance_to_rgb(exact.diffuse / 2),
         f"normal_{source}": figures.normal_to_rgb(
             view.camera.to_world(normal * mask[..., None]), view.camera
+        ),
+        "normal_by_colour": figures.normal_to_rgb(
+            view.camera.to_world(chromatic * (certain[..., None] > 0)), view.camera
         ),
         "mask": figures.scalar_to_rgb(mask.float(), 0.0, 1.0),
     }

@@ -5,12 +5,18 @@ from __future__ import annotations
 from polarguide.errors import PolarguideError
 from polarguide.recipes.ablations import ABLATIONS_POLARGUIDE
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
-from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER
+from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
 from polarguide.training.stages import Recipe
 
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
-    for recipe in (RECIPE_3DGS, RECIPE_3DGS_DR, RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER)
+    for recipe in (
+        RECIPE_3DGS,
+        RECIPE_3DGS_DR,
+        RECIPE_POLARGUIDE_PAPER,
+        RECIPE_POLARGUIDE,
+        RECIPE_POLARGUIDE_STOKES,
+    )
 }
 ABLATIONS: dict[str, tuple[Recipe, ...]] = {"polarguide": ABLATIONS_POLARGUIDE}
 """Variations of a recipe by its name, each with one thing changed, named ``recipe:variation``."""

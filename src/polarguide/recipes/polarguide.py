@@ -46,6 +46,21 @@ RECIPE_POLARGUIDE: Recipe = replace(
     priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0, snr=3.0, chromatic=True),
 )
 
+RECIPE_POLARGUIDE_STOKES: Recipe = replace(
+    RECIPE_POLARGUIDE,
+    name="polarguide-stokes",
+    about="Renders the measurement: S1 and S2 of Fresnel-weighted layers, with local reflections.",
+    stages=_stages(
+        Weights(stokes=1.0, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
+        Weights(stokes=1.0, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
+    ),
+    blend="fresnel",
+    local=True,
+    first_strength=0.5,
+    environment_spread=0.2,
+    rates={**RECIPE_3DGS_DR.rates, "local_dc": 2.5e-3, "local_rest": 2.5e-3 / 20},
+)
+
 RECIPE_POLARGUIDE_PAPER: Recipe = replace(
     RECIPE_POLARGUIDE,
     name="polarguide-paper",

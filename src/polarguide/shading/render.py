@@ -36,6 +36,19 @@ def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
     return (sh + 0.5).clamp(min=0)
 
 
+def local_light(rows: Rows, normals: Tensor, centre: Tensor, sh_degree: int) -> Tensor:
+    """Light [N, 3] that each Gaussian adds along the camera's ray mirrored at its own normal; can be negative.
+
+    Args:
+        rows: with ``local_dc`` and ``local_rest``, harmonics of the mirrored direction.
+        normals: [N, 3] unit. centre: [3] of the camera. sh_degree: as for the base colour.
+    """
+    with torch.no_grad():
+        directions = mirrored(unit(rows["means"] - centre), normals)
+    origin = torch.zeros_like(centre)
+    return evaluate_sh(directions, origin, rows["local_dc"], rows["local_rest"], sh_degree)
+
+
 def mirrored(rays: Tensor, normals: Tensor) -> Tensor:
     """Directions of rays [..., 3] after reflection at unit normals [..., 3]."""
     return rays - 2 * dot(rays, normals)[..., None] * normals
@@ -50,10 +63,13 @@ class Shading:
             "fresnel": final = base + r F(i) exp(environment), with F the unpolarized power reflectance of a
             dielectric at the angle between ray and normal, so that strength can be a property of the surface.
         index: refractive index of F.
+        local: whether Gaussians add light of their own to the environment's, a function of the mirrored direction:
+            what stands near, and what the far environment cannot say.
     """
 
     blend: Blend = "lerp"
     index: float = 1.5
+    local: bool = False
 
     def light(self, texels: Tensor) -> Tensor:
         """Radiance of raw texel values."""
@@ -78,12 +94,19 @@ SHADING_3DGS_DR = Shading()
 
 
 def reflect(
-    base: Tensor, normal: Tensor, strength: Tensor, environment: Tensor, camera: Camera, shading: Shading
+    base: Tensor,
+    normal: Tensor,
+    strength: Tensor,
+    environment: Tensor,
+    camera: Camera,
+    shading: Shading,
+    local: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Deferred reflection per pixel.
 
     Args:
         base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
+        local: [H, W, 3] blended light of the Gaussians' own, added to the environment's.
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
@@ -92,6 +115,8 @@ def reflect(
     facing = unit(normal, 1e-3)
     directions = mirrored(rays, facing)
     light = shading.light(cubemap_lookup(environment, directions.reshape(-1, 3)).reshape(base.shape))
+    if local is not None:
+        light = (light + local).clamp(min=0)
     cosine = -dot(rays, facing)[..., None].clamp(-1, 0)
     specular, diffuse = shading.layers(base, strength[..., None], light, cosine)
     return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": light}
@@ -123,9 +148,12 @@ def render(
     centre = camera.centre.to(rows["means"])
     channels = [base_colours(rows, centre, sh_degree)]
     if normals or environment is not None:
-        channels.append(shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], centre))
-    if environment is not None:
-        channels.append(torch.sigmoid(rows["strength_logits"])[:, None])
+        axes = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], centre)
+        channels.append(axes)
+        if environment is not None:
+            channels.append(torch.sigmoid(rows["strength_logits"])[:, None])
+            if shading.local:
+                channels.append(local_light(rows, axes, centre, sh_degree))
     if depth:
         axis = camera.rotation[2].to(rows["means"])
         channels.append(((rows["means"] - centre) @ axis)[:, None])
@@ -143,7 +171,8 @@ def render(
     strength = picture.features[..., 6] if environment is not None else None
     layers = {"final": base}
     if environment is not None and normal is not None and strength is not None:
-        layers = reflect(base, normal, strength, environment, camera, shading)
+        local = picture.features[..., 7:10] if shading.local else None
+        layers = reflect(base, normal, strength, environment, camera, shading, local)
     return RenderResult(
         final=layers["final"],
         specular=layers.get("specular"),

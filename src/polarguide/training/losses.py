@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from polarguide import optics
 from polarguide.errors import PolarguideError
 from polarguide.shading.result import RenderResult
 from polarguide.training.photometric import photometric_loss
@@ -55,6 +56,31 @@ def agreement_loss(normal: Tensor, alpha: Tensor, weight: Tensor) -> Tensor:
     return (weight * (alpha.detach() - length).clamp(min=0)).mean()
 
 
+def stokes_loss(result: RenderResult, priors: ViewPriors, index: float) -> Tensor:
+    """Mean distance of the predicted S1 and S2 from the measured ones, over the square root of S0.
+
+    The prediction is Fresnel's for the rendered layers and the rendered normal, so that one explanation of
+    geometry and layers has to fit the polarization of all views. The variance of S1 and S2 grows with S0 where light
+    itself is the noise; the root evens that out.
+
+    Args:
+        result: with both layers and the normal.
+    """
+    assert result.specular is not None
+    assert result.diffuse is not None
+    assert result.normal is not None
+    predicted = optics.predicted_stokes(
+        2 * result.specular,
+        2 * result.diffuse,
+        priors.camera.to_camera(result.normal),
+        priors.camera.rays(),
+        index,
+    )
+    distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))
+    scale = (priors.stokes[0].mean(dim=-1) + 0.01).rsqrt()
+    return (priors.reliable * scale * distance).mean()
+
+
 def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
     """Mean shortest scale of the visible Gaussians in percent of the scene's extent.
 
@@ -74,6 +100,7 @@ def step_loss(
     priors: ViewPriors | None,
     *,
     ssim_weight: float,
+    index: float,
     log_scales: Tensor,
     extent: float,
 ) -> tuple[Tensor, Tensor]:
@@ -86,12 +113,15 @@ def step_loss(
         weights: of the stage.
         priors: of the view; needed where a weight asks for them.
         ssim_weight: lambda of the image terms.
+        index: refractive index.
         log_scales: [N, 3] of the Gaussians. extent: of the scene.
     """
     photometric = photometric_loss(result.final, shown, valid, ssim_weight)
     total = weights.photometric * photometric
     if priors is not None:
         total = total + _prior_terms(result, weights, priors, ssim_weight)
+        if weights.stokes and result.specular is not None:
+            total = total + weights.stokes * stokes_loss(result, priors, index)
     if weights.flatness:
         total = total + weights.flatness * flatness_loss(log_scales, result.radii, extent)
     if not torch.isfinite(total):

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
+from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.shading.display import srgb_encode
 from polarguide.training.stages import Priors
@@ -37,6 +38,9 @@ class ViewPriors:
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
         chromatic: [H, W, 3] normal that the polarization of colour differences tells, world axes.
         chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
+        camera: of the view.
+        stokes: [3, H, W, 3] as measured.
+        reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or clips.
     """
 
     specular: Tensor
@@ -47,6 +51,9 @@ class ViewPriors:
     weight: Tensor
     chromatic: Tensor
     chromatic_weight: Tensor
+    camera: Camera
+    stokes: Tensor
+    reliable: Tensor
 
 
 def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,7 +92,9 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
     )
     nearest_to = guide
     if settings.chromatic:
-        chromatic, chromatic_weight = _chromatic(stokes, guide, rays, index, ~(view.invalid | view.saturated))
+        chromatic, chromatic_weight = facing_chromatic(
+            stokes, guide, rays, index, ~(view.invalid | view.saturated)
+        )
         chromatic_weight = chromatic_weight * known
         nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
     make = optics.paper_candidates if settings.candidates == "paper" else optics.physical_candidates
@@ -118,13 +127,24 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
         weight=weight,
         chromatic=view.camera.to_world(chromatic),
         chromatic_weight=chromatic_weight,
+        camera=view.camera,
+        stokes=stokes,
+        reliable=(~(view.invalid | view.saturated)).float(),
     )
 
 
-def _chromatic(
+def facing_chromatic(
     stokes: Tensor, guide: Tensor, rays: Tensor, index: float, good: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Normals of the colour differences on the guide's side [H, W, 3], and their weights [H, W]."""
+    """Normals of the colour differences on the guide's side of each ray, and their weights.
+
+    Args:
+        stokes: [3, H, W, 3]. guide: [H, W, 3] camera axes. rays: [H, W, 3]. index: refractive index.
+        good: [H, W] bool, pixels whose measurement counts.
+
+    Returns:
+        [H, W, 3] unit, camera axes; [H, W] in [0, 1], 0 where colour decides nothing.
+    """
     told = optics.chromatic_normals(stokes, index)
     normal = optics.normal_from_angles(told.zenith, told.azimuth, rays)
     mirrored = optics.normal_from_angles(told.zenith, told.azimuth + torch.pi, rays)

@@ -46,6 +46,7 @@ class Weights:
         normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
         azimuth: distance of the normal from the plane of incidence that the AoLP names (azimuth alone).
         chromatic: 1 - cosine with the normal that colour differences tell, where they do.
+        stokes: S1 and S2 that the layers and the normal predict against the measured ones.
         agreement: how far the normals that a pixel blends disagree, where polarization says something.
         flatness: shortest scale of the Gaussians, in percent of the scene's extent.
     """
@@ -56,18 +57,19 @@ class Weights:
     normal: float = 0.0
     azimuth: float = 0.0
     chromatic: float = 0.0
+    stokes: float = 0.0
     agreement: float = 0.0
     flatness: float = 0.0
 
     @property
     def priors(self) -> bool:
         """Whether a term compares with the priors of a view."""
-        return any((self.specular, self.diffuse, self.normals))
+        return any((self.specular, self.diffuse, self.stokes, self.normals))
 
     @property
     def normals(self) -> bool:
         """Whether a term looks at the rendered normals."""
-        return any((self.normal, self.azimuth, self.chromatic, self.agreement))
+        return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.agreement))
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,7 @@ class Recipe:
         rates: learning rates; that of the means is times the scene's extent.
         means_decay: factor on the means' rate at the last step (exponential in between).
         blend: how base colour and reflection make the picture (see ``Shading``).
+        local: whether Gaussians add reflected light of their own (see ``Shading``).
         first_strength: reflection strength that Gaussians start with.
         environment_spread: first raw texels are uniform in plus or minus this.
         environment_rate: learning rate of the environment's texels.
@@ -159,6 +162,7 @@ class Recipe:
     rates: dict[str, float]
     means_decay: float = 0.01
     blend: Blend = "lerp"
+    local: bool = False
     first_strength: float = 1e-3
     environment_spread: float = 5.0
     environment_rate: float = 0.05
@@ -172,7 +176,7 @@ class Recipe:
 
     def shading(self, index: float) -> Shading:
         """The shading of this recipe for surfaces of a refractive index."""
-        return Shading(self.blend, index)
+        return Shading(self.blend, index, self.local)
 
     @property
     def reflects(self) -> bool:

@@ -66,6 +66,9 @@ def first_state(scene: Scene, recipe: Recipe, settings: TrainSettings) -> Traini
     if recipe.reflects:
         logit = torch.logit(torch.tensor(recipe.first_strength))
         tensors["strength_logits"] = logit.expand(count).clone()
+        if recipe.local:
+            tensors["local_dc"] = torch.zeros(count, 3)
+            tensors["local_rest"] = torch.zeros(count, 15, 3)
         size = (6, recipe.environment_resolution, recipe.environment_resolution, 3)
         uniform = torch.rand(size, generator=_seeded(settings.seed, 1)) * 2 - 1
         environment = Environment(uniform * recipe.environment_spread, recipe.environment_rate)
@@ -136,6 +139,7 @@ class Trainer:
             stage.weights,
             self._priors_of(view, stage),
             ssim_weight=recipe.ssim_weight,
+            index=self.settings.refractive_index,
             log_scales=state.rows["log_scales"],
             extent=self._extent,
         )
