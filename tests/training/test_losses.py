@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from polarguide import optics
+from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.shading.display import srgb_encode
 from polarguide.shading.result import RenderResult
@@ -20,6 +22,7 @@ from polarguide.training.losses import (
     flatness_loss,
     normal_loss,
     step_loss,
+    stokes_loss,
 )
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
@@ -31,6 +34,18 @@ SCALES = torch.tensor([[-3.0, -2.0, -1.0], [-1.0, -4.0, -2.0], [0.0, 0.0, -5.0]]
 
 def unit(seed: int) -> Tensor:
     return normalize(torch.randn(*SIZE, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
+
+
+CAMERA = Camera(
+    SIZE[1],
+    SIZE[0],
+    20.0,
+    20.0,
+    7.0,
+    6.0,
+    torch.eye(3, dtype=torch.float64),
+    torch.zeros(3, dtype=torch.float64),
+)
 
 
 def picture(seed: int) -> Tensor:
@@ -51,7 +66,21 @@ def priors() -> ViewPriors:
         weight,
         normal,
         weight.square(),
+        CAMERA,
+        measured(1.0),
+        torch.ones(SIZE),
     )
+
+
+LAYERS = (picture(20), picture(21))
+FACING = normalize(unit(22) - 1.5 * CAMERA.world_rays(), dim=-1)
+
+
+def measured(index_shift: float) -> Tensor:
+    """What a camera measures of two known layers on a surface with known normals."""
+    specular, diffuse = LAYERS
+    normal = CAMERA.to_camera(FACING)
+    return optics.predicted_stokes(2 * specular, 2 * diffuse, normal, CAMERA.rays(), 0.5 + index_shift)
 
 
 def result(**layers: Tensor | None) -> RenderResult:
@@ -129,6 +158,39 @@ def test_agreement_loss_is_what_scatter_takes_from_the_length() -> None:
     assert float(agreement_loss(after.mean(dim=0), torch.ones(SIZE), weight)) < float(before.detach())
 
 
+def test_stokes_loss_is_zero_for_the_layers_and_normals_that_were_measured(priors: ViewPriors) -> None:
+    rendered = result(specular=LAYERS[0], diffuse=LAYERS[1], normal=0.7 * FACING)
+    assert float(stokes_loss(rendered, priors, 1.5)) == pytest.approx(0.0, abs=1e-6)
+    assert float(stokes_loss(rendered, priors, 1.4)) > 1e-3
+    swapped = result(specular=LAYERS[1], diffuse=LAYERS[0], normal=FACING)
+    assert float(stokes_loss(swapped, priors, 1.5)) > 1e-2
+    nothing = replace(priors, reliable=torch.zeros(SIZE))
+    assert float(stokes_loss(swapped, nothing, 1.5)) == 0
+
+
+def test_stokes_loss_turns_a_normal_to_the_one_that_was_measured(priors: ViewPriors) -> None:
+    start = normalize(FACING + 0.2 * unit(23), dim=-1)
+    normal = start.clone().requires_grad_()
+    optimiser = torch.optim.Adam([normal], lr=0.01)
+    for _ in range(300):
+        optimiser.zero_grad()
+        stokes_loss(result(specular=LAYERS[0], diffuse=LAYERS[1], normal=normal), priors, 1.5).backward()
+        optimiser.step()
+    before = (start * FACING).sum(-1).clamp(-1, 1).acos().mean()
+    after = (normalize(normal.detach(), dim=-1) * FACING).sum(-1).clamp(-1, 1).acos().mean()
+    assert float(after) < 0.3 * float(before)
+
+
+def test_stokes_loss_is_finite_where_there_is_no_light_and_no_normal(priors: ViewPriors) -> None:
+    dark = replace(priors, stokes=torch.zeros(3, *SIZE, 3))
+    layers = [torch.zeros(*SIZE, 3, requires_grad=True) for _ in range(3)]
+    rendered = result(specular=layers[0], diffuse=layers[1], normal=layers[2])
+    stokes_loss(rendered, dark, 1.5).backward()
+    for layer in layers:
+        assert layer.grad is not None
+        assert bool(torch.isfinite(layer.grad).all())
+
+
 def test_flatness_is_the_shortest_scale_of_what_is_visible() -> None:
     radii = torch.tensor([4.0, 0.0, 1.0])
     expected = 100 / 2 * (math.exp(-3) + math.exp(-5)) / 2
@@ -149,9 +211,10 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         chromatic=0.6,
         agreement=0.8,
         flatness=0.9,
+        stokes=1.1,
     )
     total, photometric = step_loss(
-        rendered, shown, valid, weights, priors, ssim_weight=0.3, log_scales=SCALES, extent=2.0
+        rendered, shown, valid, weights, priors, ssim_weight=0.3, index=1.5, log_scales=SCALES, extent=2.0
     )
     assert rendered.specular is not None
     assert rendered.diffuse is not None
@@ -166,6 +229,7 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         + 0.6 * chromatic_loss(rendered.normal, priors)
         + 0.8 * agreement_loss(rendered.normal, rendered.alpha, priors.weight)
         + 0.9 * flatness_loss(SCALES, rendered.radii, 2.0)
+        + 1.1 * stokes_loss(rendered, priors, 1.5)
     )
     assert float(total) == pytest.approx(float(expected), rel=1e-5)
     assert float(photometric) == pytest.approx(float(expected_photometric), rel=1e-6)
@@ -182,6 +246,7 @@ def test_a_perfect_picture_costs_nothing(priors: ViewPriors) -> None:
         weights,
         priors,
         ssim_weight=0.2,
+        index=1.5,
         log_scales=SCALES,
         extent=2.0,
     )
@@ -192,11 +257,19 @@ def test_layers_that_a_recipe_lacks_are_left_out(priors: ViewPriors) -> None:
     weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
     shown = srgb_encode(picture(6))
     total, photometric = step_loss(
-        result(), shown, None, weights, priors, ssim_weight=0.2, log_scales=SCALES, extent=2.0
+        result(), shown, None, weights, priors, ssim_weight=0.2, index=1.5, log_scales=SCALES, extent=2.0
     )
     assert torch.equal(total, photometric)
     total, photometric = step_loss(
-        result(normal=unit(1)), shown, None, weights, None, ssim_weight=0.2, log_scales=SCALES, extent=2.0
+        result(normal=unit(1)),
+        shown,
+        None,
+        weights,
+        None,
+        ssim_weight=0.2,
+        index=1.5,
+        log_scales=SCALES,
+        extent=2.0,
     )
     assert torch.equal(total, photometric)
 
@@ -211,6 +284,7 @@ def test_a_loss_that_is_not_finite_is_an_error(priors: ViewPriors) -> None:
             Weights(normal=0.1),
             priors,
             ssim_weight=0.2,
+            index=1.5,
             log_scales=SCALES,
             extent=2.0,
         )
