@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from polarguide.gaussians.densify import Densification, DensityStatistics, densify
+from polarguide.gaussians.free_space import FreeSpace
 from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.gaussians.rows import CORE_ROWS, GaussianRows
 
@@ -42,6 +43,7 @@ def round_of(
     *,
     prune_large: bool = False,
     limit: int = 100_000,
+    empty: FreeSpace | None = None,
     seed: int = 1,
 ) -> None:
     densify(
@@ -52,6 +54,7 @@ def round_of(
         middle=torch.zeros(3),
         prune_large=prune_large,
         limit=limit,
+        empty=empty,
         generator=torch.Generator().manual_seed(seed),
     )
 
@@ -136,6 +139,14 @@ def test_the_limit_is_kept_by_those_that_pull_hardest(size: float) -> None:
     round_of(rows, pulled([2.0, 5.0, 3.0, 9.0, 0.5, 4.0]), settings, limit=8)
     assert len(rows) == 8
     assert counted(rows, before) == [1, 2, 1, 2, 1, 1]
+
+
+def test_what_lies_in_free_space_is_pruned() -> None:
+    rows = rows_of([SMALL] * 4)
+    before = rows.snapshot()
+    near = before["means"][1:2] + 0.01
+    round_of(rows, pulled([0.0] * 4), empty=FreeSpace(near, torch.tensor([0.1])))
+    assert counted(rows, before) == [1, 0, 1, 1]
 
 
 def test_at_the_limit_nothing_is_added() -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from polarguide.gaussians.free_space import FreeSpace
 from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.gaussians.rows import GaussianRows
 
@@ -67,6 +68,7 @@ def densify(
     extent: float,
     middle: Tensor,
     prune_large: bool,
+    empty: FreeSpace | None = None,
     limit: int,
     generator: torch.Generator,
 ) -> None:
@@ -75,6 +77,7 @@ def densify(
     Args:
         extent: the scene's extent (``scene_extent``). middle: [3], the cameras' mean position.
         prune_large: also prune the huge ones (after the first opacity reset).
+        empty: where Gaussians are pruned, too.
         limit: no more Gaussians than this.
         generator: draws the positions of the split ones' children.
     """
@@ -93,6 +96,8 @@ def densify(
     rows.keep(torch.cat((~split, torch.ones(added, dtype=torch.bool))))
     opacity = torch.sigmoid(rows["opacity_logits"])
     doomed = opacity < settings.minimum_opacity
+    if empty is not None:
+        doomed |= empty.holds(rows["means"].detach())
     if prune_large:
         distance = (rows["means"] - middle).norm(dim=1)
         allowed = settings.maximum_scale_share * torch.maximum(distance, torch.tensor(extent))

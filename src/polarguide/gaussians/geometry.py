@@ -6,6 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+# Cosine of the angle to the camera under which the outward side decides, not the camera.
+GRAZING = 0.35
+
 
 def quaternions_to_rotations(quats: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalised first."""
@@ -18,11 +21,17 @@ def quaternions_to_rotations(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in entries], dim=-2)
 
 
-def shortest_axis_normals(means: Tensor, quaternions: Tensor, log_scales: Tensor, centre: Tensor) -> Tensor:
-    """Unit normals of flat Gaussians: the axis of the smallest scale, turned to face the camera.
+def shortest_axis_normals(
+    means: Tensor, quaternions: Tensor, log_scales: Tensor, centre: Tensor, outward: Tensor | None = None
+) -> Tensor:
+    """Unit normals of flat Gaussians: the axis of the smallest scale, turned outward.
+
+    Without ``outward``, outward is towards the camera. At a silhouette that turns the Gaussians just beyond it over, so
+    that they cancel those just before it and the blended normal leans to the camera; with it they stay as they are.
 
     Args:
         means: [N, 3]. quaternions: [N, 4] (w, x, y, z), any length. log_scales: [N, 3]. centre: [3] camera centre.
+        outward: [N, 3] direction from which each is seen, which decides at grazing angles; zero where not known.
 
     Returns:
         [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
@@ -32,5 +41,11 @@ def shortest_axis_normals(means: Tensor, quaternions: Tensor, log_scales: Tensor
     w, u = q[:, :1], q[:, 1:]
     cross = torch.linalg.cross(u, axis)
     normals = axis + 2 * (w * cross + torch.linalg.cross(u, cross))
-    facing = ((centre.to(means) - means.detach()) * normals.detach()).sum(dim=-1, keepdim=True)
+    facing = (normalize(centre.to(means) - means.detach(), dim=-1) * normals.detach()).sum(
+        dim=-1, keepdim=True
+    )
+    if outward is not None:
+        side = (outward.detach() * normals.detach()).sum(dim=-1, keepdim=True)
+        # An opaque surface does not face away from a camera that sees it by more than its Gaussians' width.
+        facing = torch.where((facing.abs() < GRAZING) & (side != 0), side, facing)
     return torch.where(facing >= 0, normals, -normals)

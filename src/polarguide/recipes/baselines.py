@@ -38,7 +38,8 @@ RECIPE_3DGS_DR = Recipe(
     stages=(
         Stage("plain", 0.1, reflection=False, densify=True),
         Stage("propagate", 0.3, reflection=True, densify=True, repeats=(RESET_DR, PROPAGATE)),
-        Stage("densify", 0.1, reflection=True, densify=True),
+        # The release resets after the last propagation, too: what no view needs must not stay as opaque as it left it.
+        Stage("densify", 0.1, reflection=True, densify=True, on_enter=("reset_opacity",)),
         Stage("refine", 0.5, reflection=True),
     ),
     rates=RATES_REFLECTION,

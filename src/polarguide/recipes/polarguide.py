@@ -9,15 +9,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
-from polarguide.training.stages import Priors, Recipe, Repeat, Stage, Weights
+from polarguide.training.stages import Action, Priors, Recipe, Repeat, Stage, Weights
 
 REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)
 
 _PLAIN = Stage("plain", 0.1, reflection=False, densify=True)
 
 
-def _stages(guided: Weights, final: Weights) -> tuple[Stage, ...]:
+def _stages(guided: Weights, final: Weights, *, oriented: bool = False) -> tuple[Stage, ...]:
     """The paper's three stages; the guided one first with, then without density control."""
+    enter: tuple[Action, ...] = ("refresh_priors",)
+    orient: tuple[Action, ...] = ("orient_normals",) if oriented else ()
     return (
         _PLAIN,
         Stage(
@@ -27,10 +29,10 @@ def _stages(guided: Weights, final: Weights) -> tuple[Stage, ...]:
             weights=guided,
             densify=True,
             repeats=(REFRESH,),
-            on_enter=("refresh_priors",),
+            on_enter=enter,
         ),
         Stage("guided", 0.35, reflection=True, weights=guided, repeats=(REFRESH,)),
-        Stage("final", 0.15, reflection=True, weights=final, on_enter=("refresh_priors",)),
+        Stage("final", 0.15, reflection=True, weights=final, on_enter=orient + enter),
     )
 
 
@@ -51,9 +53,13 @@ RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     name="polarguide-stokes",
     about="Renders the measurement: S1 and S2 of Fresnel-weighted layers, with local reflections.",
     stages=_stages(
+        Weights(
+            stokes=1.0, specular=0.25, diffuse=0.1, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1
+        ),
         Weights(stokes=1.0, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
-        Weights(stokes=1.0, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
+        oriented=True,
     ),
+    oriented=True,
     blend="fresnel",
     local=True,
     first_strength=0.5,

@@ -137,7 +137,8 @@ def render(
     """Render one view.
 
     Args:
-        rows: the Gaussians; with ``strength_logits`` when there is an environment.
+        rows: the Gaussians; with ``strength_logits`` when there is an environment; with ``outward`` where normals
+            are turned to where they are seen from, not to the camera.
         sh_degree: SH degree of the base colour, 0 to 3.
         environment: [6, R, R, 3] raw texels of the learned environment; None: no reflection.
         shading: how base colour and reflection are combined.
@@ -148,7 +149,8 @@ def render(
     centre = camera.centre.to(rows["means"])
     channels = [base_colours(rows, centre, sh_degree)]
     if normals or environment is not None:
-        axes = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], centre)
+        outward = rows["outward"] if "outward" in rows else None  # noqa: SIM401
+        axes = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], centre, outward)
         channels.append(axes)
         if environment is not None:
             channels.append(torch.sigmoid(rows["strength_logits"])[:, None])

@@ -16,6 +16,7 @@ Action = Literal[
     "reset_opacity",
     "propagate_normals",
     "refresh_priors",
+    "orient_normals",
 ]
 Candidates = Literal["paper", "physical"]
 Separation = Literal["paper", "exact"]
@@ -147,6 +148,7 @@ class Recipe:
         rates: learning rates; that of the means is times the scene's extent.
         means_decay: factor on the means' rate at the last step (exponential in between).
         blend: how base colour and reflection make the picture (see ``Shading``).
+        oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         local: whether Gaussians add reflected light of their own (see ``Shading``).
         first_strength: reflection strength that Gaussians start with.
         environment_spread: first raw texels are uniform in plus or minus this.
@@ -163,6 +165,7 @@ class Recipe:
     means_decay: float = 0.01
     blend: Blend = "lerp"
     local: bool = False
+    oriented: bool = False
     first_strength: float = 1e-3
     environment_spread: float = 5.0
     environment_rate: float = 0.05

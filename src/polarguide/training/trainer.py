@@ -10,6 +10,7 @@ from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.gaussians.densify import DensityStatistics, densify
+from polarguide.gaussians.free_space import free_space
 from polarguide.gaussians.initialise import initial_rows, scene_extent
 from polarguide.gaussians.rows import GaussianRows
 from polarguide.raster import Backend, ScreenStatistic
@@ -17,6 +18,7 @@ from polarguide.shading.display import srgb_decode, srgb_encode
 from polarguide.shading.render import COLOUR_CHANNELS, render
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.losses import step_loss
+from polarguide.training.orientation import outward_directions
 from polarguide.training.priors import ViewPriors, view_priors
 from polarguide.training.stages import Action, Recipe, Schedule, Stage
 from polarguide.training.state import Environment, TrainingState
@@ -63,6 +65,8 @@ def first_state(scene: Scene, recipe: Recipe, settings: TrainSettings) -> Traini
     tensors = initial_rows(scene.points, colours, centres, recipe.initialisation, seed=settings.seed)
     count = tensors["means"].shape[0]
     environment = None
+    if recipe.oriented:
+        tensors["outward"] = torch.zeros(count, 3)
     if recipe.reflects:
         logit = torch.logit(torch.tensor(recipe.first_strength))
         tensors["strength_logits"] = logit.expand(count).clone()
@@ -103,6 +107,7 @@ class Trainer:
         self._middle = centres.mean(dim=0).float()
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self._limit = int(pixels / recipe.densification.pixels_each)
+        self._empty = free_space(scene.points, [view.camera for view in scene.train_views])
         self._shown: dict[str, Tensor] = {}
         self._priors: dict[str, ViewPriors] = {}
 
@@ -158,6 +163,7 @@ class Trainer:
                 extent=self._extent,
                 middle=self._middle,
                 prune_large=state.opacity_was_reset,
+                empty=self._empty,
                 limit=self._limit,
                 generator=_seeded(self.settings.seed, 2, state.step),
             )
@@ -179,6 +185,9 @@ class Trainer:
             generator = _seeded(self.settings.seed, 3, self.state.step)
             rest = min(OPACITY_REST, self.settings.steps // 50)
             propagate_normals(self.state, self.recipe.propagation, generator, rest)
+        elif action == "orient_normals":
+            rows, rasterise = self.state.rows, self.backend.rasterise
+            rows.overwrite("outward", outward_directions(rows, self.scene.train_views, rasterise))
         else:
             self.state.frozen = self.state.rows.snapshot()
             self._priors.clear()

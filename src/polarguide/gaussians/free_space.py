@@ -1,0 +1,48 @@
+"""Where nothing can be: the space just in front of the cameras.
+
+A Gaussian close to one camera explains that one picture and stands in the way of every new view nearby. The points
+of the structure from motion say how near the nearest surface of a view is; well before it, there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from polarguide.camera import Camera
+
+# Share of the depth of a view's nearest points that is taken to be empty, and which points are its nearest.
+EMPTY_SHARE = 0.4
+NEAREST = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """Balls about the cameras.
+
+    Attributes:
+        centres: [V, 3]. radii: [V], 0 for a camera that sees no point.
+    """
+
+    centres: Tensor
+    radii: Tensor
+
+    def holds(self, means: Tensor) -> Tensor:
+        """Which of the positions [N, 3] lie in it, [N] bool."""
+        return (torch.cdist(means, self.centres) < self.radii).any(dim=1)
+
+
+def free_space(points: Tensor, cameras: Sequence[Camera]) -> FreeSpace:
+    """The space in front of the cameras that points [M, 3] leave free: see ``EMPTY_SHARE`` and ``NEAREST``."""
+    radii = []
+    for camera in cameras:
+        x, y, z = camera.to_camera(points.double() - camera.centre).unbind(-1)
+        column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        depths = z[inside]
+        radii.append(EMPTY_SHARE * float(torch.quantile(depths, NEAREST)) if len(depths) else 0.0)
+    centres = torch.stack([camera.centre for camera in cameras]).float()
+    return FreeSpace(centres, torch.tensor(radii))
