@@ -10,6 +10,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from polarguide.camera import Camera
+from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
+from polarguide.gaussians.spherical_harmonics import SH_C0, sh_basis
 from polarguide.raster import Rasterise, ScreenStatistic, rasterise_reference
 from polarguide.raster.cpu import rasterise_cpu
 from polarguide.shading.render import (
@@ -17,6 +19,7 @@ from polarguide.shading.render import (
     MAXIMUM_LOG_LIGHT,
     Shading,
     base_colours,
+    local_light,
     mirrored,
     reflect,
     render,
@@ -233,3 +236,60 @@ def test_native_and_twin_render_the_same_with_gradients(rows: dict[str, Tensor],
         assert found is not None
         assert expected is not None
         assert float((found.double() - expected).norm()) < 1e-3 * float(expected.norm()), name
+
+
+LOCAL = Shading("fresnel", 1.5, local=True)
+
+
+def test_local_light_that_is_nothing_changes_nothing(rows: dict[str, Tensor]) -> None:
+    rows |= {"local_dc": torch.zeros(COUNT, 3), "local_rest": torch.zeros(COUNT, 15, 3)}
+    without = render(rows, camera(), rasterise_reference, environment=environment(), shading=FRESNEL)
+    with_it = render(rows, camera(), rasterise_reference, environment=environment(), shading=LOCAL)
+    torch.testing.assert_close(with_it.final, without.final)
+
+
+def test_local_light_adds_to_the_environments_before_fresnel(rows: dict[str, Tensor]) -> None:
+    """Of degree 0 it is a constant, blended by the weights that sum to alpha."""
+    rows |= {"local_dc": torch.full((COUNT, 3), 0.5 / SH_C0), "local_rest": torch.zeros(COUNT, 15, 3)}
+    without = render(rows, camera(), rasterise_reference, environment=environment(), shading=FRESNEL)
+    with_it = render(rows, camera(), rasterise_reference, environment=environment(), shading=LOCAL)
+    assert without.reflection is not None
+    assert with_it.reflection is not None
+    torch.testing.assert_close(with_it.reflection, without.reflection + 0.5 * without.alpha[..., None])
+    torch.testing.assert_close(with_it.base, without.base)
+
+
+def test_local_light_is_that_of_the_mirrored_direction(rows: dict[str, Tensor]) -> None:
+    generator = torch.Generator().manual_seed(3)
+    rows |= {
+        "local_dc": torch.randn(COUNT, 3, generator=generator),
+        "local_rest": torch.randn(COUNT, 15, 3, generator=generator),
+    }
+    rays, normals = (directions(seed)[:COUNT].float() for seed in (4, 5))
+    light = local_light(rows, normals, rays, 3)
+    basis = sh_basis(mirrored(rays, normals), 3)
+    coefficients = torch.cat((rows["local_dc"][:, None], rows["local_rest"]), dim=1)
+    torch.testing.assert_close(light, (basis[..., None] * coefficients).sum(1), atol=1e-5, rtol=1e-5)
+
+
+def test_normals_keep_their_outer_side_past_the_silhouette(rows: dict[str, Tensor]) -> None:
+    """A Gaussian that faces slightly away is turned over without its outer side, and stays with it."""
+    centre = camera().centre.float()
+    rows["outward"] = torch.zeros(COUNT, 3)
+    shape = (rows["means"], rows["quaternions"], rows["log_scales"], centre)
+    flipped = shortest_axis_normals(*shape)
+    torch.testing.assert_close(shortest_axis_normals(*shape, rows["outward"]), flipped)
+    cosine = (flipped * normalize(centre - rows["means"], dim=-1)).sum(-1)
+    outward = -flipped
+    kept = shortest_axis_normals(*shape, outward)
+    grazing = cosine < GRAZING
+    assert 3 < int(grazing.sum()) < COUNT
+    torch.testing.assert_close(kept[grazing], -flipped[grazing])
+    torch.testing.assert_close(kept[~grazing], flipped[~grazing])
+    rows["outward"] = outward
+    normal = render(rows, camera(), rasterise_reference, environment=environment(), shading=FRESNEL).normal
+    del rows["outward"]
+    other = render(rows, camera(), rasterise_reference, environment=environment(), shading=FRESNEL).normal
+    assert normal is not None
+    assert other is not None
+    assert not torch.allclose(normal, other)

@@ -12,7 +12,7 @@ from polarguide.gaussians.ply import refit_sh_to_display, write_ply
 from polarguide.gaussians.spherical_harmonics import evaluate_sh
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.display import srgb_encode
-from polarguide.shading.render import Shading, mirrored
+from polarguide.shading.render import Shading, local_light, mirrored
 from polarguide.training.run import atomic
 from polarguide.training.state import TrainingState
 
@@ -39,6 +39,9 @@ def shown_colours(state: TrainingState, shading: Shading, directions: Tensor) ->
             light = shading.light(
                 cubemap_lookup(state.environment.texels, mirrored(means, facing).contiguous())
             )
+            if shading.local:
+                own = local_light(rows, facing, means, 3)
+                light = (light + own).clamp(min=0)
             strength = torch.sigmoid(rows["strength_logits"])[:, None]
             cosine = -(means * facing).sum(dim=-1, keepdim=True).clamp(-1, 0)
             specular, diffuse = shading.layers(colour, strength, light, cosine)

@@ -36,16 +36,18 @@ def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
     return (sh + 0.5).clamp(min=0)
 
 
-def local_light(rows: Rows, normals: Tensor, centre: Tensor, sh_degree: int) -> Tensor:
-    """Light [N, 3] that each Gaussian adds along the camera's ray mirrored at its own normal; can be negative.
+def local_light(rows: Rows, normals: Tensor, rays: Tensor, sh_degree: int) -> Tensor:
+    """Light [N, 3] that each Gaussian adds along a ray mirrored at its own normal; can be negative.
 
     Args:
         rows: with ``local_dc`` and ``local_rest``, harmonics of the mirrored direction.
-        normals: [N, 3] unit. centre: [3] of the camera. sh_degree: as for the base colour.
+        normals: [N, 3] unit. rays: [N, 3] unit, from the camera to each. sh_degree: as for the base colour.
+
+    Returns:
+        [N, 3], differentiable in the harmonics alone.
     """
-    with torch.no_grad():
-        directions = mirrored(unit(rows["means"] - centre), normals)
-    origin = torch.zeros_like(centre)
+    directions = mirrored(rays, normals).detach()
+    origin = torch.zeros_like(directions[0])
     return evaluate_sh(directions, origin, rows["local_dc"], rows["local_rest"], sh_degree)
 
 
@@ -155,7 +157,8 @@ def render(
         if environment is not None:
             channels.append(torch.sigmoid(rows["strength_logits"])[:, None])
             if shading.local:
-                channels.append(local_light(rows, axes, centre, sh_degree))
+                rays = unit(rows["means"].detach() - centre)
+                channels.append(local_light(rows, axes, rays, sh_degree))
     if depth:
         axis = camera.rotation[2].to(rows["means"])
         channels.append(((rows["means"] - centre) @ axis)[:, None])
