@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from polarguide.errors import PolarguideError
-from polarguide.recipes.ablations import ABLATIONS_POLARGUIDE
+from polarguide.recipes.ablations import ABLATIONS_POLARGUIDE, ABLATIONS_STOKES
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
 from polarguide.training.stages import Recipe
@@ -18,7 +18,10 @@ RECIPES: dict[str, Recipe] = {
         RECIPE_POLARGUIDE_STOKES,
     )
 }
-ABLATIONS: dict[str, tuple[Recipe, ...]] = {"polarguide": ABLATIONS_POLARGUIDE}
+ABLATIONS: dict[str, tuple[Recipe, ...]] = {
+    "polarguide": ABLATIONS_POLARGUIDE,
+    "polarguide-stokes": ABLATIONS_STOKES,
+}
 """Variations of a recipe by its name, each with one thing changed, named ``recipe:variation``."""
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from polarguide.recipes.polarguide import RECIPE_POLARGUIDE
-from polarguide.training.stages import Recipe, Weights
+from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_STOKES
+from polarguide.training.stages import Action, Recipe, Weights
 
 
 def varied(
@@ -16,7 +16,7 @@ def varied(
     *,
     weights: dict[str, float] | None = None,
     priors: dict[str, Any] | None = None,
-    refresh: bool = True,
+    without: Action | None = None,
     **fields: Any,
 ) -> Recipe:
     """A recipe named ``base:name`` that differs from ``base`` in what is given.
@@ -24,7 +24,7 @@ def varied(
     Args:
         weights: new values in every stage that has polarization terms.
         priors: new values of its ``Priors``.
-        refresh: False: priors are computed once, when they are first needed.
+        without: an action that does not happen. (Priors are then computed once, when they are first needed.)
         fields: new values of the recipe itself.
     """
 
@@ -35,10 +35,8 @@ def varied(
         replace(
             stage,
             weights=weights_of(stage.weights),
-            repeats=stage.repeats
-            if refresh
-            else tuple(r for r in stage.repeats if r.action != "refresh_priors"),
-            on_enter=stage.on_enter if refresh else tuple(a for a in stage.on_enter if a != "refresh_priors"),
+            repeats=tuple(r for r in stage.repeats if r.action != without),
+            on_enter=tuple(a for a in stage.on_enter if a != without),
         )
         for stage in base.stages
     )
@@ -84,7 +82,7 @@ ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE,
         "without-refresh",
         "Priors computed once, not again as the Gaussians improve.",
-        refresh=False,
+        without="refresh_priors",
     ),
     varied(
         RECIPE_POLARGUIDE,
@@ -110,5 +108,59 @@ ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
         "without-flatness",
         "Gaussians need not be flat.",
         weights={"flatness": 0.0},
+    ),
+)
+
+ABLATIONS_STOKES: tuple[Recipe, ...] = (
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-stokes",
+        "S1 and S2 are not rendered.",
+        weights={"stokes": 0.0},
+    ),
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-separation",
+        "No term on the separated layers.",
+        weights={"specular": 0.0, "diffuse": 0.0},
+    ),
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-normals",
+        "No term on the normals but what S1 and S2 say.",
+        weights=_NORMAL_TERMS_OFF,
+    ),
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-fresnel",
+        "Strength does not depend on the angle: the lerp of 3DGS-DR.",
+        blend="lerp",
+        first_strength=0.05,
+    ),
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-local",
+        "Nothing near is reflected: the environment alone.",
+        local=False,
+    ),
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-outer-side",
+        "Normals are always turned to the camera.",
+        without="orient_normals",
+        oriented=False,
+    ),
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-colour",
+        "Nothing is read from the polarization of colour differences.",
+        weights={"chromatic": 0.0},
+        priors={"chromatic": False},
+    ),
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-agreement",
+        "The normals that a pixel blends need not agree.",
+        weights={"agreement": 0.0},
     ),
 )
