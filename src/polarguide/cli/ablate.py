@@ -15,7 +15,7 @@ from polarguide.recipes import ABLATIONS
 
 
 def ablate(
-    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE ...")],
     /,
     *,
     out: Path,
@@ -50,7 +50,7 @@ def ablate(
         refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water.
         jobs: Runs at a time; 0 takes as many as there are cores for their threads. Times are measured only with 1.
         threads: Threads of each run.
-        speed: With --speed, time pictures at the end, one run after the other, where that has not been done alone.
+        speed: With --speed at the end time pictures, one run after the other, where that was not done alone before.
         report_views: Test views of each scene in the report; 0 leaves the pictures out.
         device: What to compute on.
     """

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+PROGRAM = (sys.executable, "-m", "polarguide")
 POLL_SECONDS = 0.1
 STDERR = "stderr.txt"
 
@@ -53,7 +54,7 @@ class Child:
         count = str(self._threads)
         with open(self._errors, "wb") as errors:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "polarguide", *command, "--threads", count],
+                [*PROGRAM, *command, "--threads", count],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,

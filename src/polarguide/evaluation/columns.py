@@ -32,10 +32,14 @@ class Column:
     factor: float = 1.0
 
     @property
+    def arrow(self) -> str:
+        """Points to the better side; empty where there is none."""
+        return {"higher": "↑", "lower": "↓", None: ""}[self.better]
+
+    @property
     def heading(self) -> str:
-        """Label, unit and an arrow that points to the better side."""
-        arrow = {"higher": " ↑", "lower": " ↓", None: ""}[self.better]
-        return self.label + (f" ({self.unit})" if self.unit else "") + arrow
+        """Label, unit and arrow."""
+        return " ".join(filter(None, (self.label, f"({self.unit})" if self.unit else "", self.arrow)))
 
 
 COLUMNS: tuple[Column, ...] = (

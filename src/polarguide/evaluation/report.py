@@ -92,7 +92,10 @@ def _list(texts: Sequence[str]) -> str:
 
 
 def _tables(results: Mapping[str, Any]) -> str:
-    headings = "".join(f"<th>{html.escape(column.heading)}</th>" for column in shown_columns(results))
+    headings = "".join(
+        f"<th>{html.escape(column.label)}<br>{html.escape(' '.join((column.unit, column.arrow)))}</th>"
+        for column in shown_columns(results)
+    )
     return "".join(_table(block, headings) for block in blocks(results))
 
 
