@@ -91,7 +91,7 @@ def test_interrupted_failed_and_finished(
     # What is finished is not done again, in a comparison with other recipes neither.
     stamp = (first / "metrics.json").stat().st_mtime_ns
     assert run(alone) == 0
-    assert "1 runs, 1 of them finished before" in capsys.readouterr().out
+    assert "runs: 1, of them finished before: 1" in capsys.readouterr().out
     assert (first / "metrics.json").stat().st_mtime_ns == stamp
     record = json.loads((out / "results.json").read_text())
     assert [r["state"] for r in record["runs"]] == ["done"]

@@ -105,7 +105,7 @@ def planned(trained: Path, demo_scene: Path, tmp_path: Path) -> PlannedRun:
     return only
 
 
-def test_how_far_a_run_is(planned: PlannedRun) -> None:
+def test_how_far_a_run_is(planned: PlannedRun, tmp_path: Path) -> None:
     metrics, other = planned.folder / "metrics.json", dataclasses.replace(planned, folder=Path("none"))
     assert (planned.state(), other.state()) == ("trained", "new")
     assert run(["eval", str(planned.folder), "--no-speed", "--threads", "1"]) == 0
@@ -122,6 +122,9 @@ def test_how_far_a_run_is(planned: PlannedRun) -> None:
         assert planned.state() == "trained", change
     metrics.write_text('{"psnr": 3')
     assert planned.state() == "trained"
+    shutil.copytree(planned.scene.path, tmp_path / "demo")
+    moved = dataclasses.replace(planned, scene=dataclasses.replace(planned.scene, path=tmp_path / "demo"))
+    assert moved.state() == "begun"
     (planned.folder / "point_cloud.ply").unlink()
     assert planned.state() == "begun"
     metrics.write_text(json.dumps(record))

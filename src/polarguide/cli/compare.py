@@ -11,6 +11,7 @@ from typing import Annotated
 
 import tyro
 
+from polarguide.capture.view import listed
 from polarguide.cli.collect import BESIDE_OTHERS, collect, write_tables
 from polarguide.cli.common import Transfer, console, use_threads
 from polarguide.cli.comparison import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
@@ -116,11 +117,11 @@ def run_comparison(comparison: Comparison) -> None:
         f"tables: {comparison.out}/results.md, .csv, .tex, .json   report: {comparison.out / REPORT}"
     )
     if failures:
-        listed = "; ".join(f"{r.label}: {failures[r.folder]}" for r in plan if r.folder in failures)
+        said = listed([f"{r.label}: {failures[r.folder]}" for r in plan if r.folder in failures])
         raise PolarguideError(
             comparison.out,
             expected=f"{len(plan)} finished runs",
-            found=f"that {len(failures)} failed ({listed})",
+            found=f"that {len(failures)} failed ({said})",
             remedy="What there is has been written. Remove the cause and give the same command again.",
         )
 
@@ -131,7 +132,7 @@ def _train(
     """Train and score what is missing; the last words of what failed, by run folder."""
     wanted = [run for run in plan if run.state() != "done"]
     parallel = min(comparison.jobs, len(wanted))
-    console.print(f"{len(plan)} runs, {len(plan) - len(wanted)} of them finished before")
+    console.print(f"runs: {len(plan)}, of them finished before: {len(plan) - len(wanted)}")
     jobs = [_job(comparison, run, alone=parallel == 1) for run in wanted]
     failures: dict[Path, str] = {}
     with JobProgress(jobs) as progress:
@@ -182,6 +183,7 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun]) -> None:
         Job(run.label, run.folder, (_scoring(comparison, run, speed=True),), run.settings.steps)
         for run in untimed
     ]
+    console.print(f"timing the pictures of {len(jobs)} runs, one after the other")
     with JobProgress(jobs) as progress:
         run_jobs(
             jobs,
@@ -193,7 +195,7 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun]) -> None:
     missed = [r.label for r in untimed if (m := r.metrics()) is None or m["fps"] is None]
     if missed:
         console.print(
-            f"[yellow]warning:[/] no speed for {len(missed)} runs: something else was running on the machine."
+            f"[yellow]warning:[/] no speed for {len(missed)} runs: they failed, or were not alone on the machine."
         )
 
 

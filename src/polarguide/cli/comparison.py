@@ -103,11 +103,14 @@ class PlannedRun:
         """How far it is, by what its folder holds."""
         if not (self.folder / CONFIGURATION).exists():
             return "new"
-        if not self._matches():
+        found = self._configuration()
+        if found is None:
             return "begun"  # going on with it will say what does not match
         if self.metrics() is not None:
             return "done"
-        return "trained" if (self.folder / PLY).exists() else "begun"
+        # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
+        moved = found.scene != str(self.scene.path.resolve())
+        return "trained" if (self.folder / PLY).exists() and not moved else "begun"
 
     def metrics(self) -> dict[str, Any] | None:
         """The record of its scores, or None where there is no valid one by this version."""
@@ -119,18 +122,20 @@ class PlannedRun:
         whole = record["steps"] == self.settings.steps
         return record if whole and record["provenance"].get("sources") == scoring_digest() else None
 
-    def _matches(self) -> bool:
+    def _configuration(self) -> RunConfiguration | None:
+        """What the folder's run was trained as, or None where that is not this run."""
         try:
             found = RunConfiguration.load(self.folder)
         except PolarguideError:
-            return False
-        return (
+            return None
+        same = (
             found.scene_digest == self.scene.digest
             and found.recipe_data == recipe_data(self.recipe)
             and found.settings == self.settings
             and (found.recipe, found.downscale, found.transfer)
             == (self.recipe.name, self.downscale, self.transfer)
         )
+        return found if same else None
 
 
 def scene_entries(comparison: Comparison) -> list[SceneEntry]:

@@ -21,6 +21,11 @@ ERROR_HIGH = 0.25
 """Mean absolute difference of shown pictures that is brightest in the error map."""
 NORMAL_ERROR_HIGH = 45.0
 """Degrees that are brightest in the map of normal errors."""
+LEGEND = {
+    "error": f"mean absolute difference over the channels, 0 to {ERROR_HIGH:g} of white",
+    "normal_error": f"angle to the true normal, 0 to {NORMAL_ERROR_HIGH:g} degrees",
+}
+"""What the colours of false-colour layers say."""
 
 
 def report_html(
@@ -51,9 +56,7 @@ def report_html(
         pictures_hidden="" if views else "hidden",
         remarks=_list(remarks),
         gradient=_gradient("inferno"),
-        legend=_script_data(
-            {"error": f"0 to {ERROR_HIGH:g}", "normal_error": f"0 to {NORMAL_ERROR_HIGH:g}°"}
-        ),
+        legend=_script_data(LEGEND),
         data=_script_data([vars(view) for view in views]),
         layers=_script_data(LAYERS),
         curves=_curves(results, curves),

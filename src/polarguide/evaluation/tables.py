@@ -87,6 +87,10 @@ def notes(results: Mapping[str, Any]) -> list[str]:
         said.append(f"Mean ± sample standard deviation over {seeds} seeds.")
     else:
         said.append("One seed: differences may be within what a seed moves.")
+    if len(results["scenes"]) > 1:
+        said.append(
+            "Mean over scenes: over those where any recipe has a value of the column, with one weight each."
+        )
     reasons = {r["lpips_reason"]: 0 for r in results["runs"] if r["state"] == "done" and r["lpips_reason"]}
     said += [f"LPIPS {NOT_APPLICABLE}: {reason}." for reason in reasons]
     unfinished = [r for r in results["runs"] if r["state"] != "done"]

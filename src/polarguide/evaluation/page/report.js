@@ -6,6 +6,8 @@
   const tiles = element("tiles");
   const state = { index: 0, layer: "final", scale: 1, x: 0, y: 0, truth: false };
   const MOST = 32, STEP = 1.25, PAN = 0.1;
+  /* What the tile of the truth shows beside maps of errors, to see where an error is. */
+  const BESIDE = { error: "final", normal_error: "normal" };
 
   /* Zoom: one scale and one offset for all pictures. The offset is in widths and heights of a tile, so that tiles of
      every size agree. */
@@ -42,13 +44,15 @@
   function draw() {
     const view = views[state.index];
     const truth = view.tiles[0][1];
+    const beside = BESIDE[state.layer] || state.layer;
     tiles.replaceChildren(...view.tiles.map(([name, pictures, scores], index) => {
       const tile = make("figure", index ? "tile" : "tile truth");
       const caption = make("figcaption");
-      caption.append(make("b", "", name), make("span", "", scores[state.layer] || ""));
+      const beneath = index || beside === state.layer ? scores[state.layer] : layers[beside];
+      caption.append(make("b", "", name), make("span", "", beneath || ""));
       const frame = make("div", "window");
       frame.style.aspectRatio = view.width + " / " + view.height;
-      const source = state.truth && truth[state.layer] ? truth[state.layer] : pictures[state.layer];
+      const source = index === 0 || (state.truth && truth[beside]) ? truth[beside] : pictures[state.layer];
       if (source) {
         const picture = make("img");
         picture.src = source;
@@ -110,7 +114,7 @@
     let drag = null;
     tiles.addEventListener("wheel", (event) => {
       const frame = event.target.closest(".window");
-      if (!frame) return;
+      if (!frame || (state.scale === 1 && event.deltaY > 0)) return; /* nothing to zoom out of: scroll the page */
       event.preventDefault();
       const box = frame.getBoundingClientRect();
       const factor = Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0018));
