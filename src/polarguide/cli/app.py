@@ -10,6 +10,8 @@ import tyro
 from rich.console import Console
 
 from polarguide import __version__
+from polarguide.cli.ablate import ablate
+from polarguide.cli.compare import compare
 from polarguide.cli.demo import demo
 from polarguide.cli.evaluate import evaluate
 from polarguide.cli.priors import priors
@@ -23,6 +25,8 @@ VERBS: dict[str, Callable[..., Any]] = {
     "eval": evaluate,
     "render": render_views,
     "priors": priors,
+    "compare": compare,
+    "ablate": ablate,
 }
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "

@@ -92,13 +92,14 @@ class OpenRun:
         )
 
 
-def open_run(folder: Path, *, device: DeviceName = "auto") -> OpenRun:
-    """Open a run folder and the scene it was trained on."""
+def open_run(folder: Path, *, device: DeviceName = "auto", scene: Scene | None = None) -> OpenRun:
+    """Open a run folder and the scene it was trained on, unless that is at hand already."""
     configuration = RunConfiguration.load(folder)
     recipe = recipe_named(configuration.recipe)
     state = load_checkpoint(folder, recipe)
-    transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
-    scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
+    if scene is None:
+        transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
+        scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
     if scene.digest != configuration.scene_digest:
         console.print(
             f"[yellow]warning:[/] {configuration.scene} has changed since {folder} was trained on it."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import resource
-import subprocess
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +15,7 @@ import polarguide
 from polarguide import _native
 from polarguide.cli.common import OpenRun, console, open_run, use_threads
 from polarguide.evaluation import score_view, write_metrics
+from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.speed import frames_per_second
 from polarguide.raster import DeviceName
 from polarguide.training.run import RunLog
@@ -37,21 +37,27 @@ SHOWN_KEYS = (
 
 
 def evaluate(
-    run: Annotated[Path, tyro.conf.Positional], /, *, device: DeviceName = "auto", threads: int = 0
+    run: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    speed: bool = True,
+    device: DeviceName = "auto",
+    threads: int = 0,
 ) -> None:
     """Score a run on its test views and write RUN/metrics.json.
 
     Args:
         run: Run folder.
+        speed: Measure frames a second; --speed makes sense only while nothing else runs.
         device: What to compute on.
         threads: Threads to use; 0 takes all cores.
     """
     use_threads(threads)
-    evaluate_run(open_run(run, device=device))
+    evaluate_run(open_run(run, device=device), speed=speed)
 
 
-def evaluate_run(opened: OpenRun) -> dict[str, Any]:
-    """Score, write ``metrics.json``, print the table; returns the record."""
+def evaluate_run(opened: OpenRun, *, speed: bool = True) -> dict[str, Any]:
+    """Score, write ``metrics.json``, print the table; returns the record. Without ``speed`` its keys are null."""
     views = {}
     for view in opened.scene.test_views:
         result = opened.render(view)
@@ -62,12 +68,8 @@ def evaluate_run(opened: OpenRun) -> dict[str, Any]:
         opened.folder / METRICS,
         views=views,
         run={
-            "fps": frames_per_second(
-                lambda view: opened.render(view, normals=False), opened.scene.test_views
-            ),
-            "fps_layers": frames_per_second(
-                lambda view: opened.render(view, depth=True), opened.scene.test_views
-            ),
+            "fps": _speed(opened, normals=False) if speed else None,
+            "fps_layers": _speed(opened, depth=True) if speed else None,
             "train_seconds": seconds if alone and seconds > 0 else None,
             "gaussians": len(opened.state.rows),
             "steps": opened.state.step,
@@ -79,16 +81,17 @@ def evaluate_run(opened: OpenRun) -> dict[str, Any]:
     return record
 
 
+def _speed(opened: OpenRun, **layers: bool) -> float | None:
+    return frames_per_second(lambda view: opened.render(view, **layers), opened.scene.test_views)
+
+
 def _provenance(opened: OpenRun) -> dict[str, Any]:
     configuration = opened.configuration
-    folder = Path(polarguide.__file__).parent
-    git = subprocess.run(
-        ["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-    )
     return {
         "recipe": configuration.recipe,
         "seed": configuration.settings.seed,
-        "commit": git.stdout.strip() or None,
+        "commit": commit(),
+        "sources": scoring_digest(),
         "versions": {
             "polarguide": polarguide.__version__,
             "torch": torch.__version__,

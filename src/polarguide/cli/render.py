@@ -77,7 +77,7 @@ def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out:
                 missing.add(name)
             else:
                 figures.write_png(out / f"{view.name}_{name}.png", picture)
-        truth = _truth_pictures(view)
+        truth = truth_pictures(view)
         if len(rows) < 2 * SHEET_VIEWS:
             rows.append([pictures[name] for name in layers])
             rows.append([truth.get(name) for name in layers])
@@ -126,7 +126,8 @@ def _true_depth_range(view: View) -> tuple[float, float] | None:
     return _depth_range(truth.depth, truth.mask)
 
 
-def _truth_pictures(view: View) -> dict[str, Picture]:
+def truth_pictures(view: View) -> dict[str, Picture]:
+    """The photograph as ``final``, and what is known of the other layers, as 8-bit pictures."""
     pictures = {"final": figures.radiance_to_rgb(view.photograph())}
     truth = view.truth
     if truth is None:

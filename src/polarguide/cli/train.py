@@ -71,23 +71,12 @@ def train(
         resume: Go on with the run in --out.
     """
     use_threads(threads)
-    for name, value in (("--steps", steps), ("--checkpoint-every", checkpoint_every)):
-        if value < 1:
-            raise PolarguideError(
-                name, expected="1 or more", found=str(value), remedy="Give a positive count."
-            )
-    if not 1.0 < refractive_index < 4.0:
-        raise PolarguideError(
-            "--refractive-index",
-            expected="between 1 and 4",
-            found=str(refractive_index),
-            remedy="1.5 suits most.",
-        )
+    check_count("--checkpoint-every", checkpoint_every)
+    settings = checked_settings(steps, seed, refractive_index)
     chosen = recipe_named(recipe)
     _check_out(out, resume)
     backend = choose_backend(device)
     loaded = read_scene(scene, downscale=downscale, transfer=transfer)
-    settings = TrainSettings(steps, seed, refractive_index)
     configuration = RunConfiguration(
         scene=str(scene.resolve()),
         scene_digest=loaded.digest,
@@ -107,6 +96,29 @@ def train(
     trainer = Trainer(loaded, chosen, settings, backend, state)
     train_run(trainer, out, checkpoint_every=checkpoint_every)
     console.print(f"trained: {out}   next: polarguide eval {out}   polarguide render {out}")
+
+
+def check_count(name: str, value: int) -> None:
+    """Raise PolarguideError unless the value of the flag ``name`` is at least 1."""
+    if value < 1:
+        raise PolarguideError(name, expected="1 or more", found=str(value), remedy="Give a positive count.")
+
+
+def checked_settings(steps: int, seed: int, refractive_index: float) -> TrainSettings:
+    """The settings of a training from its flags.
+
+    Raises:
+        PolarguideError: a value out of range.
+    """
+    check_count("--steps", steps)
+    if not 1.0 < refractive_index < 4.0:
+        raise PolarguideError(
+            "--refractive-index",
+            expected="between 1 and 4",
+            found=str(refractive_index),
+            remedy="1.5 suits most.",
+        )
+    return TrainSettings(steps, seed, refractive_index)
 
 
 def _check_out(out: Path, resume: bool) -> None:
