@@ -84,7 +84,7 @@ def test_angle_out_is_angle_in_and_twice_is_none() -> None:
 def test_layers_add_up_to_the_final_picture(
     rows: dict[str, Tensor], rasterise: Rasterise, shading: Shading
 ) -> None:
-    result = render(rows, camera(), rasterise, environment=environment(), shading=shading)
+    result = render(rows, camera(), rasterise, environment={"texels": environment()}, shading=shading)
     assert result.specular is not None
     assert result.diffuse is not None
     assert result.strength is not None
@@ -114,7 +114,7 @@ def test_without_environment_there_is_no_reflection(rows: dict[str, Tensor]) -> 
 
 def test_the_base_does_not_depend_on_what_else_is_splatted(rows: dict[str, Tensor]) -> None:
     plain = render(rows, camera(), rasterise_cpu, normals=False)
-    full = render(rows, camera(), rasterise_cpu, environment=environment(), depth=True)
+    full = render(rows, camera(), rasterise_cpu, environment={"texels": environment()}, depth=True)
     for name in ("base", "alpha", "radii"):
         torch.testing.assert_close(getattr(plain, name), getattr(full, name))
 
@@ -196,7 +196,7 @@ def test_every_row_that_shows_gets_a_finite_gradient(
         trained,
         camera(),
         rasterise_cpu,
-        environment=texels if reflects else None,
+        environment={"texels": texels} if reflects else None,
         shading=shading,
         statistic=statistic,
     )
@@ -219,7 +219,9 @@ def test_native_and_twin_render_the_same_with_gradients(rows: dict[str, Tensor],
     for rasterise, dtype in ((rasterise_cpu, torch.float32), (rasterise_reference, torch.float64)):
         trained = {name: t.to(dtype).detach().clone().requires_grad_() for name, t in rows.items()}
         texels = environment().to(dtype).detach().requires_grad_()
-        result = render(trained, camera(), rasterise, environment=texels, shading=shading, depth=True)
+        result = render(
+            trained, camera(), rasterise, environment={"texels": texels}, shading=shading, depth=True
+        )
         result.final.square().mean().backward()
         outcomes.append((result, {name: t.grad for name, t in trained.items()}))
     (fast, fast_gradients), (slow, slow_gradients) = outcomes

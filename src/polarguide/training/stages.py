@@ -68,7 +68,8 @@ class Weights:
     @property
     def priors(self) -> bool:
         """Whether a term compares with the priors of a view."""
-        return any((self.specular, self.diffuse, self.stokes, self.normals))
+        layers = self.specular, self.diffuse, self.stokes
+        return any((*layers, self.normal, self.azimuth, self.chromatic, self.agreement))
 
     @property
     def normals(self) -> bool:
