@@ -87,7 +87,7 @@ def test_angle_out_is_angle_in_and_twice_is_none() -> None:
 def test_layers_add_up_to_the_final_picture(
     rows: dict[str, Tensor], rasterise: Rasterise, shading: Shading
 ) -> None:
-    result = render(rows, camera(), rasterise, environment=environment(), shading=shading)
+    result = render(rows, camera(), rasterise, environment={"texels": environment()}, shading=shading)
     assert result.specular is not None
     assert result.diffuse is not None
     assert result.strength is not None
@@ -117,7 +117,7 @@ def test_without_environment_there_is_no_reflection(rows: dict[str, Tensor]) -> 
 
 def test_the_base_does_not_depend_on_what_else_is_splatted(rows: dict[str, Tensor]) -> None:
     plain = render(rows, camera(), rasterise_cpu, normals=False)
-    full = render(rows, camera(), rasterise_cpu, environment=environment(), depth=True)
+    full = render(rows, camera(), rasterise_cpu, environment={"texels": environment()}, depth=True)
     for name in ("base", "alpha", "radii"):
         torch.testing.assert_close(getattr(plain, name), getattr(full, name))
 
@@ -199,7 +199,7 @@ def test_every_row_that_shows_gets_a_finite_gradient(
         trained,
         camera(),
         rasterise_cpu,
-        environment=texels if reflects else None,
+        environment={"texels": texels} if reflects else None,
         shading=shading,
         statistic=statistic,
     )
@@ -222,7 +222,9 @@ def test_native_and_twin_render_the_same_with_gradients(rows: dict[str, Tensor],
     for rasterise, dtype in ((rasterise_cpu, torch.float32), (rasterise_reference, torch.float64)):
         trained = {name: t.to(dtype).detach().clone().requires_grad_() for name, t in rows.items()}
         texels = environment().to(dtype).detach().requires_grad_()
-        result = render(trained, camera(), rasterise, environment=texels, shading=shading, depth=True)
+        result = render(
+            trained, camera(), rasterise, environment={"texels": texels}, shading=shading, depth=True
+        )
         result.final.square().mean().backward()
         outcomes.append((result, {name: t.grad for name, t in trained.items()}))
     (fast, fast_gradients), (slow, slow_gradients) = outcomes
@@ -243,16 +245,24 @@ LOCAL = Shading("fresnel", 1.5, local=True)
 
 def test_local_light_that_is_nothing_changes_nothing(rows: dict[str, Tensor]) -> None:
     rows |= {"local_dc": torch.zeros(COUNT, 3), "local_rest": torch.zeros(COUNT, 15, 3)}
-    without = render(rows, camera(), rasterise_reference, environment=environment(), shading=FRESNEL)
-    with_it = render(rows, camera(), rasterise_reference, environment=environment(), shading=LOCAL)
+    without = render(
+        rows, camera(), rasterise_reference, environment={"texels": environment()}, shading=FRESNEL
+    )
+    with_it = render(
+        rows, camera(), rasterise_reference, environment={"texels": environment()}, shading=LOCAL
+    )
     torch.testing.assert_close(with_it.final, without.final)
 
 
 def test_local_light_adds_to_the_environments_before_fresnel(rows: dict[str, Tensor]) -> None:
     """Of degree 0 it is a constant, blended by the weights that sum to alpha."""
     rows |= {"local_dc": torch.full((COUNT, 3), 0.5 / SH_C0), "local_rest": torch.zeros(COUNT, 15, 3)}
-    without = render(rows, camera(), rasterise_reference, environment=environment(), shading=FRESNEL)
-    with_it = render(rows, camera(), rasterise_reference, environment=environment(), shading=LOCAL)
+    without = render(
+        rows, camera(), rasterise_reference, environment={"texels": environment()}, shading=FRESNEL
+    )
+    with_it = render(
+        rows, camera(), rasterise_reference, environment={"texels": environment()}, shading=LOCAL
+    )
     assert without.reflection is not None
     assert with_it.reflection is not None
     torch.testing.assert_close(with_it.reflection, without.reflection + 0.5 * without.alpha[..., None])
@@ -287,9 +297,13 @@ def test_normals_keep_their_outer_side_past_the_silhouette(rows: dict[str, Tenso
     torch.testing.assert_close(kept[grazing], -flipped[grazing])
     torch.testing.assert_close(kept[~grazing], flipped[~grazing])
     rows["outward"] = outward
-    normal = render(rows, camera(), rasterise_reference, environment=environment(), shading=FRESNEL).normal
+    normal = render(
+        rows, camera(), rasterise_reference, environment={"texels": environment()}, shading=FRESNEL
+    ).normal
     del rows["outward"]
-    other = render(rows, camera(), rasterise_reference, environment=environment(), shading=FRESNEL).normal
+    other = render(
+        rows, camera(), rasterise_reference, environment={"texels": environment()}, shading=FRESNEL
+    ).normal
     assert normal is not None
     assert other is not None
     assert not torch.allclose(normal, other)

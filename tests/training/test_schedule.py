@@ -111,7 +111,9 @@ def test_every_recipe_is_named_told_and_trains_what_it_renders(recipe: Recipe) -
     assert recipe.about.endswith(".")
     core = {"means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest"}
     assert core <= set(recipe.rates)
-    assert ("strength_logits" in recipe.rates) == recipe.reflects
+    side = "strength_logits" if recipe.directional is None else "log_albedo"
+    assert (side in recipe.rates) == recipe.reflects
+    assert "texels" in recipe.environment_rates
     assert list(recipe.sh_fractions) == sorted(recipe.sh_fractions)
 
 
@@ -148,7 +150,7 @@ def test_an_ablation_changes_something_and_is_found_by_its_name() -> None:
 
 
 def test_an_unknown_recipe_is_refused_with_the_names_there_are() -> None:
-    with pytest.raises(PolarguideError, match="3dgs-dr, polarguide"):
+    with pytest.raises(PolarguideError, match="3dgs-dr, ref-gs, polarguide"):
         recipe_named("magic")
     with pytest.raises(PolarguideError, match="polarguide:without-normals"):
         recipe_named("polarguide:magic")

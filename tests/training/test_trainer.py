@@ -19,6 +19,7 @@ from polarguide.training.stages import Recipe
 from polarguide.training.trainer import StepReport, Trainer, TrainSettings, first_state
 
 STEPS, STOP = 60, 25
+DIRECTIONAL_ROWS = ("log_albedo", "roughness_logits", "features")
 
 
 def train(
@@ -48,7 +49,9 @@ def test_every_recipe_trains(tiny_scene: Scene, name: str) -> None:
     assert {report.stage for report in reports} == {stage.name for stage in RECIPES[name].stages}
     floats = {k: t for k, t in trainer.state.tensors().items() if t.is_floating_point()}
     assert all(bool(torch.isfinite(t).all()) for t in floats.values())
-    assert ("rows.strength_logits" in floats) == RECIPES[name].reflects == ("environment.texels" in floats)
+    assert ("environment.texels" in floats) == RECIPES[name].reflects
+    side = {"strength_logits"} if RECIPES[name].directional is None else set(DIRECTIONAL_ROWS)
+    assert {f"rows.{row}" for row in side} <= set(floats) or not RECIPES[name].reflects
 
 
 @pytest.mark.parametrize("name", ["3dgs", "polarguide"])
@@ -81,6 +84,32 @@ def test_resumed_is_uninterrupted_bit_by_bit(tiny_scene: Scene, busy_recipe: Rec
     Trainer(tiny_scene, busy_recipe, TrainSettings(STEPS, 3), choose_backend("cpu"), state).run(rest.append)
     assert first + rest == reports
     assert different(state.tensors(), whole.state.tensors()) == []
+
+
+def test_a_directional_light_is_resumed_bit_by_bit(
+    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
+) -> None:
+    """Side rows follow the density control, and the grid and the MLP keep their moments."""
+    stop = 14  # between two rounds of the density control that add Gaussians
+    recipe = dataclasses.replace(
+        RECIPES["ref-gs"],
+        densification=dataclasses.replace(busy_recipe.densification, every=4, pixels_each=1.0),
+        initialisation=busy_recipe.initialisation,
+        environment_resolution=8,
+    )
+    whole, reports = train(tiny_scene, recipe)
+    assert len({report.gaussians for report in reports[stop : STEPS // 2]}) > 1
+    begun, _ = train(tiny_scene, recipe, until=stop)
+    save_checkpoint(tmp_path, begun.state)
+    state = load_checkpoint(tmp_path, recipe)
+    assert different(state.tensors(), begun.state.tensors()) == []
+    Trainer(tiny_scene, recipe, TrainSettings(STEPS, 3), choose_backend("cpu"), state).run(lambda _: None)
+    assert different(state.tensors(), whole.state.tensors()) == []
+    tensors = state.tensors()
+    moved = [f"adam.{row}.exp_avg" for row in DIRECTIONAL_ROWS]
+    moved += [f"environment.adam.mlp_weight_{layer}.exp_avg" for layer in range(3)]
+    assert all(bool(tensors[name].any()) for name in (*moved, "environment.adam.exp_avg"))
+    assert all(tensors[f"rows.{row}"].shape[0] == len(state.rows) for row in DIRECTIONAL_ROWS)
 
 
 @pytest.mark.parametrize("stop", [1, 6, 7, 16, 24, 40, 59])

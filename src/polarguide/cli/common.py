@@ -15,7 +15,8 @@ from polarguide.capture import Scene, View, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, DeviceName, choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.shading.render import Shading, render
+from polarguide.shading.model import ShadingModel
+from polarguide.shading.render import render
 from polarguide.shading.result import RenderResult
 from polarguide.training.run import RunConfiguration, load_checkpoint, recipe_data
 from polarguide.training.stages import Recipe
@@ -73,7 +74,7 @@ class OpenRun:
     backend: Backend
 
     @property
-    def shading(self) -> Shading:
+    def shading(self) -> ShadingModel:
         """How its layers combine."""
         return self.recipe.shading(self.configuration.settings.refractive_index)
 
@@ -85,7 +86,7 @@ class OpenRun:
             self.state.rows,
             view.camera,
             self.backend.rasterise,
-            environment=environment.texels if environment else None,
+            environment=environment.parameters if environment else None,
             shading=self.shading,
             normals=normals,
             depth=depth,

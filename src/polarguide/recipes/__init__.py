@@ -6,6 +6,7 @@ from polarguide.errors import PolarguideError
 from polarguide.recipes.ablations import ABLATIONS_POLARGUIDE, ABLATIONS_STOKES
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
+from polarguide.recipes.ref_gs import RECIPE_REF_GS
 from polarguide.training.stages import Recipe
 
 RECIPES: dict[str, Recipe] = {
@@ -13,6 +14,7 @@ RECIPES: dict[str, Recipe] = {
     for recipe in (
         RECIPE_3DGS,
         RECIPE_3DGS_DR,
+        RECIPE_REF_GS,
         RECIPE_POLARGUIDE_PAPER,
         RECIPE_POLARGUIDE,
         RECIPE_POLARGUIDE_STOKES,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,26 +15,24 @@ from polarguide.gaussians.spherical_harmonics import evaluate_sh
 from polarguide.optics import reflectances_from_cosine
 from polarguide.raster.interface import Rasterise, ScreenStatistic
 from polarguide.shading.cubemap import cubemap_lookup
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, Rows, ShadingModel, mirrored
 from polarguide.shading.result import RenderResult
 from polarguide.vectors import dot, unit
 
 COLOUR_CHANNELS = (0, 1, 2)
 Blend = Literal["lerp", "fresnel"]
-# Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
-MAXIMUM_LOG_LIGHT = 5.0
-
-
-class Rows(Protocol):
-    """Named per-Gaussian tensors: the trainable rows, or a frozen copy of them."""
-
-    def __getitem__(self, name: str, /) -> Tensor: ...
-    def __contains__(self, name: str, /) -> bool: ...
 
 
 def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
     """Linear base colours [N, 3] towards a camera centre [3], not negative."""
     sh = evaluate_sh(rows["means"], centre, rows["sh_dc"], rows["sh_rest"], sh_degree)
     return (sh + 0.5).clamp(min=0)
+
+
+def harmonic_colours(rows: Rows, rays: Tensor) -> Tensor:
+    """Linear base colours [N, 3] along unit rays [N, 3], of degree 3, not negative."""
+    origin = torch.zeros(3)
+    return (evaluate_sh(rays, origin, rows["sh_dc"], rows["sh_rest"], 3) + 0.5).clamp(min=0)
 
 
 def local_light(rows: Rows, normals: Tensor, rays: Tensor, sh_degree: int) -> Tensor:
@@ -49,11 +48,6 @@ def local_light(rows: Rows, normals: Tensor, rays: Tensor, sh_degree: int) -> Te
     directions = mirrored(rays, normals).detach()
     origin = torch.zeros_like(directions[0])
     return evaluate_sh(directions, origin, rows["local_dc"], rows["local_rest"], sh_degree)
-
-
-def mirrored(rays: Tensor, normals: Tensor) -> Tensor:
-    """Directions of rays [..., 3] after reflection at unit normals [..., 3]."""
-    return rays - 2 * dot(rays, normals)[..., None] * normals
 
 
 @dataclass(frozen=True)
@@ -90,6 +84,38 @@ class Shading:
             return strength * light, (1 - strength) * base
         s, p = reflectances_from_cosine(cosine, self.index)
         return strength * (0.5 * (s + p)) * light, base
+
+    def channels(self, rows: Rows, normals: Tensor, centre: Tensor, sh_degree: int) -> list[Tensor]:
+        """Base colour [N, 3], strength [N, 1] and, with ``local``, the Gaussians' own light [N, 3]."""
+        channels = [base_colours(rows, centre, sh_degree), torch.sigmoid(rows["strength_logits"])[:, None]]
+        if self.local:
+            rays = unit(rows["means"].detach() - centre)
+            channels.append(local_light(rows, normals, rays, sh_degree))
+        return channels
+
+    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+        """The layers of ``reflect``, and ``strength`` [H, W]."""
+        base, normal, further, _ = splatted
+        strength, local = further[..., 0], further[..., 1:4] if self.local else None
+        layers = reflect(base, normal, strength, light["texels"], camera, self, local)
+        return {**layers, "strength": strength}
+
+    def colours(self, rows: Rows, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor) -> Tensor:
+        """Colours [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
+        seen = self.light(cubemap_lookup(light["texels"], mirrored(rays, normals).contiguous()))
+        if self.local:
+            seen = (seen + local_light(rows, normals, rays, 3)).clamp(min=0)
+        strength = torch.sigmoid(rows["strength_logits"])[:, None]
+        cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
+        specular, diffuse = self.layers(harmonic_colours(rows, rays), strength, seen, cosine)
+        return specular + diffuse
+
+    def fields(self, rows: Rows) -> dict[str, Tensor]:
+        """Linear harmonics of the base colour and, where Gaussians have one, ``strength`` [N]."""
+        fields = {"linear_dc": rows["sh_dc"], "linear_rest": rows["sh_rest"].flatten(1)}
+        if "strength_logits" in rows:
+            fields["strength"] = torch.sigmoid(rows["strength_logits"])
+        return fields
 
 
 SHADING_3DGS_DR = Shading()
@@ -130,8 +156,8 @@ def render(
     rasterise: Rasterise,
     *,
     sh_degree: int = 3,
-    environment: Tensor | None = None,
-    shading: Shading = SHADING_3DGS_DR,
+    environment: Mapping[str, Tensor] | None = None,
+    shading: ShadingModel = SHADING_3DGS_DR,
     normals: bool = True,
     depth: bool = False,
     statistic: ScreenStatistic | None = None,
@@ -139,26 +165,23 @@ def render(
     """Render one view.
 
     Args:
-        rows: the Gaussians; with ``strength_logits`` when there is an environment; with ``outward`` where normals
-            are turned to where they are seen from, not to the camera.
+        rows: the Gaussians; with the side tensors of the shading model when there is an environment; with
+            ``outward`` where normals are turned to where they are seen from, not to the camera.
         sh_degree: SH degree of the base colour, 0 to 3.
-        environment: [6, R, R, 3] raw texels of the learned environment; None: no reflection.
-        shading: how base colour and reflection are combined.
+        environment: parameters of the learned environment by name; None: no reflection.
+        shading: what is splatted for reflection, and how it makes the picture.
         normals: also splat normals (always done with an environment).
         depth: also splat camera depth.
         statistic: see ``ScreenStatistic``; the colour channels come first.
     """
     centre = camera.centre.to(rows["means"])
-    channels = [base_colours(rows, centre, sh_degree)]
+    channels = [] if environment is not None else [base_colours(rows, centre, sh_degree)]
     if normals or environment is not None:
         outward = rows["outward"] if "outward" in rows else None  # noqa: SIM401
         axes = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], centre, outward)
-        channels.append(axes)
         if environment is not None:
-            channels.append(torch.sigmoid(rows["strength_logits"])[:, None])
-            if shading.local:
-                rays = unit(rows["means"].detach() - centre)
-                channels.append(local_light(rows, axes, rays, sh_degree))
+            channels = shading.channels(rows, axes, centre, sh_degree)
+        channels.insert(1, axes)
     if depth:
         axis = camera.rotation[2].to(rows["means"])
         channels.append(((rows["means"] - centre) @ axis)[:, None])
@@ -173,18 +196,17 @@ def render(
     )
     base = picture.features[..., :3]
     normal = picture.features[..., 3:6] if normals or environment is not None else None
-    strength = picture.features[..., 6] if environment is not None else None
     layers = {"final": base}
-    if environment is not None and normal is not None and strength is not None:
-        local = picture.features[..., 7:10] if shading.local else None
-        layers = reflect(base, normal, strength, environment, camera, shading, local)
+    if environment is not None and normal is not None:
+        splatted = GBuffer(base, normal, picture.features[..., 6:], picture.alpha)
+        layers = shading.shade(splatted, environment, camera)
     return RenderResult(
         final=layers["final"],
         specular=layers.get("specular"),
         diffuse=layers.get("diffuse"),
         base=base,
         reflection=layers.get("reflection"),
-        strength=strength,
+        strength=layers.get("strength"),
         normal=normal,
         depth=picture.features[..., -1] / picture.alpha.clamp(min=1e-6) if depth else None,
         alpha=picture.alpha,

@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
+from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.shading.result import RenderResult
+from polarguide.training.consistency import consistency_loss
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
 from polarguide.training.stages import Weights
@@ -103,6 +105,7 @@ def step_loss(
     index: float,
     log_scales: Tensor,
     extent: float,
+    camera: Camera | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The weighted sum of a stage's terms, and its photometric term alone (for the display).
 
@@ -115,6 +118,7 @@ def step_loss(
         ssim_weight: lambda of the image terms.
         index: refractive index.
         log_scales: [N, 3] of the Gaussians. extent: of the scene.
+        camera: of the view; needed where a weight asks for the normals of the depth.
     """
     photometric = photometric_loss(result.final, shown, valid, ssim_weight)
     total = weights.photometric * photometric
@@ -124,6 +128,8 @@ def step_loss(
             total = total + weights.stokes * stokes_loss(result, priors, index)
     if weights.flatness:
         total = total + weights.flatness * flatness_loss(log_scales, result.radii, extent)
+    if weights.consistency and camera is not None:
+        total = total + weights.consistency * consistency_loss(result, camera)
     if not torch.isfinite(total):
         raise PolarguideError(
             "training",

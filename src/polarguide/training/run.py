@@ -143,7 +143,7 @@ def load_checkpoint(run: Path, recipe: Recipe) -> TrainingState:
     try:
         with safe_open(path, framework="pt") as file:
             tensors: dict[str, Tensor] = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        return TrainingState.from_tensors(tensors, recipe.rates, recipe.environment_rate)
+        return TrainingState.from_tensors(tensors, recipe.rates, recipe.environment_rates)
     except (SafetensorError, KeyError, ValueError) as error:
         raise PolarguideError(
             path,

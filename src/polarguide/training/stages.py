@@ -10,6 +10,8 @@ from typing import Literal
 
 from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.initialise import Initialisation
+from polarguide.shading.directional import DirectionalShading
+from polarguide.shading.model import ShadingModel
 from polarguide.shading.render import Blend, Shading
 
 Action = Literal[
@@ -50,6 +52,7 @@ class Weights:
         stokes: S1 and S2 that the layers and the normal predict against the measured ones.
         agreement: how far the normals that a pixel blends disagree, where polarization says something.
         flatness: shortest scale of the Gaussians, in percent of the scene's extent.
+        consistency: alpha - cosine of the blended normal with that of the rendered depth.
     """
 
     photometric: float = 1.0
@@ -61,16 +64,18 @@ class Weights:
     stokes: float = 0.0
     agreement: float = 0.0
     flatness: float = 0.0
+    consistency: float = 0.0
 
     @property
     def priors(self) -> bool:
         """Whether a term compares with the priors of a view."""
-        return any((self.specular, self.diffuse, self.stokes, self.normals))
+        layers = self.specular, self.diffuse, self.stokes
+        return any((*layers, self.normal, self.azimuth, self.chromatic, self.agreement))
 
     @property
     def normals(self) -> bool:
         """Whether a term looks at the rendered normals."""
-        return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.agreement))
+        return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.agreement, self.consistency))
 
 
 @dataclass(frozen=True)
@@ -150,6 +155,7 @@ class Recipe:
         blend: how base colour and reflection make the picture (see ``Shading``).
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         local: whether Gaussians add reflected light of their own (see ``Shading``).
+        directional: the shading model in place of ``Shading``, if given; ``environment_*`` then tell its grid.
         first_strength: reflection strength that Gaussians start with.
         environment_spread: first raw texels are uniform in plus or minus this.
         environment_rate: learning rate of the environment's texels.
@@ -166,6 +172,7 @@ class Recipe:
     blend: Blend = "lerp"
     local: bool = False
     oriented: bool = False
+    directional: DirectionalShading | None = None
     first_strength: float = 1e-3
     environment_spread: float = 5.0
     environment_rate: float = 0.05
@@ -177,13 +184,19 @@ class Recipe:
     priors: Priors = field(default_factory=Priors)
     propagation: Propagation = field(default_factory=Propagation)
 
-    def shading(self, index: float) -> Shading:
+    def shading(self, index: float) -> ShadingModel:
         """The shading of this recipe for surfaces of a refractive index."""
-        return Shading(self.blend, index, self.local)
+        return self.directional or Shading(self.blend, index, self.local)
+
+    @property
+    def environment_rates(self) -> dict[str, float]:
+        """Learning rates of the environment's parameters by name."""
+        rate = self.environment_rate
+        return self.directional.rates(rate) if self.directional else {"texels": rate}
 
     @property
     def reflects(self) -> bool:
-        """Whether any stage has reflection (then Gaussians carry a strength)."""
+        """Whether any stage has reflection (then Gaussians carry what its shading needs)."""
         return any(stage.reflection for stage in self.stages)
 
 

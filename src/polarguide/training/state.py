@@ -13,34 +13,52 @@ from polarguide.gaussians.rows import GaussianRows
 
 
 class Environment:
-    """The learned surroundings: a cubemap of raw texels with its own Adam state."""
+    """The learned surroundings: named parameters with their own Adam state.
 
-    def __init__(self, texels: Tensor, rate: float) -> None:
-        self.texels = texels.detach().clone().contiguous().requires_grad_()
-        self._optimiser = torch.optim.Adam([self.texels], lr=rate, eps=1e-15, fused=True)
+    Args:
+        parameters: by name; a cubemap's raw texels are ``texels``.
+        rates: learning rate of each.
+
+    Raises:
+        KeyError: a parameter without a rate.
+    """
+
+    def __init__(self, parameters: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
+        self.parameters = {
+            name: t.detach().clone().contiguous().requires_grad_() for name, t in parameters.items()
+        }
+        groups = [{"params": [t], "lr": rates[name]} for name, t in self.parameters.items()]
+        self._optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def step(self) -> None:
-        """One Adam step, if there is a gradient."""
-        if self.texels.grad is not None:
+        """One Adam step on what has a gradient."""
+        if any(t.grad is not None for t in self.parameters.values()):
             self._optimiser.step()
             self._optimiser.zero_grad(set_to_none=True)
 
     def state(self) -> dict[str, Tensor]:
-        """``environment.texels`` and its moments."""
-        out = {"environment.texels": self.texels.detach()}
-        for key, value in self._optimiser.state.get(self.texels, {}).items():
-            out[f"environment.adam.{key}"] = value.detach()
+        """``environment.NAME`` and their moments."""
+        out = {f"environment.{name}": t.detach() for name, t in self.parameters.items()}
+        for name, t in self.parameters.items():
+            for key, value in self._optimiser.state.get(t, {}).items():
+                out[_moments(name) + key] = value.detach()
         return out
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Tensor], rate: float) -> Environment:
-        """The inverse of ``state``."""
-        environment = cls(state["environment.texels"], rate)
-        prefix = "environment.adam."
-        moments = {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
-        if moments:
-            environment._optimiser.state[environment.texels] = moments
+    def from_state(cls, state: Mapping[str, Tensor], rates: Mapping[str, float]) -> Environment:
+        """The inverse of ``state``; the names are those of ``rates``."""
+        environment = cls({name: state[f"environment.{name}"] for name in rates}, rates)
+        for name, t in environment.parameters.items():
+            keys = {key: _moments(name) + key for key in ("step", "exp_avg", "exp_avg_sq")}
+            moments = {key: state[full].clone() for key, full in keys.items() if full in state}
+            if moments:
+                environment._optimiser.state[t] = moments
         return environment
+
+
+def _moments(name: str) -> str:
+    """Prefix of a parameter's moments; the texels' had it to themselves in the first checkpoints."""
+    return "environment.adam." if name == "texels" else f"environment.adam.{name}."
 
 
 @dataclass
@@ -81,13 +99,13 @@ class TrainingState:
 
     @classmethod
     def from_tensors(
-        cls, tensors: Mapping[str, Tensor], rates: Mapping[str, float], environment_rate: float
+        cls, tensors: Mapping[str, Tensor], rates: Mapping[str, float], environment_rates: Mapping[str, float]
     ) -> TrainingState:
         """The inverse of ``tensors``."""
         rows = GaussianRows.from_state(tensors, rates)
         environment = None
         if "environment.texels" in tensors:
-            environment = Environment.from_state(tensors, environment_rate)
+            environment = Environment.from_state(tensors, environment_rates)
         statistics = DensityStatistics(len(rows))
         statistics.gradient, statistics.seen = tensors["statistics.gradient"], tensors["statistics.seen"]
         frozen = {key[7:]: value for key, value in tensors.items() if key.startswith("frozen.")}

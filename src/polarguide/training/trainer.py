@@ -11,7 +11,7 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.gaussians.densify import DensityStatistics, densify
 from polarguide.gaussians.free_space import free_space
-from polarguide.gaussians.initialise import initial_rows, scene_extent
+from polarguide.gaussians.initialise import SH_C0, initial_rows, scene_extent
 from polarguide.gaussians.rows import GaussianRows
 from polarguide.raster import Backend, ScreenStatistic
 from polarguide.shading.display import srgb_decode, srgb_encode
@@ -67,7 +67,14 @@ def first_state(scene: Scene, recipe: Recipe, settings: TrainSettings) -> Traini
     environment = None
     if recipe.oriented:
         tensors["outward"] = torch.zeros(count, 3)
-    if recipe.reflects:
+    if recipe.directional is not None:
+        generator = _seeded(settings.seed, 5)
+        tensors.update(recipe.directional.first_rows(tensors["sh_dc"] * SH_C0 + 0.5, generator))
+        light = recipe.directional.first_light_values(
+            recipe.environment_resolution, recipe.environment_spread, generator
+        )
+        environment = Environment(light, recipe.environment_rates)
+    elif recipe.reflects:
         logit = torch.logit(torch.tensor(recipe.first_strength))
         tensors["strength_logits"] = logit.expand(count).clone()
         if recipe.local:
@@ -75,7 +82,7 @@ def first_state(scene: Scene, recipe: Recipe, settings: TrainSettings) -> Traini
             tensors["local_rest"] = torch.zeros(count, 15, 3)
         size = (6, recipe.environment_resolution, recipe.environment_resolution, 3)
         uniform = torch.rand(size, generator=_seeded(settings.seed, 1)) * 2 - 1
-        environment = Environment(uniform * recipe.environment_spread, recipe.environment_rate)
+        environment = Environment({"texels": uniform * recipe.environment_spread}, recipe.environment_rates)
     rows = GaussianRows(tensors, recipe.rates)
     return TrainingState(0, rows, environment, DensityStatistics(count))
 
@@ -130,9 +137,10 @@ class Trainer:
             view.camera,
             self.backend.rasterise,
             sh_degree=self.schedule.sh_degree(state.step),
-            environment=state.environment.texels if state.environment and stage.reflection else None,
+            environment=state.environment.parameters if state.environment and stage.reflection else None,
             shading=recipe.shading(self.settings.refractive_index),
             normals=stage.weights.normals,
+            depth=stage.weights.consistency > 0,
             statistic=statistic,
         )
         shown = self._shown_photograph(view)
@@ -147,6 +155,7 @@ class Trainer:
             index=self.settings.refractive_index,
             log_scales=state.rows["log_scales"],
             extent=self._extent,
+            camera=view.camera,
         )
         loss.backward()
         if statistic is not None and statistic.gradient is not None:

@@ -1,0 +1,29 @@
+"""The baseline Ref-GS (Zhang et al. 2025) on our Gaussians: directional factorization, RGB alone."""
+
+from __future__ import annotations
+
+from polarguide.recipes.baselines import RATES_3DGS, RESET
+from polarguide.shading.directional import DirectionalShading
+from polarguide.training.stages import Recipe, Stage, Weights
+
+WEIGHTS = Weights(consistency=0.05, flatness=0.1)
+
+RECIPE_REF_GS = Recipe(
+    name="ref-gs",
+    about="Deferred shading with a learned directional grid and an MLP: RGB alone.",
+    stages=(
+        Stage("densify", 0.5, reflection=True, weights=WEIGHTS, densify=True, repeats=(RESET,)),
+        Stage("refine", 0.5, reflection=True, weights=WEIGHTS),
+    ),
+    rates={
+        **RATES_3DGS,
+        "quaternions": 1e-2,
+        "log_albedo": 1e-3,
+        "roughness_logits": 2e-3,
+        "features": 2e-3,
+    },
+    directional=DirectionalShading(width=64),
+    environment_spread=0.5,
+    environment_rate=2e-3,
+    environment_resolution=32,
+)

@@ -1,0 +1,160 @@
+"""Directional factorization (Ref-GS, Zhang et al. 2025), deferred: light of a learned grid of feature vectors.
+
+One alpha blend splats albedo (3), normal (3), roughness (1) and a feature (4). Per pixel, with ``w`` the view ray
+mirrored at the blended normal and ``r`` the roughness,
+
+    h = grid(w, level = L r)                  16 values of a learned cubemap with L box-filtered levels
+    specular = exp(min(MLP(h, h x f), 5))     f the blended feature at unit length, h x f their outer product (64)
+    final = albedo + specular
+
+in linear radiance. The MLP has two hidden layers with ReLU. The albedo does not depend on the view.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+from torch.nn.functional import relu
+
+from polarguide.camera import Camera
+from polarguide.shading.mips import box_mips, mip_lookup
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, Rows, mirrored
+from polarguide.vectors import unit
+
+CHANNELS, FEATURES = 16, 4
+INPUTS = CHANNELS * (1 + FEATURES)
+# Brightest albedo is e^5 / 5, about 30 times display white (the release's scale).
+ALBEDO_SCALE = 0.2
+# Pixels with less alpha than this get no specular light: there is no surface to reflect it.
+MINIMUM_ALPHA = 0.05
+_DARKEST = 1e-3  # a black point's first albedo, so that its logarithm is finite
+
+
+def albedo_of(rows: Rows) -> Tensor:
+    """Albedo [N, 3], ``exp(min(x, 5)) / 5`` of the rows ``log_albedo``."""
+    return ALBEDO_SCALE * rows["log_albedo"].clamp(max=MAXIMUM_LOG_LIGHT).exp()
+
+
+@dataclass(frozen=True)
+class DirectionalShading:
+    """The shading model, and what it begins with.
+
+    Attributes:
+        width: of the MLP's two hidden layers.
+        mlp_rate: learning rate of the MLP.
+        first_albedo: share of the first points' colours that albedo begins with, in (0, 1].
+        first_roughness: that Gaussians begin with, in (0, 1).
+        first_light: specular radiance before the first step (the MLP's output bias is its logarithm).
+    """
+
+    width: int = 256
+    mlp_rate: float = 5e-4
+    first_albedo: float = 0.5
+    first_roughness: float = 0.5
+    first_light: float = 0.25
+
+    def first_rows(self, colours: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        """The side tensors ``log_albedo`` [N, 3], ``roughness_logits`` [N] and ``features`` [N, 4] to begin with.
+
+        Args:
+            colours: [N, 3] linear, of the first Gaussians. generator: draws the features.
+        """
+        count = colours.shape[0]
+        albedo = (self.first_albedo * colours).clamp(min=_DARKEST)
+        logit = math.log(self.first_roughness / (1 - self.first_roughness))
+        return {
+            "log_albedo": torch.log(albedo / ALBEDO_SCALE),
+            "roughness_logits": torch.full((count,), logit),
+            "features": torch.randn(count, FEATURES, generator=generator),
+        }
+
+    def first_light_values(
+        self, resolution: int, spread: float, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """The light's parameters to begin with.
+
+        Args:
+            resolution: texels along a cube face's side, a power of two. spread: texels are uniform in plus or minus
+                this. generator: draws the texels, then the MLP (uniform within 1 / sqrt(inputs), as torch's Linear).
+
+        Returns:
+            ``texels`` [6, R, R, 16], and ``mlp_weight_K`` [inputs, outputs], ``mlp_bias_K`` [outputs], K = 0, 1, 2.
+        """
+        size = (6, resolution, resolution, CHANNELS)
+        values = {"texels": (torch.rand(size, generator=generator) * 2 - 1) * spread}
+        sizes = (INPUTS, self.width, self.width, 3)
+        for layer, (inputs, outputs) in enumerate(pairwise(sizes)):
+            bound = 1 / math.sqrt(inputs)
+            for name, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
+                uniform = torch.rand(shape, generator=generator) * 2 - 1
+                values[f"mlp_{name}_{layer}"] = uniform * bound
+        values["mlp_bias_2"] = torch.full((3,), math.log(self.first_light))
+        return values
+
+    def rates(self, texel_rate: float) -> dict[str, float]:
+        """Learning rates of the light's parameters by name; texels learn at ``texel_rate``."""
+        mlp = {f"mlp_{name}_{layer}": self.mlp_rate for layer in range(3) for name in ("weight", "bias")}
+        return {"texels": texel_rate, **mlp}
+
+    def radiance(
+        self, light: Mapping[str, Tensor], directions: Tensor, roughness: Tensor, features: Tensor
+    ) -> Tensor:
+        """Specular radiance [P, 3], in (0, e^5].
+
+        Args:
+            light: parameters as of ``first_light_values``.
+            directions: [P, 3] mirrored rays, of any length.
+            roughness: [P] in [0, 1]; from ``1 - 1 / L`` on, with L mip levels, it reads the mean of the grid.
+            features: [P, 4] of any length; zero reads the light without them.
+        """
+        levels = box_mips(light["texels"])
+        found = mip_lookup(levels, directions, len(levels) * roughness)
+        squared = features.square().sum(dim=-1, keepdim=True)
+        factors = features * torch.rsqrt(squared.clamp(min=1e-6))
+        outer = (found[:, :, None] * factors[:, None, :]).flatten(1)
+        hidden = torch.cat((found, outer), dim=1)
+        for layer in (0, 1):
+            hidden = relu(torch.addmm(light[f"mlp_bias_{layer}"], hidden, light[f"mlp_weight_{layer}"]))
+        out = torch.addmm(light["mlp_bias_2"], hidden, light["mlp_weight_2"])
+        return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
+
+    def channels(self, rows: Rows, normals: Tensor, centre: Tensor, sh_degree: int) -> list[Tensor]:
+        """Albedo [N, 3]; then roughness and feature together, [N, 5]. No harmonics are read."""
+        roughness = torch.sigmoid(rows["roughness_logits"])[:, None]
+        return [albedo_of(rows), torch.cat((roughness, torch.tanh(rows["features"])), dim=1)]
+
+    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+        """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the colour that was splatted is albedo."""
+        albedo, normal, further, alpha = splatted
+        rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
+        directions = mirrored(rays, unit(normal, 1e-3))
+        radiance = self.radiance(
+            light,
+            directions.reshape(-1, 3),
+            further[..., 0].flatten(),
+            further[..., 1 : 1 + FEATURES].reshape(-1, FEATURES),
+        ).reshape(albedo.shape)
+        specular = radiance * (alpha > MINIMUM_ALPHA)[..., None]
+        return {"final": albedo + specular, "specular": specular, "diffuse": albedo}
+
+    def colours(self, rows: Rows, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor) -> Tensor:
+        """Each Gaussian shaded alone, at its own normal, roughness and feature: linear colours [N, 3].
+
+        Args:
+            rays: [N, 3] unit. normals: [N, 3] unit, facing them.
+        """
+        roughness, features = torch.sigmoid(rows["roughness_logits"]), torch.tanh(rows["features"])
+        return albedo_of(rows) + self.radiance(light, mirrored(rays, normals), roughness, features)
+
+    def fields(self, rows: Rows) -> dict[str, Tensor]:
+        """What a PLY of the Gaussians keeps besides display colours: ``albedo``, ``roughness``, ``feature``."""
+        return {
+            "albedo": albedo_of(rows),
+            "roughness": torch.sigmoid(rows["roughness_logits"]),
+            "feature": torch.tanh(rows["features"]),
+        }

@@ -1,0 +1,61 @@
+"""What every shading model of deferred reflection offers to rendering and to export."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol
+
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.vectors import dot
+
+# Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
+MAXIMUM_LOG_LIGHT = 5.0
+
+
+class Rows(Protocol):
+    """Named per-Gaussian tensors: the trainable rows, or a frozen copy of them."""
+
+    def __getitem__(self, name: str, /) -> Tensor: ...
+    def __contains__(self, name: str, /) -> bool: ...
+
+
+class GBuffer(NamedTuple):
+    """What was splatted for a picture that is shaded afterwards.
+
+    Attributes:
+        colour: [H, W, 3].
+        normal: [H, W, 3] blended, world axes.
+        further: [H, W, K] channels of the shading model (others may follow).
+        alpha: [H, W].
+    """
+
+    colour: Tensor
+    normal: Tensor
+    further: Tensor
+    alpha: Tensor
+
+
+class ShadingModel(Protocol):
+    """What a recipe's reflection splats, and how it makes the picture of it.
+
+    ``light`` is the learned environment: its parameters by name.
+    """
+
+    def channels(self, rows: Rows, normals: Tensor, centre: Tensor, sh_degree: int) -> list[Tensor]:
+        """Per Gaussian: colours [N, 3], then what is blended behind colour and normal, each [N, C]."""
+
+    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+        """Layers of a picture by their names in ``RenderResult``; ``final`` at least."""
+
+    def colours(self, rows: Rows, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor) -> Tensor:
+        """Linear colours [N, 3] of Gaussians shaded one by one, along unit rays [N, 3] at facing normals [N, 3]."""
+
+    def fields(self, rows: Rows) -> dict[str, Tensor]:
+        """What a PLY of the Gaussians keeps besides display colours, [N, ...] by name."""
+
+
+def mirrored(rays: Tensor, normals: Tensor) -> Tensor:
+    """Directions of rays [..., 3] after reflection at unit normals [..., 3]."""
+    return rays - 2 * dot(rays, normals)[..., None] * normals

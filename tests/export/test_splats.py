@@ -1,0 +1,88 @@
+"""The PLY of a run with each shading model: display colours, and the model's own fields."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from polarguide.export import write_run_ply
+from polarguide.export.splats import shown_colours
+from polarguide.gaussians.densify import DensityStatistics
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.gaussians.ply import read_ply
+from polarguide.gaussians.rows import GaussianRows
+from polarguide.recipes import RECIPES
+from polarguide.shading.display import srgb_encode
+from polarguide.shading.model import ShadingModel
+from polarguide.training.state import Environment, TrainingState
+
+COUNT = 7
+FIELDS = {
+    "3dgs": {"linear_dc", "linear_rest"},
+    "3dgs-dr": {"linear_dc", "linear_rest", "strength"},
+    "ref-gs": {"albedo", "roughness", "feature"},
+}
+
+
+def trained(name: str) -> tuple[TrainingState, ShadingModel]:
+    """A state as the recipe's training would leave, of seven random Gaussians."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    recipe = RECIPES[name]
+    rows = {
+        "means": normal(COUNT, 3),
+        "quaternions": normal(COUNT, 4),
+        "log_scales": normal(COUNT, 3) - 2,
+        "opacity_logits": normal(COUNT),
+        "sh_dc": 0.3 * normal(COUNT, 3),
+        "sh_rest": 0.05 * normal(COUNT, 15, 3),
+    }
+    light = None
+    if recipe.directional is not None:
+        rows |= recipe.directional.first_rows(0.5 + 0.28 * rows["sh_dc"], generator)
+        light = recipe.directional.first_light_values(8, 0.5, generator)
+    elif recipe.reflects:
+        rows["strength_logits"] = normal(COUNT)
+        light = {"texels": normal(6, 8, 8, 3)}
+    environment = Environment(light, recipe.environment_rates) if light else None
+    state = TrainingState(0, GaussianRows(rows, recipe.rates), environment, DensityStatistics(COUNT))
+    return state, recipe.shading(1.5)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_the_file_holds_display_colours_and_the_fields_of_the_model(name: str, tmp_path: Path) -> None:
+    state, shading = trained(name)
+    write_run_ply(tmp_path / "run.ply", state, shading)
+    read = read_ply(tmp_path / "run.ply")
+    assert set(read["extra"]) == FIELDS[name]
+    assert all(bool(torch.isfinite(t).all()) for t in (read["sh_dc"], read["sh_rest"]))
+    for field, values in shading.fields(state.rows).items():
+        torch.testing.assert_close(read["extra"][field], values.detach())
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_colours_are_in_range_and_change_with_the_view(name: str) -> None:
+    state, shading = trained(name)
+    directions = normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    colours = shown_colours(state, shading, directions)
+    assert colours.shape == (COUNT, 5, 3)
+    assert 0 <= float(colours.min()) <= float(colours.max()) <= 1
+    assert float(colours.std(dim=1).max()) > 1e-4
+
+
+def test_a_directional_gaussian_shows_its_albedo_and_the_light_in_its_mirror() -> None:
+    state, shading = trained("ref-gs")
+    assert state.environment is not None
+    rows, ray = state.rows, torch.tensor([[0.0, 0.6, 0.8]])
+    normals = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], torch.zeros(3))
+    facing = torch.where(normals @ ray[0][:, None] > 0, -normals, normals)
+    linear = shading.colours(rows, state.environment.parameters, ray.expand(COUNT, 3), facing)
+    expected = srgb_encode(linear.detach().clamp(0, 1))
+    torch.testing.assert_close(shown_colours(state, shading, ray)[:, 0], expected)

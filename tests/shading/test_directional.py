@@ -1,0 +1,179 @@
+"""Ref-GS shading: the directional light against a plain evaluation, its layers, and degenerate G-buffers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from polarguide.camera import Camera
+from polarguide.raster.cpu import rasterise_cpu
+from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
+from polarguide.shading.mips import box_mips, mip_lookup
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, mirrored
+from polarguide.shading.render import render
+
+SHADING = DirectionalShading(width=8)
+COUNT, RESOLUTION, LEVELS = 30, 8, 5
+
+
+def camera() -> Camera:
+    eye, back = torch.eye(3, dtype=torch.float64), torch.tensor([0.1, -0.2, 4.0], dtype=torch.float64)
+    return Camera(24, 20, 30.0, 30.0, 12.0, 10.0, eye, back)
+
+
+def normal(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def light(dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    values = SHADING.first_light_values(RESOLUTION, 1.0, torch.Generator().manual_seed(0))
+    return {name: t.to(dtype) for name, t in values.items()}
+
+
+@pytest.fixture
+def rows() -> dict[str, Tensor]:
+    core = {
+        "means": 0.7 * normal(1, COUNT, 3),
+        "quaternions": normal(2, COUNT, 4),
+        "log_scales": -1.5 + 0.5 * normal(3, COUNT, 3),
+        "opacity_logits": normal(4, COUNT),
+    }
+    return core | SHADING.first_rows(torch.rand(COUNT, 3), torch.Generator().manual_seed(5))
+
+
+def plainly(values: dict[str, Tensor], ray: Tensor, roughness: Tensor, feature: Tensor) -> Tensor:
+    """The formula for one pixel, loop by loop."""
+    level = (LEVELS * roughness).clamp(max=LEVELS - 1)[None]
+    h = mip_lookup(box_mips(values["texels"]), ray[None], level)[0]
+    f = feature / feature.norm()
+    outer = torch.stack([h[i] * f[j] for i in range(CHANNELS) for j in range(FEATURES)])
+    x = torch.cat((h, outer))
+    for layer in range(3):
+        x = x @ values[f"mlp_weight_{layer}"] + values[f"mlp_bias_{layer}"]
+        x = x.clamp(min=0) if layer < 2 else x
+    return torch.exp(x.clamp(max=5.0))
+
+
+def test_radiance_as_plainly_evaluated() -> None:
+    values, rays = light(torch.float64), normal(6, 40, 3).double()
+    roughness, features = torch.rand(40).double(), normal(7, 40, FEATURES).double()
+    found = SHADING.radiance(values, rays, roughness, features)
+    for i in range(40):
+        assert_close(found[i], plainly(values, rays[i], roughness[i], features[i]))
+    single = SHADING.radiance(light(), rays.float(), roughness.float(), features.float())
+    assert_close(single.double(), found, rtol=1e-4, atol=1e-5)
+
+
+def test_radiance_gradients_against_finite_differences() -> None:
+    values = {name: t.requires_grad_() for name, t in light(torch.float64).items()}
+    rays, features = normal(8, 6, 3).double(), normal(9, 6, FEATURES).double()
+    roughness = torch.linspace(0.05, 0.75, 6, dtype=torch.float64)
+    inputs = [t.requires_grad_() for t in (rays, roughness, features)]
+
+    def function(*leaves: Tensor) -> Tensor:
+        named = dict(zip(values, leaves[3:], strict=True))
+        return SHADING.radiance(named, *leaves[:3])
+
+    assert torch.autograd.gradcheck(function, (*inputs, *values.values()), fast_mode=True)
+
+
+def test_a_rough_surface_reads_the_mean_of_the_grid() -> None:
+    """So its light does not depend on where it looks; a smooth one's does."""
+    rays, features = normal(10, 50, 3), torch.ones(50, FEATURES)
+    rough = SHADING.radiance(light(), rays, torch.ones(50), features)
+    assert_close(rough, rough[:1].expand_as(rough), rtol=1e-5, atol=0)
+    mean = light()["texels"].mean(dim=(0, 1, 2)).expand(6, 1, 1, CHANNELS)
+    values = {**light(), "texels": mean}
+    assert_close(rough, SHADING.radiance(values, rays, torch.zeros(50), features), rtol=1e-5, atol=0)
+    smooth = SHADING.radiance(light(), rays, torch.zeros(50), features)
+    assert float(smooth.std(dim=0).min()) > 100 * float(rough.std(dim=0).max())
+
+
+def test_length_of_a_feature_does_not_matter_and_brightness_has_an_end() -> None:
+    rays, roughness, features = normal(11, 20, 3), torch.rand(20), normal(12, 20, FEATURES)
+    once = SHADING.radiance(light(), rays, roughness, features)
+    assert_close(SHADING.radiance(light(), rays, roughness, 0.1 * features), once)
+    bright = {**light(), "mlp_bias_2": torch.full((3,), 99.0)}
+    brightest = torch.full((20, 3), math.exp(MAXIMUM_LOG_LIGHT))
+    assert_close(SHADING.radiance(bright, rays, roughness, features), brightest)
+
+
+def test_layers_add_up_to_the_final_picture(rows: dict[str, Tensor]) -> None:
+    result = render(rows, camera(), rasterise_cpu, environment=light(), shading=SHADING, depth=True)
+    assert result.specular is not None
+    assert result.diffuse is not None
+    assert torch.equal(result.specular + result.diffuse, result.final)
+    assert torch.equal(result.diffuse, result.base)
+    assert result.strength is result.reflection is None
+    assert float(result.specular.min()) >= 0
+    assert not result.specular[result.alpha < 0.04].any(), "light without a surface"
+    assert bool((result.specular[result.alpha > 0.06] > 0).all())
+    assert result.depth is not None
+
+
+def test_without_harmonics_the_view_changes_only_the_specular_layer(rows: dict[str, Tensor]) -> None:
+    """Of one opaque Gaussian that fills the picture the albedo is that of its row, wherever the camera stands."""
+    one = {name: t[:1].clone() for name, t in rows.items()}
+    one["means"], one["log_scales"] = torch.zeros(1, 3), torch.full((1, 3), 3.0)
+    result = render(one, camera(), rasterise_cpu, environment=light(), shading=SHADING)
+    colour = result.diffuse[10, 12] / result.alpha[10, 12]  # type: ignore[index]
+    assert_close(colour, albedo_of(one)[0], rtol=1e-4, atol=1e-5)
+
+
+def test_first_values_are_those_asked_for() -> None:
+    shading = DirectionalShading(width=8, first_albedo=0.4, first_roughness=0.3, first_light=0.1)
+    colours = torch.tensor([[0.5, 0.2, 0.1], [0.0, 1.0, 0.3]])
+    rows = shading.first_rows(colours, torch.Generator().manual_seed(0))
+    assert_close(albedo_of(rows), (0.4 * colours).clamp(min=1e-3))
+    assert_close(torch.sigmoid(rows["roughness_logits"]), torch.full((2,), 0.3))
+    values = shading.first_light_values(4, 0.5, torch.Generator().manual_seed(0))
+    assert values["texels"].shape == (6, 4, 4, CHANNELS)
+    assert_close(values["mlp_bias_2"].exp(), torch.full((3,), 0.1))
+    assert set(shading.rates(1.0)) == set(values)
+    assert shading.rates(1.0)["texels"] == 1.0
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-12, 1e-3])
+def test_degenerate_normals_and_features_stay_finite_with_gradients(scale: float) -> None:
+    size = (20, 24)
+    albedo, alpha = torch.rand(*size, 3).requires_grad_(), torch.ones(size)
+    direction = (scale * normalize(normal(13, *size, 3), dim=-1)).requires_grad_()
+    further = torch.cat((torch.rand(*size, 1), scale * normal(14, *size, FEATURES)), dim=-1).requires_grad_()
+    values = {name: t.requires_grad_() for name, t in light().items()}
+    layers = SHADING.shade(GBuffer(albedo, direction, further, alpha), values, camera())
+    layers["final"].square().mean().backward()
+    for tensor in (layers["final"], albedo.grad, direction.grad, further.grad, values["texels"].grad):
+        assert tensor is not None
+        assert bool(torch.isfinite(tensor).all())
+
+
+def test_every_row_and_parameter_gets_a_gradient(rows: dict[str, Tensor]) -> None:
+    trained = {name: t.clone().requires_grad_() for name, t in rows.items()}
+    values = {name: t.requires_grad_() for name, t in light().items()}
+    result = render(trained, camera(), rasterise_cpu, environment=values, shading=SHADING)
+    result.final.square().mean().backward()
+    for name, tensor in (trained | values).items():
+        assert tensor.grad is not None, name
+        assert bool(torch.isfinite(tensor.grad).all()), name
+        assert bool(tensor.grad.any()), name
+
+
+def test_a_gaussian_alone_is_its_albedo_and_the_light_in_its_mirror(rows: dict[str, Tensor]) -> None:
+    rays = normalize(normal(15, COUNT, 3), dim=-1)
+    normals = normalize(normal(16, COUNT, 3), dim=-1)
+    normals = torch.where((normals * rays).sum(-1, keepdim=True) > 0, -normals, normals)
+    fields = SHADING.fields(rows)
+    assert {name: tuple(t.shape[1:]) for name, t in fields.items()} == {
+        "albedo": (3,),
+        "roughness": (),
+        "feature": (FEATURES,),
+    }
+    expected = fields["albedo"] + SHADING.radiance(
+        light(), mirrored(rays, normals), fields["roughness"], fields["feature"]
+    )
+    assert_close(SHADING.colours(rows, light(), rays, normals), expected)
