@@ -135,6 +135,8 @@ def _train(
     console.print(f"runs: {len(plan)}, of them finished before: {len(plan) - len(wanted)}")
     jobs = [_job(comparison, run, alone=parallel == 1) for run in wanted]
     failures: dict[Path, str] = {}
+    if not jobs:
+        return failures
     with JobProgress(jobs) as progress:
 
         def end(job: Job, error: str | None) -> None:
@@ -183,6 +185,8 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun]) -> None:
         Job(run.label, run.folder, (_scoring(comparison, run, speed=True),), run.settings.steps)
         for run in untimed
     ]
+    if not jobs:
+        return
     console.print(f"timing the pictures of {len(jobs)} runs, one after the other")
     with JobProgress(jobs) as progress:
         run_jobs(
