@@ -14,12 +14,7 @@ from polarguide.shading.directional import DirectionalShading
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.render import Blend, Shading
 
-Action = Literal[
-    "reset_opacity",
-    "propagate_normals",
-    "refresh_priors",
-    "orient_normals",
-]
+Action = Literal["reset_opacity", "propagate_normals", "refresh_priors", "orient_normals"]
 Candidates = Literal["paper", "physical"]
 Separation = Literal["paper", "exact"]
 
