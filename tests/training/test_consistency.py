@@ -69,3 +69,14 @@ def test_any_constant_depth_is_finite_with_gradients(value: float) -> None:
     assert depth.grad is not None
     assert bool(torch.isfinite(normals).all())
     assert bool(torch.isfinite(depth.grad).all())
+
+
+def test_pixels_without_weight_do_not_count() -> None:
+    normal = normalize(torch.tensor(PLANES[1], dtype=torch.float64), dim=0)
+    depth, alpha = depth_of_plane(normal), torch.ones(20, 24, dtype=torch.float64)
+    world = CAMERA.to_world(normal.expand(20, 24, 3)).clone()
+    world[:, :12] = -world[:, :12]
+    weight = torch.zeros(20, 24, dtype=torch.float64)
+    weight[:, 12:] = 1
+    assert float(consistency_loss(result(world, depth, alpha), CAMERA, weight)) == pytest.approx(0, abs=1e-6)
+    assert float(consistency_loss(result(world, depth, alpha), CAMERA, 1 - weight)) > 0.5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from polarguide.errors import PolarguideError
-from polarguide.recipes.ablations import ABLATIONS_POLARGUIDE, ABLATIONS_STOKES
+from polarguide.recipes.ablations import ABLATIONS_3DGS_DR, ABLATIONS_POLARGUIDE, ABLATIONS_STOKES
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
 from polarguide.recipes.ref_gs import RECIPE_REF_GS
@@ -21,6 +21,7 @@ RECIPES: dict[str, Recipe] = {
     )
 }
 ABLATIONS: dict[str, tuple[Recipe, ...]] = {
+    "3dgs-dr": ABLATIONS_3DGS_DR,
     "polarguide": ABLATIONS_POLARGUIDE,
     "polarguide-stokes": ABLATIONS_STOKES,
 }

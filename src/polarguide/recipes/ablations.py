@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from polarguide.recipes.baselines import RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_STOKES
 from polarguide.training.stages import Action, Recipe, Weights
 
@@ -45,6 +46,18 @@ def varied(
 
 
 _NORMAL_TERMS_OFF = {"normal": 0.0, "azimuth": 0.0, "chromatic": 0.0, "agreement": 0.0}
+
+ABLATIONS_3DGS_DR: tuple[Recipe, ...] = (
+    replace(
+        RECIPE_3DGS_DR,
+        name="3dgs-dr:consistent",
+        about="Flat Gaussians whose normals agree with the depth: what geometry gives without polarization.",
+        stages=tuple(
+            replace(stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1))
+            for stage in RECIPE_3DGS_DR.stages
+        ),
+    ),
+)
 
 ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
     varied(
@@ -162,5 +175,11 @@ ABLATIONS_STOKES: tuple[Recipe, ...] = (
         "without-agreement",
         "The normals that a pixel blends need not agree.",
         weights={"agreement": 0.0},
+    ),
+    varied(
+        RECIPE_POLARGUIDE_STOKES,
+        "without-consistency",
+        "Normals need not agree with the depth.",
+        weights={"consistency": 0.0},
     ),
 )

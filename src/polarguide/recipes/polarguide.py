@@ -48,15 +48,17 @@ RECIPE_POLARGUIDE: Recipe = replace(
     priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0, snr=3.0, chromatic=True),
 )
 
+_STOKES_TERMS = Weights(
+    stokes=1.0, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1, consistency=0.05
+)
+
 RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     RECIPE_POLARGUIDE,
     name="polarguide-stokes",
     about="Renders the measurement: S1 and S2 of Fresnel-weighted layers, with local reflections.",
     stages=_stages(
-        Weights(
-            stokes=1.0, specular=0.25, diffuse=0.1, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1
-        ),
-        Weights(stokes=1.0, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
+        replace(_STOKES_TERMS, specular=0.25, diffuse=0.1),
+        _STOKES_TERMS,
         oriented=True,
     ),
     oriented=True,

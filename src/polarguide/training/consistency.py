@@ -30,14 +30,16 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     return pad(camera.to_world(unit(torch.linalg.cross(down, across))), (0, 0, 1, 1, 1, 1))
 
 
-def consistency_loss(result: RenderResult, camera: Camera) -> Tensor:
+def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None = None) -> Tensor:
     """Mean of ``alpha - n . n_depth``: 0 where blended normals agree with each other and with the depth.
 
     Args:
         result: with the blended normal ``n`` (unit normals times weights that add up to alpha) and the depth.
         camera: of the view.
+        weight: [H, W] where it counts; None: everywhere.
     """
     assert result.normal is not None
     assert result.depth is not None
     cosine = dot(result.normal, depth_normals(result.depth, camera))
-    return (result.alpha.detach() - cosine)[1:-1, 1:-1].mean()
+    distance = result.alpha.detach() - cosine
+    return (distance if weight is None else weight * distance)[1:-1, 1:-1].mean()

@@ -129,7 +129,9 @@ def step_loss(
     if weights.flatness:
         total = total + weights.flatness * flatness_loss(log_scales, result.radii, extent)
     if weights.consistency and camera is not None:
-        total = total + weights.consistency * consistency_loss(result, camera)
+        total = total + weights.consistency * consistency_loss(
+            result, camera, None if priors is None else priors.weight
+        )
     if not torch.isfinite(total):
         raise PolarguideError(
             "training",
