@@ -12,6 +12,7 @@ from rich.console import Console
 from polarguide import __version__
 from polarguide.cli.demo import demo
 from polarguide.cli.evaluate import evaluate
+from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
 from polarguide.cli.train import train
@@ -19,6 +20,7 @@ from polarguide.errors import PolarguideError
 
 VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
+    "prepare": prepare,
     "train": train,
     "eval": evaluate,
     "render": render_views,
