@@ -20,7 +20,9 @@ def smooth_light(height: int = 48, width: int = 64, *, peak: float = 0.8, colour
     s0 = 0.5 + 0.25 * np.sin(2.2 * x + 1.0) + 0.2 * np.cos(1.7 * y)
     s0 = s0[..., None] * (np.array([1.0, 0.8, 0.6]) if colour else np.ones(3))
     dolp, aolp = 0.3 + 0.2 * np.sin(2.0 * y + x), 1.0 + 1.5 * x - y
-    stokes = np.stack([s0, s0 * (dolp * np.cos(2 * aolp))[..., None], s0 * (dolp * np.sin(2 * aolp))[..., None]])
+    stokes = np.stack(
+        [s0, s0 * (dolp * np.cos(2 * aolp))[..., None], s0 * (dolp * np.sin(2 * aolp))[..., None]]
+    )
     return stokes * peak / 0.95
 
 
@@ -37,7 +39,9 @@ def busy_light(height: int, width: int, seed: int) -> np.ndarray:
         s0 = np.where((distance < radius)[..., None], tint, s0)
         dolp = np.where(distance < radius * 1.3, rng.uniform(0.05, 0.6), dolp)
         aolp = np.where(distance < radius * 1.3, np.arctan2(centre[1] - y, x - centre[0]), aolp)
-    stokes = np.stack([s0, s0 * (dolp * np.cos(2 * aolp))[..., None], s0 * (dolp * np.sin(2 * aolp))[..., None]])
+    stokes = np.stack(
+        [s0, s0 * (dolp * np.cos(2 * aolp))[..., None], s0 * (dolp * np.sin(2 * aolp))[..., None]]
+    )
     return np.stack([cv2.GaussianBlur(plane, (0, 0), 0.7) for plane in stokes])
 
 
@@ -67,7 +71,8 @@ def pack(values: np.ndarray, packing: str) -> bytes:
     if packing == "12packed":
         flat += [0] * (len(flat) % 2)
         return b"".join(
-            bytes([a >> 4, (a & 15) | (b & 15) << 4, b >> 4]) for a, b in zip(flat[::2], flat[1::2], strict=True)
+            bytes([a >> 4, (a & 15) | (b & 15) << 4, b >> 4])
+            for a, b in zip(flat[::2], flat[1::2], strict=True)
         )
     bits = int(packing[:2])
     flat += [0] * (-len(flat) % (4 if bits == 10 else 2))
@@ -100,7 +105,13 @@ def write_mosaics(
 
 
 def write_shots(
-    folder: Path, view: str, intensities: np.ndarray, *, suffix: str = ".png", bits: int = 16, srgb: bool = False
+    folder: Path,
+    view: str,
+    intensities: np.ndarray,
+    *,
+    suffix: str = ".png",
+    bits: int = 16,
+    srgb: bool = False,
 ) -> None:
     """Four shots ``<angle>/<view><suffix>``."""
     for angle, values in zip(ANGLES, intensities, strict=True):

@@ -10,7 +10,13 @@ from camera_files import COLOUR, MONO, behind, busy_light, mosaic, smooth_light
 
 from polarguide.capture.sensor import DEMOSAIC_MODES, Picture, demosaic, sensor_pattern
 
-MODES = [("half", "bilinear"), ("half", "guided"), ("quarter", "bilinear"), ("full", "bilinear"), ("full", "guided")]
+MODES = [
+    ("half", "bilinear"),
+    ("half", "guided"),
+    ("quarter", "bilinear"),
+    ("full", "bilinear"),
+    ("full", "guided"),
+]
 
 
 def developed(
@@ -26,7 +32,9 @@ def developed(
 
 @pytest.mark.parametrize("colour", [True, False])
 @pytest.mark.parametrize(("mode", "interpolation"), MODES)
-def test_uniform_light_comes_out_exactly_for_every_offset(colour: bool, mode: str, interpolation: str) -> None:
+def test_uniform_light_comes_out_exactly_for_every_offset(
+    colour: bool, mode: str, interpolation: str
+) -> None:
     stokes = np.array([[0.8, 0.6, 0.4], [0.2, -0.1, 0.05], [-0.1, 0.2, 0.1]])
     if not colour:
         stokes = np.repeat(stokes[:, :1], 3, axis=1)
@@ -51,7 +59,9 @@ def test_smooth_light_is_reproduced(colour: bool, mode: str, interpolation: str)
     assert np.abs(picture.intensities - expected)[margin].max() < bound
 
 
-def footprint(colour: bool, mode: str, interpolation: str, place: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def footprint(
+    colour: bool, mode: str, interpolation: str, place: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Where one changed sample changes the picture, and where it makes it invalid."""
     rng = np.random.default_rng(0)
     values = rng.uniform(0.3, 0.6, (32, 32)).astype(np.float32)
@@ -67,7 +77,9 @@ def footprint(colour: bool, mode: str, interpolation: str, place: tuple[int, int
 
 @pytest.mark.parametrize("colour", [True, False])
 @pytest.mark.parametrize(("mode", "interpolation"), MODES)
-def test_a_pixel_is_invalid_wherever_a_bad_sample_is_used(colour: bool, mode: str, interpolation: str) -> None:
+def test_a_pixel_is_invalid_wherever_a_bad_sample_is_used(
+    colour: bool, mode: str, interpolation: str
+) -> None:
     for place in ((16, 16), (17, 14), (15, 19), (0, 0), (31, 3)):
         changed, invalid = footprint(colour, mode, interpolation, place)
         assert not (changed & ~invalid).any()
@@ -109,6 +121,8 @@ def test_polanalyser_agrees(colour: bool) -> None:
         theirs = np.repeat(theirs[..., None], 3, axis=-1)
     pattern = sensor_pattern("IMX250MYR" if colour else "IMX250MZR")
     bad = np.zeros(values.shape, bool)
-    ours = demosaic(values.astype(np.float32), bad, pattern, mode="full", interpolation="bilinear").intensities
+    ours = demosaic(
+        values.astype(np.float32), bad, pattern, mode="full", interpolation="bilinear"
+    ).intensities
     # It rounds after each of its two steps, and treats the border in another way.
     assert np.abs(ours - theirs)[:, 4:-4, 4:-4].max() <= 2.0

@@ -50,7 +50,9 @@ def test_files_that_know_their_size(tmp_path: Path, name: str, bits: int) -> Non
     np.testing.assert_array_equal(stored, np.rint(values * (2**bits - 1)))
 
 
-@pytest.mark.parametrize(("sensor", "rows"), [("IMX250MYR", COLOUR), ("IMX264MYR", COLOUR), ("IMX250MZR", MONO)])
+@pytest.mark.parametrize(
+    ("sensor", "rows"), [("IMX250MYR", COLOUR), ("IMX264MYR", COLOUR), ("IMX250MZR", MONO)]
+)
 def test_patterns_and_their_offsets(sensor: str, rows: tuple[str, ...]) -> None:
     pattern = sensor_pattern(sensor)
     assert tuple(pattern.rows()) == rows
@@ -78,7 +80,9 @@ def test_patterns_and_their_offsets(sensor: str, rows: tuple[str, ...]) -> None:
         (4095, 4095, 12, None, (12, 4095)),
     ],
 )
-def test_full_scale(largest: int, used: int, container: int, bits: int | None, found: tuple[int, int]) -> None:
+def test_full_scale(
+    largest: int, used: int, container: int, bits: int | None, found: tuple[int, int]
+) -> None:
     levels = find_levels(largest, used, container, bits=bits, black=0.0, saturation=None)
     assert (levels.bits, levels.white) == found
     assert levels.saturation == levels.white

@@ -26,7 +26,7 @@ UNIDENTIFIED = (
     "Only the ratio of the pair sums is estimated: I0/I90 and I45/I135 of the instrument cannot be told from the "
     "polarization of the scene, nor the common gain from its brightness."
 )
-_FEWEST = 256
+_FEWEST = 32
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
         usable: [...], what may be looked at.
 
     Returns:
-        The ratio, or None where fewer than 256 samples are bright enough to tell.
+        The ratio, or None where fewer than 32 samples are bright enough to tell.
     """
     i0, i45, i90, i135 = angles[:, usable].astype(np.float64)
     first, second = i0 + i90, i45 + i135

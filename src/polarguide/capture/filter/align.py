@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-SMALLEST = 0.1
-"""Shifts under this many pixels are left alone: resampling would cost more sharpness than they do."""
+SMALLEST = 0.2
+"""Shifts under this many pixels are left alone: resampling would cost more sharpness than they do, and polarization
+misleads the estimate by about as much."""
 LARGEST_SHARE = 0.05
 """Shifts above this share of the picture's width are no shake; they are reported, not corrected."""
 
+_BETTER = 0.95
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
 
 
@@ -36,13 +38,30 @@ def find_shifts(linear: NDArray[np.float32]) -> list[Shift]:
 
     Phase correlation of the logarithms' fine detail finds a start (brightness and polarization change slowly
     across a surface, edges stay); maximising the enhanced correlation coefficient refines it to a fraction of
-    a pixel.
+    a pixel. Edges of polarization can mislead both, so the shifts are trusted only if with them
+    I0 + I90 = I45 + I135 holds better than without.
 
     Args:
         linear: [4, H, W, 3] linear intensities.
     """
     detail = [_detail(shot) for shot in linear]
-    return [Shift(0.0, 0.0, True), *(_shift(detail[0], other) for other in detail[1:])]
+    shifts = [Shift(0.0, 0.0, True), *(_shift(detail[0], other) for other in detail[1:])]
+    if not any(shift.corrected for shift in shifts):
+        return shifts
+    whole = np.zeros(linear.shape[:3], bool)
+    after = _disagreement(*aligned(linear, whole, shifts))
+    if after < _BETTER * _disagreement(linear, whole):
+        return shifts
+    return [shifts[0], *(replace(shift, trusted=False) for shift in shifts[1:])]
+
+
+def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
+    """Mean |I0 + I90 - I45 - I135|, common gains taken out, relative to the light."""
+    i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad.any(axis=0)]
+    first, second = i0 + i90, i45 + i135
+    if not second.sum() > 0:
+        return 0.0
+    return float(np.abs(first - second * (first.sum() / second.sum())).sum() / first.sum())
 
 
 def aligned(

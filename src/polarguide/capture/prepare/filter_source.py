@@ -140,6 +140,6 @@ def _shift_notes(view: str, shifts: list[Shift]) -> list[str]:
             )
         elif not shift.trusted:
             notes.append(
-                f"{view}: no shift could be told between the shots at 0 and {angle}; they are used as they are."
+                f"{view}: no trustworthy shift between the shots at 0 and {angle}; they are used as they are."
             )
     return notes

@@ -89,7 +89,7 @@ class MosaicSource:
             self._require_alike(path, values, shape)
             container = self._container(path, values)
             largest, used = max(largest, int(values.max())), used | int(np.bitwise_or.reduce(values, None))
-            samples.append(_blocks(self._cut(values)))
+            samples.append(_blocks(self._cut(values), 2 * self._pattern.period))
             advance(count)
         assert shape is not None
         asked = self._settings
@@ -97,7 +97,7 @@ class MosaicSource:
             largest, used, container, bits=asked.bits, black=asked.black_level, saturation=asked.saturation
         )
         dark = self._dark(shape[0])
-        floor = None if dark is None else _blocks(dark)
+        floor = None if dark is None else _blocks(dark, 2 * self._pattern.period)
         angles, colours, usable = self._sampled(samples, levels, floor)
         ratio = pair_ratio(angles, usable)
         gains, notes = self._gains(ratio)
@@ -193,16 +193,28 @@ class MosaicSource:
     def _sampled(
         self, samples: list[NDArray[Any]], levels: Levels, floor: NDArray[np.float32] | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Means over 4x4 superpixels: by angle [4, N], by colour [3, N], and those that can be used [N]."""
+        """Light at the centres of blocks: by angle [4, N], by colour [3, N], and those that can be used [N].
+
+        Samples of different angles lie beside one another; weights that interpolate all of them to the centre
+        of a block of two periods keep gradients of the picture out of the ratio of the pair sums.
+        """
         blocks = np.concatenate(samples)
         base = levels.black if floor is None else np.tile(floor, (len(samples), 1, 1))
         linear = (blocks - base) / (levels.white - levels.black)
-        repeat = 4 // self._pattern.period
-        places = np.tile(self._pattern.angles, (repeat, repeat))
-        angles = np.stack([linear[:, places == angle].mean(axis=1) for angle in ANGLES])
+        period = self._pattern.period
+        rising = (np.arange(period) + 0.5) / period
+        tent = np.concatenate([rising, rising[::-1]])
+        weighted = linear * tent[:, None] * tent
+        places = np.tile(self._pattern.angles, (2, 2))
+        filters = (
+            np.zeros_like(places) if self._pattern.colours is None else np.tile(self._pattern.colours, (2, 2))
+        )
+        # The weights of one angle and colour add up to 1 a sample of the period.
+        angles = np.stack([weighted[:, places == angle].sum(axis=1) for angle in ANGLES])
+        angles *= 4 / period**2
         colours = np.ones((3, len(blocks)))
         if self._pattern.colours is not None:
-            colours = np.stack([linear[:, self._pattern.colours == c].mean(axis=1) for c in range(3)])
+            colours = np.stack([weighted[:, filters == c].sum(axis=1) for c in range(3)]) / [[4], [8], [4]]
         usable = (blocks < levels.saturation).all(axis=(1, 2)) & (blocks > base).any(axis=(1, 2))
         return angles, colours, np.asarray(usable)
 
@@ -240,8 +252,9 @@ def _grey_world(colours: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2])
 
 
-def _blocks(values: NDArray[Any]) -> NDArray[Any]:
-    """Some 4x4 blocks of a mosaic, spread over it, [N, 4, 4]."""
-    rows, columns = values.shape[0] // 4, values.shape[1] // 4
-    blocks = values[: rows * 4, : columns * 4].reshape(rows, 4, columns, 4).swapaxes(1, 2).reshape(-1, 4, 4)
+def _blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
+    """Some blocks of a mosaic, spread over it, [N, size, size]."""
+    rows, columns = values.shape[0] // size, values.shape[1] // size
+    blocks = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
+    blocks = blocks.swapaxes(1, 2).reshape(-1, size, size)
     return blocks[:: max(1, len(blocks) // _BLOCKS)].copy()
