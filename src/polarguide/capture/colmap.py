@@ -127,12 +127,12 @@ def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
 
 
 def find_model(root: Path, *, itself: bool = True) -> tuple[Path, str]:
-    """The folder of a model and the suffix of its files: in ``sparse/0``, ``sparse`` or the folder itself.
+    """The folder of a model and the suffix of its files: in ``sparse/0`` or ``sparse``, else ``0`` or ``root`` itself.
 
     Raises:
         PolarguideError: there is none, or a file of it is missing.
     """
-    for folder in (root / "sparse" / "0", root / "sparse", *([root] if itself else [])):
+    for folder in (root / "sparse" / "0", root / "sparse", *([root / "0", root] if itself else [])):
         for kind in (".bin", ".txt"):
             if (folder / ("cameras" + kind)).exists():
                 missing = [n for n in ("images", "points3D") if not (folder / (n + kind)).exists()]
