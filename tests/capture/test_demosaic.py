@@ -115,10 +115,7 @@ def test_polanalyser_agrees(colour: bool) -> None:
     values = np.rint(mosaic(light, COLOUR if colour else MONO) * 65535).astype(np.uint16)
     code = reference.COLOR_PolarRGB if colour else reference.COLOR_PolarMono
     theirs = np.stack([picture.astype(float) for picture in reference.demosaicing(values, code)])
-    if colour:
-        theirs = theirs[..., ::-1]
-    else:
-        theirs = np.repeat(theirs[..., None], 3, axis=-1)
+    theirs = theirs[..., ::-1] if colour else np.repeat(theirs[..., None], 3, axis=-1)
     pattern = sensor_pattern("IMX250MYR" if colour else "IMX250MZR")
     bad = np.zeros(values.shape, bool)
     ours = demosaic(

@@ -160,8 +160,9 @@ def test_poses_may_follow_on_none(tmp_path: Path) -> None:
     settings = replace(MOSAIC, sensor="IMX250MZR", poses="none")
     prepare_scene(tmp_path / "in", tmp_path / "out", settings)
     written = (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns
-    model = write_model(tmp_path / "model", NAMES, "PINHOLE 64 48 80 82 32 24")
+    model = write_model(tmp_path / "model", NAMES[:2], "PINHOLE 64 48 80 82 32 24")
     done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(settings, poses=str(model)))
     assert done.new
+    assert done.left_out == ["v002"]
     assert (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns == written
-    assert len(load_scene(tmp_path / "out").views) == 3
+    assert len(load_scene(tmp_path / "out").views) == 2

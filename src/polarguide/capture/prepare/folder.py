@@ -44,6 +44,7 @@ class SceneFolder:
         self.measured: dict[str, Any] | None = None
         self.views: dict[str, dict[str, Any]] = {}
         self.finished = False
+        self._follows_none = False
         if root.exists() and not root.is_dir():
             raise PolarguideError(
                 root, expected="a folder to write", found="a file", remedy="Give another --out."
@@ -131,6 +132,12 @@ class SceneFolder:
         files[f"invalid/{view}.png"] = invalid.astype(np.uint8) * 255
         sizes = {name: write_whole(self.root / name, encoded(pixels)) for name, pixels in files.items()}
         self.views[view] = {**record, "files": sizes}
+        self.save()
+
+    def drop(self, view: str) -> None:
+        """Remove a view that an earlier call without poses wrote, and that has none."""
+        for name in self.views.pop(view)["files"]:
+            (self.root / name).unlink(missing_ok=True)
         self.save()
 
     def _state(self) -> dict[str, Any]:

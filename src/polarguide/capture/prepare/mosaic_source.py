@@ -30,7 +30,7 @@ from polarguide.capture.sensor import (
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 
-_BLOCKS = 4096
+_BLOCKS = 1024
 _SMALLEST = 16
 
 
@@ -255,6 +255,6 @@ def _grey_world(colours: NDArray[np.float64]) -> tuple[float, float, float]:
 def _blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
     """Some blocks of a mosaic, spread over it, [N, size, size]."""
     rows, columns = values.shape[0] // size, values.shape[1] // size
-    blocks = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
-    blocks = blocks.swapaxes(1, 2).reshape(-1, size, size)
+    grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
+    blocks = grid.swapaxes(1, 2).reshape(-1, size, size)
     return blocks[:: max(1, len(blocks) // _BLOCKS)].copy()

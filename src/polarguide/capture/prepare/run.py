@@ -11,7 +11,7 @@ from typing import Any
 from polarguide import __version__
 from polarguide.capture.colmap import read_model
 from polarguide.capture.filter import find_shots
-from polarguide.capture.layout import contents
+from polarguide.capture.layout import angle_folders, contents
 from polarguide.capture.prepare.filter_source import FilterSource
 from polarguide.capture.prepare.folder import SFM, SceneFolder, encoded, guarded, write_whole
 from polarguide.capture.prepare.mosaic_source import MosaicSource
@@ -20,7 +20,7 @@ from polarguide.capture.prepare.reporter import Reporter
 from polarguide.capture.prepare.settings import PrepareSettings, check_format, check_settings
 from polarguide.capture.prepare.sfm import reconstruct, tone_mapped
 from polarguide.capture.prepare.source import Geometry, Source
-from polarguide.capture.view import ANGLES, listed
+from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
 _PARTIAL = ".sparse.partial"
@@ -111,8 +111,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
         )
     kind = settings.format
     if kind == "auto":
-        complete = any(len(files) == len(ANGLES) for files in find_shots(root).values())
-        kind = "filter" if complete or any(path.is_dir() for path in _angle_like(root)) else "mosaic"
+        several = any(len(files) > 1 for files in find_shots(root).values())
+        kind = "filter" if several or angle_folders(root) else "mosaic"
     check_format(settings, kind)
     found = FilterSource(root, settings) if kind == "filter" else MosaicSource(root, settings)
     if not found.views:
@@ -123,12 +123,6 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             remedy="See docs/formats.md for the layouts.",
         )
     return found
-
-
-def _angle_like(root: Path) -> list[Path]:
-    return [
-        path for path in root.iterdir() if path.name.lstrip("Ii-_").lstrip("0") in ("", "45", "90", "135")
-    ]
 
 
 def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Poses | None) -> dict[str, Any]:
@@ -174,6 +168,8 @@ def _structure(folder: SceneFolder, pictures: Source, settings: PrepareSettings,
 def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:
     assert folder.measured is not None
     views = pictures.views if poses is None else poses.views
+    for view in folder.views.keys() - set(views):
+        folder.drop(view)
     with reporter.track("writing views", len(views)) as advance:
         for count, view in enumerate(views, 1):
             known = folder.views.get(view)

@@ -20,6 +20,7 @@ from polarguide.errors import PolarguideError
 
 _POLL_SECONDS = 0.5
 _FEW_SHARE = 0.8
+_LEAST = 3
 ADVICE = (
     "More views with more overlap (15 degrees or less between neighbours), a textured ground under the object and "
     "sharp pictures help; --matching exhaustive finds more pairs than sequential."
@@ -62,44 +63,17 @@ def reconstruct(
     if model.is_dir():
         return model
     database, images, trial = folder / "database.db", folder / "images", folder / "models"
+    _match(database, images, sizes, matching, seed, reporter)
     shutil.rmtree(trial, ignore_errors=True)
     guarded(lambda: trial.mkdir(), trial)
-    single = len(set(sizes.values())) == 1
-    mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE
-    count = len(sizes)
-    pairs = count * (count - 1) // 2 if matching == "exhaustive" else None
-
-    _run(
-        lambda: pycolmap.extract_features(database, images, camera_mode=mode),
-        seed, reporter, "finding features", count, lambda: _rows(database, "keypoints"),
-    )  # fmt: skip
-    verify = pycolmap.TwoViewGeometryOptions()
-    _seed(verify.ransac, seed)
-    match = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
-    _run(
-        lambda: match(database, verification_options=verify),
-        seed, reporter, "matching pairs", pairs, lambda: _rows(database, "two_view_geometries"),
-    )  # fmt: skip
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 3
-    for part in (options, options.mapper, options.triangulation):
-        _seed(part, seed)
-    placed = [0]
-
-    def step() -> None:
-        placed[0] += 1
-
-    models = _run(
-        lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
-        seed, reporter, "placing cameras", count, lambda: placed[0] + 2 if placed[0] else 0,
-    )  # fmt: skip
+    models = _map(database, images, trial, len(sizes), seed, reporter)
     best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
     registered = 0 if best is None else best.num_reg_images()
-    if best is None or registered < 3:
+    if best is None or registered < _LEAST:
         raise PolarguideError(
             images,
             expected="pictures that structure from motion can connect",
-            found=f"{registered} of {count} views registered",
+            found=f"{registered} of {len(sizes)} views registered",
             remedy=ADVICE + " Or bring a COLMAP model with --poses PATH.",
         )
     chosen = folder / "chosen"
@@ -107,13 +81,60 @@ def reconstruct(
     guarded(chosen.mkdir, chosen)
     best.write_binary(str(chosen))
     chosen.rename(model)
+    said = f"{registered} of {len(sizes)} views registered"
     reporter.say(
-        f"{registered} of {count} views registered, {best.num_points3D()} points, mean reprojection error "
-        f"{best.compute_mean_reprojection_error():.2f} pixels, {len(models)} model(s) found."
+        f"{said}, {best.num_points3D()} points, mean reprojection error "
+        f"{best.compute_mean_reprojection_error():.2f} pixels; {len(models)} model(s) found."
     )
-    if registered < _FEW_SHARE * count:
-        reporter.warn(f"Only {registered} of {count} views were registered. {ADVICE}")
+    if registered < _FEW_SHARE * len(sizes):
+        reporter.warn(f"Only {said}. {ADVICE}")
     return model
+
+
+def _match(
+    database: Path,
+    images: Path,
+    sizes: dict[str, tuple[int, int]],
+    matching: str,
+    seed: int,
+    reporter: Reporter,
+) -> None:
+    """Features, matches and two-view geometries of the pictures, into the database."""
+    single = len(set(sizes.values())) == 1
+    mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE
+    count = len(sizes)
+    _run(
+        lambda: pycolmap.extract_features(database, images, camera_mode=mode),
+        seed, reporter, "finding features", count, lambda: _rows(database, "keypoints"),
+    )  # fmt: skip
+    verify = pycolmap.TwoViewGeometryOptions()
+    _seed(verify.ransac, seed)
+    match = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
+    pairs = count * (count - 1) // 2 if matching == "exhaustive" else None
+    _run(
+        lambda: match(database, verification_options=verify),
+        seed, reporter, "matching pairs", pairs, lambda: _rows(database, "two_view_geometries"),
+    )  # fmt: skip
+
+
+def _map(
+    database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter
+) -> dict[int, Any]:
+    """Incremental mapping: pycolmap's models, by number."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = _LEAST
+    for part in (options, options.mapper, options.triangulation):
+        _seed(part, seed)
+    placed = [0]
+
+    def step() -> None:
+        placed[0] += 1
+
+    found: dict[int, Any] = _run(
+        lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
+        seed, reporter, "placing cameras", count, lambda: placed[0] + 2 if placed[0] else 0,
+    )  # fmt: skip
+    return found
 
 
 def _run(

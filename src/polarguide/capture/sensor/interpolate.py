@@ -1,9 +1,10 @@
 """Interpolation of sparse samples: bilinear, and guided by edges, colour differences and total intensity.
 
 ``guided_colour`` interpolates green along the weaker gradient with a second-difference correction (after Hamilton
-and Adams, US patent 5,629,734, expired; half of their correction, which overshoots less) and then the differences of red and blue to green, which vary less than the
-colours. ``guided_polarization`` does the same across angles: half of S0, which every 2x2 pixels hold completely,
-takes the part of green, so that edges of the picture do not turn into polarization.
+and Adams, US patent 5,629,734, expired; half of their correction, which overshoots less) and then the differences
+of red and blue to green, which vary less than the colours. ``guided_polarization`` does the same across angles:
+half of S0, which every 2x2 pixels hold completely, takes the part of green, so that edges of the picture do not
+turn into polarization.
 """
 
 from __future__ import annotations
