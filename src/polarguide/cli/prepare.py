@@ -80,7 +80,7 @@ def prepare(
         poses: sfm, none, or the path of a COLMAP model.
         matching: Pairs that SfM compares: all, or neighbours in the order of their names.
         seed: Seed of SfM.
-        threads: Threads of this program; 0 takes all cores.
+        threads: Threads for the pictures; 0 takes all cores, as SfM always does.
     """
     use_threads(threads)
     if threads:

@@ -132,14 +132,11 @@ def _upright(linear: NDArray[np.float32], code: int) -> NDArray[np.float32]:
 
 
 def _shift_notes(view: str, shifts: list[Shift]) -> list[str]:
-    notes = []
-    for angle, shift in zip(ANGLES, shifts, strict=True):
-        if shift.corrected:
-            notes.append(
-                f"{view}: the shot at {angle} was moved by ({-shift.x:+.2f}, {-shift.y:+.2f}) pixels."
-            )
-        elif not shift.trusted:
-            notes.append(
-                f"{view}: no trustworthy shift between the shots at 0 and {angle}; they are used as they are."
-            )
+    """At most one line for the shots that were moved, and one for those whose shift cannot be trusted."""
+    named = list(zip(ANGLES, shifts, strict=True))
+    moved = [f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})" for angle, shift in named if shift.corrected]
+    doubtful = [str(angle) for angle, shift in named if not shift.trusted]
+    notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
+    if doubtful:
+        notes.append(f"{view}: no trustworthy shift of the shots at {', '.join(doubtful)}; used as they are.")
     return notes

@@ -21,6 +21,8 @@ from polarguide.errors import PolarguideError
 _POLL_SECONDS = 0.5
 _FEW_SHARE = 0.8
 _LEAST = 3
+# COLMAP logs every picture and pair; what fails comes as an exception.
+_FATAL = 3
 ADVICE = (
     "More views with more overlap (15 degrees or less between neighbours), a textured ground under the object and "
     "sharp pictures help; --matching exhaustive finds more pairs than sequential."
@@ -149,11 +151,14 @@ def _run(
     outcome: dict[str, Any] = {}
 
     def target() -> None:
+        level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _FATAL
         try:
             pycolmap.set_random_seed(seed)  # each thread has its own generator
             outcome["value"] = work()
         except Exception as error:  # whatever C++ threw
             outcome["error"] = error
+        finally:
+            pycolmap.logging.minloglevel = level
 
     thread = threading.Thread(target=target, daemon=True)
     with reporter.track(label, total) as advance:
