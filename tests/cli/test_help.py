@@ -25,7 +25,8 @@ def test_help_of_every_verb_names_and_explains_every_flag(
     assert about.splitlines()[0] in text
     for parameter in inspect.signature(VERBS[verb]).parameters.values():
         if parameter.kind is parameter.KEYWORD_ONLY:
-            assert f"--{parameter.name.replace('_', '-')} " in text, parameter.name
+            flag = f"--{parameter.name.replace('_', '-')}"
+            assert f"{flag} " in text or f"{flag}, --no-" in text, parameter.name
         assert f"{parameter.name}:" in about, f"{parameter.name} is not explained"
 
 

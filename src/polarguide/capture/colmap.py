@@ -17,7 +17,7 @@ from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
 # Perspective models that are a plain pinhole when all of their distortion parameters are zero.
-_PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,23 +70,11 @@ def read_model(root: Path) -> ColmapModel:
     Raises:
         PolarguideError: there is no model, it cannot be read, or it has no points.
     """
-    folder, kind = _find_model(root)
+    folder, kind = find_model(root, itself=False)
     names = ("cameras", "images", "points3D", "rigs", "frames")
     files = tuple(path for path in (folder / (name + kind) for name in names) if path.exists())
-    model = pycolmap.Reconstruction()
-    try:
-        model.read_binary(str(folder)) if kind == ".bin" else model.read_text(str(folder))
-    except Exception as error:  # pycolmap raises whatever C++ threw: ValueError, IndexError, MemoryError, ...
-        raise PolarguideError(
-            folder,
-            expected="a readable COLMAP model",
-            found=f"one that pycolmap refuses ({str(error).strip().splitlines()[0]})",
-            remedy="Export the model again; text files need two lines per image.",
-        ) from error
-    images: dict[str, list[Any]] = {}
-    for image in model.images.values():
-        if image.has_pose:
-            images.setdefault(PurePosixPath(image.name.replace("\\", "/")).stem, []).append(image)
+    model = load_model(folder, kind)
+    images = posed_images(model)
     points, colours, dropped = _points_of(model)
     if len(points) == 0:
         raise PolarguideError(
@@ -138,8 +126,13 @@ def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
     return [f"The COLMAP model has poses for {len(unused)} images without pictures ({listed(unused)})."]
 
 
-def _find_model(root: Path) -> tuple[Path, str]:
-    for folder in (root / "sparse" / "0", root / "sparse"):
+def find_model(root: Path, *, itself: bool = True) -> tuple[Path, str]:
+    """The folder of a model and the suffix of its files: in ``sparse/0`` or ``sparse``, else ``0`` or ``root`` itself.
+
+    Raises:
+        PolarguideError: there is none, or a file of it is missing.
+    """
+    for folder in (root / "sparse" / "0", root / "sparse", *([root / "0", root] if itself else [])):
         for kind in (".bin", ".txt"):
             if (folder / ("cameras" + kind)).exists():
                 missing = [n for n in ("images", "points3D") if not (folder / (n + kind)).exists()]
@@ -152,17 +145,45 @@ def _find_model(root: Path) -> tuple[Path, str]:
                     )
                 return folder, kind
     raise PolarguideError(
-        root / "sparse" / "0",
+        root if itself else root / "sparse" / "0",
         expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
         found="none there nor in sparse/",
         remedy="Run structure from motion on the pictures, or copy the model there.",
     )
 
 
+def load_model(folder: Path, kind: str) -> Any:
+    """The model in a folder, as pycolmap's ``Reconstruction``.
+
+    Raises:
+        PolarguideError: pycolmap refuses it.
+    """
+    model = pycolmap.Reconstruction()
+    try:
+        model.read_binary(str(folder)) if kind == ".bin" else model.read_text(str(folder))
+    except Exception as error:  # pycolmap raises whatever C++ threw: ValueError, IndexError, MemoryError, ...
+        raise PolarguideError(
+            folder,
+            expected="a readable COLMAP model",
+            found=f"one that pycolmap refuses ({str(error).strip().splitlines()[0]})",
+            remedy="Export the model again; text files need two lines per image.",
+        ) from error
+    return model
+
+
+def posed_images(model: Any) -> dict[str, list[Any]]:
+    """The images with a pose of pycolmap's ``Reconstruction``, by name without folder and suffix."""
+    images: dict[str, list[Any]] = {}
+    for image in model.images.values():
+        if image.has_pose:
+            images.setdefault(PurePosixPath(image.name.replace("\\", "/")).stem, []).append(image)
+    return images
+
+
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     where = f"{folder} (camera {camera.camera_id}, image {image.name})"
     model = camera.model_name
-    if model not in _PINHOLES or any(camera.params[index] != 0.0 for index in camera.extra_params_idxs()):
+    if model not in PINHOLES or any(camera.params[index] != 0.0 for index in camera.extra_params_idxs()):
         raise PolarguideError(
             where,
             expected="an undistorted camera (PINHOLE or SIMPLE_PINHOLE)",

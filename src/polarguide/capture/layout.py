@@ -57,18 +57,18 @@ def find_layout(root: Path) -> Layout:
             remedy=_HINT,
         )
     warnings: list[str] = []
-    folders = _angle_folders(root)
+    folders = angle_folders(root)
     if (root / "polar").is_dir():
         pictures = _read_flat(root / "polar", warnings)
     elif folders:
-        pictures = _read_folders(root, folders)
+        pictures = pictures_of_folders(root, folders)
     else:
-        raise PolarguideError(root, expected="a capture folder", found=_contents(root), remedy=_HINT)
+        raise PolarguideError(root, expected="a capture folder", found=contents(root), remedy=_HINT)
     if not pictures:
         raise PolarguideError(root, expected="pictures of at least one view", found="none", remedy=_HINT)
     sides: dict[str, dict[str, Path]] = {}
     for folder, suffixes in (("masks", SUFFIXES), ("invalid", SUFFIXES), ("gt", (".npz",))):
-        files = _index(root / folder, suffixes)
+        files = index_files(root / folder, suffixes)
         strangers = sorted(path.name for stem, path in files.items() if stem not in pictures)
         if strangers:
             warnings.append(
@@ -137,7 +137,7 @@ def _read_flat(folder: Path, warnings: list[str]) -> dict[str, dict[int, Path]]:
     """``polar/<view>_<angle>.<suffix>``."""
     pictures: dict[str, dict[int, Path]] = {}
     strangers = []
-    for stem, path in _index(folder, SUFFIXES).items():
+    for stem, path in index_files(folder, SUFFIXES).items():
         match = _PICTURE_STEM.fullmatch(stem)
         if match is None:
             strangers.append(path.name)
@@ -151,8 +151,12 @@ def _read_flat(folder: Path, warnings: list[str]) -> dict[str, dict[int, Path]]:
     return pictures
 
 
-def _read_folders(root: Path, folders: dict[int, Path]) -> dict[str, dict[int, Path]]:
-    """One folder per angle, equally named pictures."""
+def pictures_of_folders(root: Path, folders: dict[int, Path]) -> dict[str, dict[int, Path]]:
+    """View -> angle -> file, from one folder per angle with equally named pictures.
+
+    Raises:
+        PolarguideError: a folder is missing, or two files share a stem.
+    """
     missing = [angle for angle in ANGLES if angle not in folders]
     if missing:
         raise PolarguideError(
@@ -163,12 +167,12 @@ def _read_folders(root: Path, folders: dict[int, Path]) -> dict[str, dict[int, P
         )
     pictures: dict[str, dict[int, Path]] = {}
     for angle, folder in folders.items():
-        for stem, path in _index(folder, SUFFIXES).items():
+        for stem, path in index_files(folder, SUFFIXES).items():
             pictures.setdefault(stem, {})[angle] = path
     return pictures
 
 
-def _angle_folders(root: Path) -> dict[int, Path]:
+def angle_folders(root: Path) -> dict[int, Path]:
     """Folders named like a polarizer angle (I-00, I_45, 090, pol135, ...)."""
     folders: dict[int, Path] = {}
     for path in sorted(root.iterdir()):
@@ -187,7 +191,7 @@ def _angle_folders(root: Path) -> dict[int, Path]:
     return dict(sorted(folders.items()))
 
 
-def _index(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
+def index_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     """Stem -> file for the files of a folder with one of the suffixes; empty if there is no such folder."""
     files: dict[str, Path] = {}
     if not folder.is_dir():
@@ -206,6 +210,6 @@ def _index(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     return files
 
 
-def _contents(root: Path) -> str:
+def contents(root: Path) -> str:
     names = sorted(path.name for path in root.iterdir())
     return f"one that holds {listed(names)}" if names else "an empty folder"

@@ -49,7 +49,7 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
     Raises:
         PolarguideError: the file is damaged, cut short, or of another kind.
     """
-    pixels = _decode(path, data)
+    pixels = decode_stored(path, data)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise PolarguideError(
             path,
@@ -74,7 +74,7 @@ def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_
     Raises:
         PolarguideError: the file is damaged, cut short, or of another kind.
     """
-    pixels = _decode(path, data)
+    pixels = decode_stored(path, data)
     grey = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
     if any_value:
         return np.asarray(grey > 0)
@@ -97,8 +97,12 @@ def _table(full: int, transfer: str) -> NDArray[np.uint16]:
     return np.rint(shown * FULL_CODE).astype(np.uint16)
 
 
-def _decode(path: Path, data: bytes) -> NDArray[Any]:
-    """Decode with OpenCV, after a look at the file's structure."""
+def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
+    """Decode a picture exactly as stored: [H, W] or [H, W, C] in OpenCV's channel order, any value type.
+
+    Raises:
+        PolarguideError: the file is damaged, cut short, or of another kind.
+    """
     damage = find_damage(data)
     pixels = None
     if damage is None:

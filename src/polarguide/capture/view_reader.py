@@ -121,15 +121,25 @@ def _read_angles(files: Files, paths: dict[int, Path]) -> list[NDArray[Any]]:
     for angle in ANGLES:
         path = paths[angle]
         picture = decode_picture(path, files.read(path))
-        if pictures and (picture.shape, picture.dtype) != (pictures[0].shape, pictures[0].dtype):
-            raise PolarguideError(
-                path,
-                expected=f"{_kind(pictures[0])} like {'/'.join(paths[0].parts[-2:])}",
-                found=_kind(picture),
-                remedy="Export the four pictures of a view alike.",
-            )
+        if pictures:
+            require_alike(path, picture, paths[0], pictures[0])
         pictures.append(picture)
     return pictures
+
+
+def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: NDArray[Any]) -> None:
+    """Check that a picture has the size and depth of the first one of its view.
+
+    Raises:
+        PolarguideError: it has not.
+    """
+    if (picture.shape, picture.dtype) != (first.shape, first.dtype):
+        raise PolarguideError(
+            path,
+            expected=f"{_kind(first)} like {'/'.join(first_path.parts[-2:])}",
+            found=_kind(picture),
+            remedy="Export the four pictures of a view alike.",
+        )
 
 
 def _read_mask(files: Files, path: Path, size: tuple[int, int], *, any_value: bool) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from polarguide.cli.ablate import ablate
 from polarguide.cli.compare import compare
 from polarguide.cli.demo import demo
 from polarguide.cli.evaluate import evaluate
+from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
 from polarguide.cli.train import train
@@ -21,6 +22,7 @@ from polarguide.errors import PolarguideError
 
 VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
+    "prepare": prepare,
     "train": train,
     "eval": evaluate,
     "render": render_views,

@@ -1,0 +1,170 @@
+"""What a polarization camera or filter does that an ideal one would not: gains, order, sense and zero of its angles."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.pictures import read_file
+from polarguide.capture.sidecars import parse_json
+from polarguide.capture.view import ANGLES
+from polarguide.errors import PolarguideError
+
+Gains = tuple[float, float, float, float]
+UNIT_GAINS: Gains = (1.0, 1.0, 1.0, 1.0)
+LARGEST_IMBALANCE = 0.1
+"""Pair sums that differ by more than this share are no gain differences: files are swapped, or not linear."""
+ROTATED_PEAK = (1.0 + math.sqrt(2.0)) / 2.0
+"""The most a turned analyser can measure where four angles stay under 1."""
+UNIDENTIFIED = (
+    "Only the ratio of the pair sums is estimated: I0/I90 and I45/I135 of the instrument cannot be told from the "
+    "polarization of the scene, nor the common gain from its brightness."
+)
+_FEWEST = 32
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How the pictures called 0, 45, 90 and 135 relate to polarizer angles as displayed.
+
+    Attributes:
+        gains: response of the pictures, in the order of their names; intensities are divided by them. None
+            to estimate the ratio of the pair sums.
+        order: the angle that each of the pictures called 0, 45, 90 and 135 was really taken at.
+        sense: "ccw" or "cw", how these angles count as the picture is displayed.
+        zero: where their zero lies, in degrees counter-clockwise from the image's horizontal.
+    """
+
+    gains: Gains | None = None
+    order: tuple[int, int, int, int] = ANGLES
+    sense: str = "ccw"
+    zero: float = 0.0
+
+    @property
+    def permutes(self) -> bool:
+        """Whether the pictures only change places."""
+        return (self.zero / 45.0).is_integer()
+
+    @property
+    def peak(self) -> float:
+        """The largest intensity that comes out where none exceeds 1."""
+        return 1.0 if self.permutes else ROTATED_PEAK
+
+    def record(self) -> dict[str, Any]:
+        """Order, sense and zero for ``scene.json``."""
+        return {"order": list(self.order), "sense": self.sense, "zero_degrees": self.zero}
+
+
+def checked(calibration: Calibration, where: object) -> Calibration:
+    """The calibration, if it makes sense.
+
+    Raises:
+        PolarguideError: gains are not positive, the order is no permutation, the zero is not finite, ...
+    """
+    gains, order = calibration.gains, calibration.order
+    faults = (
+        (gains is not None and not all(math.isfinite(g) and 0.5 <= g <= 2.0 for g in gains),
+         "gains", "four numbers from 0.5 to 2", gains),
+        (sorted(order) != sorted(ANGLES), "order", "0, 45, 90 and 135, each once", order),
+        (calibration.sense not in ("cw", "ccw"), "sense", "cw or ccw", calibration.sense),
+        (not math.isfinite(calibration.zero), "zero", "a finite number of degrees", calibration.zero),
+    )  # fmt: skip
+    for wrong, name, expected, found in faults:
+        if wrong:
+            raise PolarguideError(
+                f"{where} ({name})", expected=expected, found=repr(found), remedy="Correct the value."
+            )
+    return calibration
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a calibration file: ``{"gains": {"0": 1.01, ...}, "order": [...], "sense": "ccw", "zero": 0.0}``.
+
+    Every key may be left out.
+
+    Raises:
+        PolarguideError: the file cannot be read, has unknown keys or values that make no sense.
+    """
+    content = parse_json(path, read_file(path))
+    unknown = sorted(content.keys() - {"gains", "order", "sense", "zero"})
+    try:
+        if unknown:
+            raise ValueError(f"the key {unknown[0]!r}")
+        found = Calibration()
+        if "gains" in content:
+            gains = content["gains"]
+            if not isinstance(gains, dict) or sorted(gains) != sorted(str(angle) for angle in ANGLES):
+                raise ValueError(f"the gains {json.dumps(gains)}")
+            i0, i45, i90, i135 = (float(gains[str(angle)]) for angle in ANGLES)
+            found = replace(found, gains=(i0, i45, i90, i135))
+        if "order" in content:
+            first, second, third, fourth = (int(angle) for angle in content["order"])
+            found = replace(found, order=(first, second, third, fourth))
+        found = replace(found, sense=content.get("sense", "ccw"), zero=float(content.get("zero", 0.0)))
+    except (ValueError, TypeError) as error:
+        raise PolarguideError(
+            path,
+            expected='"gains" by angle ("0", "45", "90", "135"), "order", "sense" and "zero"',
+            found=str(error),
+            remedy="See docs/formats.md for the calibration file.",
+        ) from None
+    return checked(found, path)
+
+
+def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> float | None:
+    """Median of (I0 + I90) / (I45 + I135), which is 1 for ideal analysers whatever the light.
+
+    Args:
+        angles: linear intensities [4, ...], without channels.
+        usable: [...], what may be looked at.
+
+    Returns:
+        The ratio, or None where fewer than 32 samples are bright enough to tell.
+    """
+    i0, i45, i90, i135 = angles[:, usable].astype(np.float64)
+    first, second = i0 + i90, i45 + i135
+    bright = np.minimum(first, second) > 0.02
+    if bright.sum() < _FEWEST:
+        return None
+    return float(np.median(first[bright] / second[bright]))
+
+
+def balancing_gains(ratio: float | None) -> Gains | None:
+    """Gains of the four pictures that explain a ratio of pair sums, with product 1; None if none do."""
+    if ratio is None or abs(ratio - 1.0) > LARGEST_IMBALANCE:
+        return None
+    root = math.sqrt(ratio)
+    return (root, 1.0 / root, root, 1.0 / root)
+
+
+def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float32]:
+    """Intensities at 0, 45, 90 and 135 degrees, counter-clockwise as displayed.
+
+    A picture taken at angle L of the instrument lies at ``sense * L + zero``. Multiples of 45 degrees exchange
+    pictures; any other zero turns (S1, S2) by twice the angle and forms the four intensities anew.
+
+    Args:
+        intensities: [4, ...], by the names of the pictures.
+        calibration: order, sense and zero; its gains are not looked at.
+
+    Returns:
+        [4, ...], at least 0 and at most ``calibration.peak`` times the largest given.
+    """
+    sign = 1 if calibration.sense == "ccw" else -1
+    turn = calibration.zero if calibration.permutes else 0.0
+    targets = [int(sign * angle + turn) % 180 for angle in calibration.order]
+    placed = intensities[[targets.index(angle) for angle in ANGLES]]
+    if calibration.permutes:
+        return placed
+    i0, i45, i90, i135 = placed
+    s0, s1, s2 = placed.sum(axis=0) / 2, i0 - i90, i45 - i135
+    cosine, sine = (f(2.0 * math.radians(calibration.zero)) for f in (math.cos, math.sin))
+    turned1, turned2 = s1 * cosine - s2 * sine, s1 * sine + s2 * cosine
+    out = np.stack([s0 + turned1, s0 + turned2, s0 - turned1, s0 - turned2]) / 2
+    return np.maximum(out, 0.0).astype(np.float32)

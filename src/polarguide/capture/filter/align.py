@@ -1,0 +1,122 @@
+"""Small shifts between the four shots of a view: estimated, and taken back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+SMALLEST = 0.2
+"""Shifts under this many pixels are left alone: resampling would cost more sharpness than they do, and polarization
+misleads the estimate by about as much."""
+LARGEST_SHARE = 0.05
+"""Shifts above this share of the picture's width are no shake; they are reported, not corrected."""
+
+_BETTER = 0.95
+_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Where the content of a shot lies relative to the first, in pixels right and down; whether it was trusted."""
+
+    x: float
+    y: float
+    trusted: bool
+
+    @property
+    def corrected(self) -> bool:
+        """Whether it is large enough to be taken back, and trusted."""
+        return self.trusted and max(abs(self.x), abs(self.y)) >= SMALLEST
+
+
+def find_shifts(linear: NDArray[np.float32]) -> list[Shift]:
+    """Shifts of the four shots against the first.
+
+    Phase correlation of the logarithms' fine detail finds a start (brightness and polarization change slowly
+    across a surface, edges stay); maximising the enhanced correlation coefficient refines it to a fraction of
+    a pixel. Edges of polarization can mislead both, so the shifts are trusted only if with them
+    I0 + I90 = I45 + I135 holds better than without.
+
+    Args:
+        linear: [4, H, W, 3] linear intensities.
+    """
+    detail = [_detail(shot) for shot in linear]
+    shifts = [Shift(0.0, 0.0, True), *(_shift(detail[0], other) for other in detail[1:])]
+    if not any(shift.corrected for shift in shifts):
+        return shifts
+    whole = np.zeros(linear.shape[:3], bool)
+    after = _disagreement(*aligned(linear, whole, shifts))
+    if after < _BETTER * _disagreement(linear, whole):
+        return shifts
+    return [shifts[0], *(replace(shift, trusted=False) for shift in shifts[1:])]
+
+
+def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
+    """Mean |I0 + I90 - I45 - I135|, common gains taken out, relative to the light."""
+    i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad.any(axis=0)]
+    first, second = i0 + i90, i45 + i135
+    if not second.sum() > 0:
+        return 0.0
+    return float(np.abs(first - second * (first.sum() / second.sum())).sum() / first.sum())
+
+
+def aligned(
+    linear: NDArray[np.float32], clipped: NDArray[np.bool_], shifts: list[Shift]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Take the shifts back.
+
+    Args:
+        linear: [4, H, W, 3] linear intensities.
+        clipped: unusable pixels of each shot, [4, H, W].
+        shifts: of the four shots.
+
+    Returns:
+        The moved intensities; and pixels for which an unusable one or one outside the picture was used, [4, H, W].
+    """
+    height, width = clipped.shape[1:]
+    moved, bad = linear.copy(), clipped.copy()
+    for index, shift in enumerate(shifts):
+        if not shift.corrected:
+            continue
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        x, y = x + np.float32(shift.x), y + np.float32(shift.y)
+        moved[index] = cv2.remap(linear[index], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        bad[index] = _remapped_mask(clipped[index], x, y)
+    return moved, bad
+
+
+def _remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
+    weight = cv2.remap(
+        mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
+    )
+    return np.asarray(weight > 0)
+
+
+def _detail(shot: NDArray[np.float32]) -> NDArray[np.float32]:
+    grey = np.log(shot.mean(axis=2) + np.float32(0.01))
+    fine = cv2.GaussianBlur(grey, (0, 0), 0.8) - cv2.GaussianBlur(grey, (0, 0), 5.0)
+    return np.asarray(fine, np.float32)
+
+
+def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
+    height, width = reference.shape
+    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    (x, y), _ = cv2.phaseCorrelate(reference, other, window)
+    limit = LARGEST_SHARE * width
+    if max(abs(x), abs(y)) > limit:
+        x = y = 0.0
+    warp = np.array([[1, 0, x], [0, 1, y]], np.float32)
+    try:
+        everywhere = np.ones(reference.shape, np.uint8)
+        score, found = cv2.findTransformECC(
+            reference, other, warp, cv2.MOTION_TRANSLATION, _CRITERIA, everywhere, 5
+        )
+    except cv2.error:  # it does not converge where there is no detail to compare
+        return Shift(0.0, 0.0, False)
+    x, y = (float(value) for value in np.asarray(found)[:, 2])
+    trusted = score > 0.3 and max(abs(x), abs(y)) <= limit and bool(np.isfinite([x, y]).all())
+    return Shift(round(x, 3), round(y, 3), trusted)

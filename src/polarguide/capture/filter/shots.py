@@ -1,0 +1,119 @@
+"""Which files are the four shots of a view, and reading them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.filter.exif import orientation
+from polarguide.capture.layout import angle_folders, index_files, pictures_of_folders
+from polarguide.capture.pictures import SUFFIXES, decode_picture, read_file
+from polarguide.capture.view import ANGLES
+from polarguide.capture.view_reader import require_alike
+from polarguide.errors import PolarguideError
+
+_SUFFIX = re.compile(
+    r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE
+)
+# Compression smears the edge of clipped areas over a few values.
+_JPEG_FULL = 250
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """The four shots of a view as stored.
+
+    Attributes:
+        pictures: [4, H, W, 3] uint8 or uint16, by the names of the angles.
+        orientation: their EXIF orientation.
+        clipped: pixels with a channel of a shot at full scale, [4, H, W].
+        dark: pixels that are 0 in all shots and channels, [H, W].
+    """
+
+    pictures: NDArray[Any]
+    orientation: int
+    clipped: NDArray[np.bool_]
+    dark: NDArray[np.bool_]
+
+
+def find_shots(root: Path) -> dict[str, dict[int, Path]]:
+    """View -> angle -> file: from four folders named like the angles, or from four suffixes.
+
+    Folders are ``0``, ``45``, ``90``, ``135``, also ``000``, ``I-00``, ``pol_45``, ...; suffixes are the same
+    after ``_``, ``-``, a point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``.
+
+    Returns:
+        Nothing where neither is found. Angles may be missing; ``require_all`` checks.
+
+    Raises:
+        PolarguideError: two files claim one place, or a folder is missing.
+    """
+    folders = angle_folders(root)
+    if folders:
+        return pictures_of_folders(root, folders)
+    shots: dict[str, dict[int, Path]] = {}
+    for stem, path in index_files(root, SUFFIXES).items():
+        match = _SUFFIX.fullmatch(stem)
+        if match is None:
+            continue
+        of_view, angle = shots.setdefault(match["view"], {}), int(match["angle"])
+        if angle in of_view:
+            raise PolarguideError(
+                root,
+                expected=f"one picture of {match['view']} at {angle} degrees",
+                found=f"{of_view[angle].name} and {path.name}",
+                remedy="Remove the one that is not meant.",
+            )
+        of_view[angle] = path
+    return shots
+
+
+def require_all(root: Path, shots: dict[str, dict[int, Path]]) -> None:
+    """Check that every view has its four shots.
+
+    Raises:
+        PolarguideError: one has not.
+    """
+    for view, files in sorted(shots.items()):
+        missing = [str(angle) for angle in ANGLES if angle not in files]
+        if missing:
+            raise PolarguideError(
+                root,
+                expected=f"the shots of view {view} at 0, 45, 90 and 135 degrees",
+                found=f"none at {' and '.join(missing)}",
+                remedy="Add the file, or remove the other shots of the view.",
+            )
+
+
+def read_shots(files: dict[int, Path]) -> Shots:
+    """Read the four shots of a view.
+
+    Raises:
+        PolarguideError: one cannot be read, or they differ in size, depth or orientation.
+    """
+    pictures: list[NDArray[Any]] = []
+    codes: list[int] = []
+    for angle in ANGLES:
+        data = read_file(files[angle])
+        picture = decode_picture(files[angle], data)
+        if pictures:
+            require_alike(files[angle], picture, files[0], pictures[0])
+        pictures.append(picture)
+        codes.append(orientation(data))
+        if codes[-1] != codes[0]:
+            raise PolarguideError(
+                files[angle],
+                expected=f"EXIF orientation {codes[0]} like {files[0].name}",
+                found=str(codes[-1]),
+                remedy="Keep the camera still between the four shots, or export them all alike.",
+            )
+    stack = np.stack(pictures)
+    jpeg = files[0].suffix.lower() in (".jpg", ".jpeg")
+    full = _JPEG_FULL if jpeg else int(np.iinfo(stack.dtype).max)
+    clipped, lit = np.asarray((stack >= full).any(axis=3)), np.asarray(stack.any(axis=(0, 3)))
+    return Shots(stack, codes[0], clipped, ~lit)

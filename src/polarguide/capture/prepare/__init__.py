@@ -1,0 +1,7 @@
+"""Camera files -> a scene folder: what ``polarguide prepare`` does."""
+
+from polarguide.capture.prepare.reporter import Reporter
+from polarguide.capture.prepare.run import Prepared, prepare_scene
+from polarguide.capture.prepare.settings import PrepareSettings
+
+__all__ = ["PrepareSettings", "Prepared", "Reporter", "prepare_scene"]

@@ -1,0 +1,141 @@
+"""What ``prepare`` was asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from polarguide.capture.calibration import Calibration, checked
+from polarguide.capture.sensor import DEMOSAIC_MODES, INTERPOLATIONS, PACKINGS, sensor_pattern
+from polarguide.errors import PolarguideError
+
+FORMATS = ("auto", "mosaic", "filter")
+_MOSAIC_ONLY = (
+    "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
+    "saturation", "white_balance", "demosaic", "interpolation",
+)  # fmt: skip
+_FILTER_ONLY = ("transfer", "align")
+
+
+@dataclass(frozen=True)
+class PrepareSettings:
+    """Settings of a preparation; see the flags of ``polarguide prepare`` for what each means.
+
+    Attributes:
+        white_balance: "none", "grey" or three gains separated by commas.
+        gains: "auto" or "none"; a calibration with gains goes first.
+        poses: "sfm", "none" or the path of a COLMAP model.
+    """
+
+    format: str = "auto"
+    sensor: str | None = None
+    packing: str | None = None
+    width: int | None = None
+    height: int | None = None
+    bits: int | None = None
+    offset_x: int = 0
+    offset_y: int = 0
+    black_level: float = 0.0
+    dark_frame: str | None = None
+    saturation: int | None = None
+    white_balance: str = "none"
+    demosaic: str = "half"
+    interpolation: str = "bilinear"
+    transfer: str = "auto"
+    align: bool = True
+    gains: str = "auto"
+    calibration: Calibration = field(default_factory=Calibration)
+    poses: str = "sfm"
+    matching: str = "exhaustive"
+    seed: int = 0
+
+    def record(self) -> dict[str, Any]:
+        """All settings as plain JSON types."""
+        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return plain
+
+
+def check_settings(settings: PrepareSettings) -> None:
+    """Check values that need no file.
+
+    Raises:
+        PolarguideError: one is out of range.
+    """
+    choices = {
+        "format": FORMATS,
+        "demosaic": tuple(DEMOSAIC_MODES),
+        "interpolation": INTERPOLATIONS,
+        "transfer": ("auto", "linear", "srgb"),
+        "gains": ("auto", "none"),
+        "matching": ("exhaustive", "sequential"),
+        "packing": (None, *PACKINGS),
+    }
+    for name, allowed in choices.items():
+        _require(
+            name, getattr(settings, name) in allowed, ", ".join(map(str, filter(None, allowed))), settings
+        )
+    for name, least in (("offset_x", 0), ("offset_y", 0), ("width", 1), ("height", 1), ("saturation", 1)):
+        value = getattr(settings, name)
+        _require(name, value is None or value >= least, f"{least} or more", settings)
+    _require("bits", settings.bits is None or 8 <= settings.bits <= 16, "8 to 16", settings)
+    _require("seed", 0 <= settings.seed < 2**31, "a whole number from 0 to 2147483647", settings)
+    level = settings.black_level
+    _require("black_level", math.isfinite(level) and level >= 0, "0 or more", settings)
+    checked(settings.calibration, "calibration")
+    if settings.sensor is not None:
+        sensor_pattern(settings.sensor)
+
+
+def check_format(settings: PrepareSettings, kind: str) -> None:
+    """Refuse settings that mean nothing for a format.
+
+    Raises:
+        PolarguideError: one is set.
+    """
+    default = PrepareSettings()
+    names, other = (_FILTER_ONLY, "rotating filters") if kind == "mosaic" else (_MOSAIC_ONLY, "raw mosaics")
+    for name in names:
+        if getattr(settings, name) != getattr(default, name):
+            raise PolarguideError(
+                flag(name),
+                expected=f"only flags that apply to the format {kind}",
+                found=f"one for {other}",
+                remedy="Leave it out, or choose the other --format.",
+            )
+
+
+def white_gains(text: str) -> tuple[float, float, float] | None:
+    """Gains of R, G and B from a ``--white-balance``; None for "grey", which needs the pictures.
+
+    Raises:
+        PolarguideError: it is none of the forms.
+    """
+    if text in ("none", "grey"):
+        return (1.0, 1.0, 1.0) if text == "none" else None
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+        if not all(math.isfinite(gain) and 0.05 <= gain <= 20 for gain in (red, green, blue)):
+            raise ValueError
+    except ValueError:
+        raise PolarguideError(
+            "--white-balance",
+            expected="none, grey, or three gains from 0.05 to 20 such as 1.9,1,1.6",
+            found=repr(text),
+            remedy="Take the gains from a picture of a grey card.",
+        ) from None
+    return red, green, blue
+
+
+def flag(name: str) -> str:
+    """The flag that sets a field."""
+    return "--" + name.replace("_", "-")
+
+
+def _require(name: str, right: bool, expected: str, settings: PrepareSettings) -> None:
+    if not right:
+        raise PolarguideError(
+            flag(name), expected=expected, found=str(getattr(settings, name)), remedy="Correct the value."
+        )

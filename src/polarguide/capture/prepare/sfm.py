@@ -1,0 +1,192 @@
+"""Structure from motion on the photographs, with pycolmap."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from polarguide.capture.prepare.folder import guarded
+from polarguide.capture.prepare.reporter import Reporter
+from polarguide.errors import PolarguideError
+
+_POLL_SECONDS = 0.5
+_FEW_SHARE = 0.8
+_LEAST = 3
+# COLMAP logs every picture and pair; what fails comes as an exception.
+_FATAL = 3
+ADVICE = (
+    "More views with more overlap (15 degrees or less between neighbours), a textured ground under the object and "
+    "sharp pictures help; --matching exhaustive finds more pairs than sequential."
+)
+
+
+def tone_mapped(intensities: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """S0/2 of a view as an 8-bit sRGB picture, BGR, with the 99th percentile at white."""
+    photograph = intensities.mean(axis=0)
+    white = max(float(np.percentile(photograph, 99.0)), 1e-4)
+    linear = np.clip(photograph / white, 0.0, 1.0)
+    shown = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    )
+    return np.rint(255.0 * shown[..., ::-1]).astype(np.uint8)
+
+
+def reconstruct(
+    folder: Path, sizes: dict[str, tuple[int, int]], *, matching: str, seed: int, reporter: Reporter
+) -> Path:
+    """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
+
+    Features and matches are kept in a database, so that a run that was stopped does not repeat them. The
+    largest model wins.
+
+    Args:
+        folder: with the pictures; the database and the model are written there.
+        sizes: width and height of every picture, by view.
+        matching: "exhaustive", or "sequential" for views taken in the order of their names.
+        seed: of all random draws.
+        reporter: for progress and what was registered.
+
+    Returns:
+        The folder of the model, with one camera model SIMPLE_RADIAL for pictures of one size.
+
+    Raises:
+        PolarguideError: fewer than three views were registered, or COLMAP failed.
+    """
+    model = folder / "model"
+    if model.is_dir():
+        return model
+    database, images, trial = folder / "database.db", folder / "images", folder / "models"
+    _match(database, images, sizes, matching, seed, reporter)
+    shutil.rmtree(trial, ignore_errors=True)
+    guarded(lambda: trial.mkdir(), trial)
+    models = _map(database, images, trial, len(sizes), seed, reporter)
+    best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
+    registered = 0 if best is None else best.num_reg_images()
+    if best is None or registered < _LEAST:
+        raise PolarguideError(
+            images,
+            expected="pictures that structure from motion can connect",
+            found=f"{registered} of {len(sizes)} views registered",
+            remedy=ADVICE + " Or bring a COLMAP model with --poses PATH.",
+        )
+    chosen = folder / "chosen"
+    shutil.rmtree(chosen, ignore_errors=True)
+    guarded(chosen.mkdir, chosen)
+    best.write_binary(str(chosen))
+    chosen.rename(model)
+    said = f"{registered} of {len(sizes)} views registered"
+    reporter.say(
+        f"{said}, {best.num_points3D()} points, mean reprojection error "
+        f"{best.compute_mean_reprojection_error():.2f} pixels; {len(models)} model(s) found."
+    )
+    if registered < _FEW_SHARE * len(sizes):
+        reporter.warn(f"Only {said}. {ADVICE}")
+    return model
+
+
+def _match(
+    database: Path,
+    images: Path,
+    sizes: dict[str, tuple[int, int]],
+    matching: str,
+    seed: int,
+    reporter: Reporter,
+) -> None:
+    """Features, matches and two-view geometries of the pictures, into the database."""
+    single = len(set(sizes.values())) == 1
+    mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE
+    count = len(sizes)
+    _run(
+        lambda: pycolmap.extract_features(database, images, camera_mode=mode),
+        seed, reporter, "finding features", count, lambda: _rows(database, "keypoints"),
+    )  # fmt: skip
+    verify = pycolmap.TwoViewGeometryOptions()
+    _seed(verify.ransac, seed)
+    match = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
+    pairs = count * (count - 1) // 2 if matching == "exhaustive" else None
+    _run(
+        lambda: match(database, verification_options=verify),
+        seed, reporter, "matching pairs", pairs, lambda: _rows(database, "two_view_geometries"),
+    )  # fmt: skip
+
+
+def _map(
+    database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter
+) -> dict[int, Any]:
+    """Incremental mapping: pycolmap's models, by number."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = _LEAST
+    for part in (options, options.mapper, options.triangulation):
+        _seed(part, seed)
+    placed = [0]
+
+    def step() -> None:
+        placed[0] += 1
+
+    found: dict[int, Any] = _run(
+        lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
+        seed, reporter, "placing cameras", count, lambda: placed[0] + 2 if placed[0] else 0,
+    )  # fmt: skip
+    return found
+
+
+def _run(
+    work: Callable[[], Any],
+    seed: int,
+    reporter: Reporter,
+    label: str,
+    total: int | None,
+    done: Callable[[], int],
+) -> Any:
+    """Run a step of COLMAP in a thread, so that progress shows and Ctrl-C ends the program at once."""
+    outcome: dict[str, Any] = {}
+
+    def target() -> None:
+        level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _FATAL
+        try:
+            pycolmap.set_random_seed(seed)  # each thread has its own generator
+            outcome["value"] = work()
+        except Exception as error:  # whatever C++ threw
+            outcome["error"] = error
+        finally:
+            pycolmap.logging.minloglevel = level
+
+    thread = threading.Thread(target=target, daemon=True)
+    with reporter.track(label, total) as advance:
+        thread.start()
+        while thread.is_alive():
+            thread.join(_POLL_SECONDS)
+            advance(done())
+    if "error" in outcome:
+        raise PolarguideError(
+            label,
+            expected="COLMAP to succeed",
+            found=str(outcome["error"]).strip().splitlines()[0],
+            remedy="Repeat the command, or bring a model with --poses PATH.",
+        ) from outcome["error"]
+    return outcome["value"]
+
+
+def _rows(database: Path, table: str) -> int:
+    """Rows of a table while COLMAP writes it; 0 where that cannot be told."""
+    try:
+        with closing(
+            sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.1)
+        ) as link:
+            return int(link.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+def _seed(options: Any, seed: int) -> None:
+    if hasattr(options, "random_seed"):
+        options.random_seed = seed

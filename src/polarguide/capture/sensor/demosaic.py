@@ -1,0 +1,156 @@
+"""Mosaics -> intensities behind four polarizer angles, at a half, a quarter or all of the sensor's resolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.sensor.interpolate import (
+    GUIDED_RADIUS,
+    bilinear,
+    guided_colour,
+    guided_polarization,
+    used_by_bilinear,
+)
+from polarguide.capture.sensor.pattern import Pattern
+from polarguide.capture.view import ANGLES
+
+DEMOSAIC_MODES = {"half": 2, "quarter": 4, "full": 1}
+"""Modes, and the sensor pixels that become one picture pixel, each way."""
+INTERPOLATIONS = ("bilinear", "guided")
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """Demosaiced intensities.
+
+    Attributes:
+        intensities: [4, h, w, 3] float32, linear, for 0, 45, 90 and 135 degrees.
+        invalid: pixels for which an unusable sample was used, [h, w].
+    """
+
+    intensities: Array
+    invalid: Mask
+
+
+def demosaic(values: Array, bad: Mask, pattern: Pattern, *, mode: str, interpolation: str) -> Picture:
+    """Demosaic one mosaic.
+
+    ``half``: each 2x2 polarizer cell is one pixel; the cells of a colour sensor form a Bayer picture per angle.
+    ``quarter``: each 4x4 superpixel is one pixel, the mean of its samples of an angle and colour; nothing is
+    interpolated. ``full``: every sensor pixel; colours are interpolated between cells of one angle, then angles
+    between neighbouring pixels.
+
+    Args:
+        values: linear intensities [H, W], black level and gains already applied.
+        bad: unusable samples, [H, W].
+        pattern: of the top-left pixel, which starts a whole polarizer cell.
+        mode: a key of ``DEMOSAIC_MODES``.
+        interpolation: one of ``INTERPOLATIONS``; ``quarter`` and a monochrome ``half`` interpolate nothing.
+
+    Returns:
+        The picture, of size ``H // s`` x ``W // s`` for s = 2, 4 or 1 (what fills no cell is cut). A
+        monochrome sensor gives three equal channels.
+    """
+    step = 4 if mode == "quarter" else 2
+    height, width = values.shape[0] // step * step, values.shape[1] // step * step
+    values, bad = values[:height, :width], bad[:height, :width]
+    if mode == "quarter":
+        return _superpixels(values, bad, pattern)
+    cells = _cells(values, bad, pattern, interpolation)
+    if mode == "half":
+        return _in_order(cells, pattern)
+    return _full(cells, pattern, interpolation)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Colours at every sensor pixel: position (row, column) in the cell -> [H/2, W/2, C], and what is bad."""
+
+    colours: dict[tuple[int, int], Array]
+    bad: dict[tuple[int, int], Mask]
+
+
+def _cells(values: Array, bad: Mask, pattern: Pattern, interpolation: str) -> _Cells:
+    colours: dict[tuple[int, int], Array] = {}
+    wrong: dict[tuple[int, int], Mask] = {}
+    for row, column in np.ndindex(2, 2):
+        sample, mask = values[row::2, column::2], bad[row::2, column::2]
+        if pattern.colours is None:
+            colours[row, column], wrong[row, column] = sample[..., None], mask
+            continue
+        bayer = _tiled(pattern.colours[row::2, column::2], sample.shape)
+        if interpolation == "bilinear":
+            planes = [bilinear(sample, bayer == colour) for colour in range(3)]
+            uses = [used_by_bilinear(mask, bayer == colour) for colour in range(3)]
+            colours[row, column] = np.stack(planes, axis=-1)
+            wrong[row, column] = np.any(uses, axis=0)
+        else:
+            colours[row, column] = guided_colour(sample, bayer)
+            wrong[row, column] = _grown(mask, GUIDED_RADIUS)
+    return _Cells(colours, wrong)
+
+
+def _in_order(cells: _Cells, pattern: Pattern) -> Picture:
+    """Half size: the samples of a cell, by angle."""
+    angles = {int(pattern.angles[place]): place for place in cells.colours}
+    stack = np.stack([cells.colours[angles[angle]] for angle in ANGLES])
+    return Picture(_three(stack), np.any(list(cells.bad.values()), axis=0))
+
+
+def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Picture:
+    """Full size: each channel is the mosaic of a monochrome polarization sensor."""
+    height, width, channels = cells.colours[0, 0].shape
+    mosaic = np.empty((2 * height, 2 * width, channels), np.float32)
+    bad = np.empty((2 * height, 2 * width), bool)
+    for (row, column), colours in cells.colours.items():
+        mosaic[row::2, column::2], bad[row::2, column::2] = colours, cells.bad[row, column]
+    places = _tiled(pattern.angles[:2, :2], bad.shape)
+    planes = []
+    for channel in range(channels):
+        plane = np.ascontiguousarray(mosaic[..., channel])
+        if interpolation == "bilinear":
+            planes.append(np.stack([bilinear(plane, places == angle) for angle in ANGLES]))
+        else:
+            planes.append(guided_polarization(plane, places))
+    if interpolation == "bilinear":
+        invalid = np.any([used_by_bilinear(bad, places == angle) for angle in ANGLES], axis=0)
+    else:
+        invalid = _grown(bad, GUIDED_RADIUS)
+    return Picture(_three(np.stack(planes, axis=-1)), np.asarray(invalid))
+
+
+def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> Picture:
+    """Quarter size: means over the samples of one angle and colour in each 4x4 pixels."""
+    repeat = 4 // pattern.period
+    angles = np.tile(pattern.angles, (repeat, repeat))
+    colours = None if pattern.colours is None else np.tile(pattern.colours, (repeat, repeat))
+    rows, columns = values.shape[0] // 4, values.shape[1] // 4
+    blocks = values.reshape(rows, 4, columns, 4)
+    picture = np.empty((4, rows, columns, 1 if colours is None else 3), np.float32)
+    for index, angle in enumerate(ANGLES):
+        for channel in range(picture.shape[3]):
+            chosen = angles == angle if colours is None else (angles == angle) & (colours == channel)
+            samples = [blocks[:, row, :, column] for row, column in np.argwhere(chosen)]
+            picture[index, ..., channel] = np.mean(samples, axis=0, dtype=np.float32)
+    return Picture(_three(picture), np.asarray(bad.reshape(rows, 4, columns, 4).any(axis=(1, 3))))
+
+
+def _tiled(pattern: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64]:
+    height, width = pattern.shape
+    return np.tile(pattern, (-(-shape[0] // height), -(-shape[1] // width)))[: shape[0], : shape[1]]
+
+
+def _three(picture: Array) -> Array:
+    return np.repeat(picture, 3, axis=-1) if picture.shape[-1] == 1 else picture
+
+
+def _grown(mask: Mask, radius: int) -> Mask:
+    kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)

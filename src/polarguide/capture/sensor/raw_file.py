@@ -1,0 +1,98 @@
+"""Files with a raw mosaic -> sensor values."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.pictures import decode_stored, read_file
+from polarguide.capture.sensor.packing import PACKINGS, packed_size, unpack
+from polarguide.errors import PolarguideError
+
+RAW_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".raw")
+
+
+@dataclass(frozen=True)
+class RawFormat:
+    """What a packed file does not say itself: its size and packing. Other files need none of it."""
+
+    width: int | None = None
+    height: int | None = None
+    packing: str | None = None
+
+
+def read_mosaic(path: Path, raw: RawFormat) -> NDArray[Any]:
+    """Read one raw mosaic.
+
+    Args:
+        path: a PNG, TIFF, ``.npy`` or packed ``.raw`` file.
+        raw: size and packing of a ``.raw`` file; where it gives a size, other files must have it too.
+
+    Returns:
+        [H, W] uint8 or uint16, the values as stored.
+
+    Raises:
+        PolarguideError: the file cannot be read, is damaged, has colour channels or another size.
+    """
+    data = read_file(path)
+    suffix = path.suffix.lower()
+    if suffix == ".raw":
+        return _read_packed(path, data, raw)
+    values = _read_npy(path, data) if suffix == ".npy" else decode_stored(path, data)
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
+        shape = "x".join(str(length) for length in values.shape) or "a single value"
+        raise PolarguideError(
+            path,
+            expected="a raw mosaic: one channel of 8- or 16-bit whole numbers",
+            found=f"an array {shape} of {values.dtype}",
+            remedy="Save what the sensor delivers, before any demosaicing or conversion to colour.",
+        )
+    found = (values.shape[1], values.shape[0])
+    wanted = (raw.width or found[0], raw.height or found[1])
+    if found != wanted:
+        raise PolarguideError(
+            path,
+            expected=f"{wanted[0]}x{wanted[1]} pixels, as --width and --height say",
+            found=f"{found[0]}x{found[1]}",
+            remedy="Leave the two flags out for files that know their size.",
+        )
+    return values
+
+
+def _read_npy(path: Path, data: bytes) -> NDArray[Any]:
+    try:
+        return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
+    except (ValueError, EOFError, OSError) as error:
+        raise PolarguideError(
+            path,
+            expected="a complete .npy file of numbers",
+            found="an empty file" if not data else f"{len(data)} bytes that are none",
+            remedy="Copy or export the file again.",
+        ) from error
+
+
+def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[np.uint16]:
+    if raw.width is None or raw.height is None or raw.packing is None:
+        flags = {"--width": raw.width, "--height": raw.height, "--packing": raw.packing}
+        raise PolarguideError(
+            path,
+            expected="width, height and packing of a .raw file",
+            found=f"no {', '.join(flag for flag, value in flags.items() if value is None)}",
+            remedy=f"Give them as the camera was set; packings are {', '.join(PACKINGS)} and are never guessed.",
+        )
+    size = packed_size(raw.width, raw.height, raw.packing)
+    if len(data) != size:
+        raise PolarguideError(
+            path,
+            expected=f"{size} bytes for {raw.width}x{raw.height} pixels in {raw.packing}",
+            found=f"{len(data)}",
+            remedy="Check --width, --height and --packing; a file that is too short may be cut off.",
+        )
+    return unpack(data, raw.width, raw.height, raw.packing)

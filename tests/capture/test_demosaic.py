@@ -1,0 +1,125 @@
+"""Demosaicing: exact where it must be, close where it interpolates, and honest about what clips."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from camera_files import COLOUR, MONO, behind, busy_light, mosaic, smooth_light
+
+from polarguide.capture.sensor import DEMOSAIC_MODES, Picture, demosaic, sensor_pattern
+
+MODES = [
+    ("half", "bilinear"),
+    ("half", "guided"),
+    ("quarter", "bilinear"),
+    ("full", "bilinear"),
+    ("full", "guided"),
+]
+
+
+def developed(
+    intensities: np.ndarray, *, colour: bool, mode: str, interpolation: str, offset: tuple[int, int] = (0, 0)
+) -> Picture:
+    values = mosaic(intensities, COLOUR if colour else MONO, offset).astype(np.float32)
+    pattern = sensor_pattern("IMX250MYR" if colour else "IMX250MZR").shifted(*offset)
+    x, y = pattern.cell_corner()
+    values = np.ascontiguousarray(values[y:, x:])
+    bad = np.zeros(values.shape, bool)
+    return demosaic(values, bad, pattern.shifted(x, y), mode=mode, interpolation=interpolation)
+
+
+@pytest.mark.parametrize("colour", [True, False])
+@pytest.mark.parametrize(("mode", "interpolation"), MODES)
+def test_uniform_light_comes_out_exactly_for_every_offset(
+    colour: bool, mode: str, interpolation: str
+) -> None:
+    stokes = np.array([[0.8, 0.6, 0.4], [0.2, -0.1, 0.05], [-0.1, 0.2, 0.1]])
+    if not colour:
+        stokes = np.repeat(stokes[:, :1], 3, axis=1)
+    light = behind(np.broadcast_to(stokes[:, None, None, :], (3, 17, 18, 3)))
+    for offset in product(range(4), range(4)):
+        picture = developed(light, colour=colour, mode=mode, interpolation=interpolation, offset=offset)
+        expected = np.broadcast_to(light[:, :1, :1], picture.intensities.shape)
+        np.testing.assert_allclose(picture.intensities, expected, atol=1e-6)
+        assert not picture.invalid.any()
+
+
+@pytest.mark.parametrize("colour", [True, False])
+@pytest.mark.parametrize(("mode", "interpolation"), MODES)
+def test_smooth_light_is_reproduced(colour: bool, mode: str, interpolation: str) -> None:
+    light = behind(smooth_light(colour=colour))
+    picture = developed(light, colour=colour, mode=mode, interpolation=interpolation)
+    step = DEMOSAIC_MODES[mode]
+    expected = light.reshape(4, 48 // step, step, 64 // step, step, 3).mean(axis=(2, 4))
+    margin = np.s_[:, 4:-4, 4:-4] if mode != "quarter" else np.s_[:]
+    # Samples of a cell lie up to half a cell beside its centre: that is what is left.
+    bound = {"half": 0.012, "quarter": 0.025, "full": 0.002}[mode]
+    assert np.abs(picture.intensities - expected)[margin].max() < bound
+
+
+def footprint(
+    colour: bool, mode: str, interpolation: str, place: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where one changed sample changes the picture, and where it makes it invalid."""
+    rng = np.random.default_rng(0)
+    values = rng.uniform(0.3, 0.6, (32, 32)).astype(np.float32)
+    pattern = sensor_pattern("IMX250MYR" if colour else "IMX250MZR")
+    bad = np.zeros(values.shape, bool)
+    bad[place] = True
+    options = {"mode": mode, "interpolation": interpolation}
+    before = demosaic(values, bad, pattern, **options)
+    values[place] += 0.3
+    after = demosaic(values, bad, pattern, **options)
+    return np.abs(after.intensities - before.intensities).max(axis=(0, 3)) > 1e-7, before.invalid
+
+
+@pytest.mark.parametrize("colour", [True, False])
+@pytest.mark.parametrize(("mode", "interpolation"), MODES)
+def test_a_pixel_is_invalid_wherever_a_bad_sample_is_used(
+    colour: bool, mode: str, interpolation: str
+) -> None:
+    for place in ((16, 16), (17, 14), (15, 19), (0, 0), (31, 3)):
+        changed, invalid = footprint(colour, mode, interpolation, place)
+        assert not (changed & ~invalid).any()
+        if interpolation == "bilinear":  # and nowhere else
+            np.testing.assert_array_equal(changed, invalid)
+
+
+def psnr(found: np.ndarray, true: np.ndarray) -> float:
+    inside = np.s_[..., 8:-8, 8:-8, :]
+    return float(-10 * np.log10(np.mean((found[inside] - true[inside]) ** 2)))
+
+
+@pytest.mark.parametrize("colour", [True, False])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_guided_interpolation_beats_bilinear(colour: bool, seed: int) -> None:
+    light = busy_light(96, 128, seed)
+    if not colour:
+        light = np.repeat(light[..., 1:2], 3, axis=-1)
+    true = behind(light)
+    gains = {}
+    for name in ("bilinear", "guided"):
+        found = developed(true, colour=colour, mode="full", interpolation=name).intensities
+        s0, s1, s2 = found.sum(axis=0) / 2, found[0] - found[2], found[1] - found[3]
+        gains[name] = [psnr(found, true), psnr(s0, light[0]), psnr(np.stack([s1, s2]), light[1:])]
+    better = np.subtract(gains["guided"], gains["bilinear"])
+    assert (better > 0.5).all(), (gains, better)
+
+
+@pytest.mark.parametrize("colour", [True, False])
+def test_polanalyser_agrees(colour: bool) -> None:
+    reference = pytest.importorskip("polanalyser")
+    light = behind(smooth_light(colour=colour))
+    values = np.rint(mosaic(light, COLOUR if colour else MONO) * 65535).astype(np.uint16)
+    code = reference.COLOR_PolarRGB if colour else reference.COLOR_PolarMono
+    theirs = np.stack([picture.astype(float) for picture in reference.demosaicing(values, code)])
+    theirs = theirs[..., ::-1] if colour else np.repeat(theirs[..., None], 3, axis=-1)
+    pattern = sensor_pattern("IMX250MYR" if colour else "IMX250MZR")
+    bad = np.zeros(values.shape, bool)
+    ours = demosaic(
+        values.astype(np.float32), bad, pattern, mode="full", interpolation="bilinear"
+    ).intensities
+    # It rounds after each of its two steps, and treats the border in another way.
+    assert np.abs(ours - theirs)[:, 4:-4, 4:-4].max() <= 2.0

@@ -1,0 +1,168 @@
+"""``prepare --poses``: models matched by name, scaled, undistorted; and structure from motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from camera_files import (
+    COLOUR,
+    MONO,
+    behind,
+    mosaic,
+    read_invalid,
+    read_polar,
+    smooth_light,
+    write_model,
+    write_mosaic,
+    write_mosaics,
+    write_shots,
+)
+
+from polarguide.capture import load_scene
+from polarguide.capture.prepare import PrepareSettings, Reporter, prepare_scene
+
+MOSAIC = PrepareSettings(sensor="IMX250MYR", gains="none")
+FILTER = PrepareSettings(gains="none", align=False, transfer="linear")
+NAMES = ("v000", "v001", "v002")
+
+
+class Heard(Reporter):
+    """Keeps what was said."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    warn = say
+
+
+@pytest.mark.parametrize(
+    ("demosaic", "camera", "inner"),
+    [
+        ("half", "PINHOLE 64 48 80 82 33 25", (40, 41, 16.5, 12.5)),
+        ("half", "PINHOLE 32 24 40 41 16.5 12.5", (40, 41, 16.5, 12.5)),
+        ("half", "SIMPLE_PINHOLE 128 96 160 66 50", (40, 40, 16.5, 12.5)),
+        ("quarter", "PINHOLE 64 48 80 82 33 25", (20, 20.5, 8.25, 6.25)),
+        ("full", "SIMPLE_RADIAL 64 48 80 33 25 0", (80, 80, 33, 25)),
+    ],
+)
+def test_intrinsics_follow_the_size(
+    tmp_path: Path, demosaic: str, camera: str, inner: tuple[float, ...]
+) -> None:
+    write_mosaics(tmp_path / "in")
+    model = write_model(tmp_path / "sparse" / "0", NAMES, camera)
+    for number, place in enumerate((tmp_path, tmp_path / "sparse", model)):
+        out = tmp_path / f"out{number}"
+        prepare_scene(tmp_path / "in", out, replace(MOSAIC, demosaic=demosaic, poses=str(place)))
+        scene = load_scene(out)
+        assert [view.name for view in scene.views] == list(NAMES)
+        found = scene.views[1].camera
+        assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx(inner)
+        assert scene.points.shape == (4, 3)
+        np.testing.assert_allclose(found.translation, [0.1, -0.25, 2.5])
+
+
+def test_a_cut_cell_moves_the_principal_point(tmp_path: Path) -> None:
+    light = smooth_light(49, 65)
+    for name in NAMES:
+        write_mosaic(tmp_path / "in" / f"{name}.png", mosaic(behind(light), COLOUR, (1, 3)))
+    model = write_model(tmp_path / "model", NAMES, "PINHOLE 65 49 80 82 33 25")
+    prepare_scene(
+        tmp_path / "in", tmp_path / "out", replace(MOSAIC, offset_x=1, offset_y=3, poses=str(model))
+    )
+    camera = load_scene(tmp_path / "out").views[0].camera
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (32, 24, 16.0, 12.0)
+
+
+def test_views_without_a_pose_are_left_out_and_named(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "in", 4)
+    model = write_model(tmp_path / "model", ("sub/v000", "v001", "v003"), "PINHOLE 64 48 80 82 32 24")
+    heard = Heard()
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(MOSAIC, poses=str(model)), heard)
+    assert done.left_out == ["v002"]
+    assert any("1 of 4 views have no pose and are left out (v002)" in text for text in heard.said)
+    assert len(load_scene(tmp_path / "out").views) == 3
+
+
+def test_one_map_undistorts_all_four_intensities(tmp_path: Path) -> None:
+    """Light that is a function of the ray: where a ray lands is known with and without distortion."""
+    distorted = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=128, height=96, params=[110.0, 64.0, 48.0, 0.12], camera_id=1
+    )
+
+    def light_of(camera: pycolmap.Camera) -> np.ndarray:
+        rows, columns = np.mgrid[: camera.height, : camera.width]
+        rays = camera.cam_from_img(np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1))
+        x, y = rays.T.reshape(2, camera.height, camera.width)
+        s0 = (0.8 + 0.3 * np.sin(9 * x) * np.cos(7 * y))[..., None] * np.ones(3)
+        return np.stack([s0, s0 * 0.4 * np.cos(5 * x)[..., None], s0 * 0.4 * np.sin(5 * y)[..., None]])
+
+    light = behind(light_of(distorted))
+    light[0, 40, 50] = 1.0
+    for name in NAMES:
+        write_shots(tmp_path / "in", name, light)
+    model = write_model(tmp_path / "model", NAMES, "SIMPLE_RADIAL 128 96 110 64 48 0.12")
+    prepare_scene(tmp_path / "in", tmp_path / "out", replace(FILTER, poses=str(model)))
+    scene = load_scene(tmp_path / "out")
+    camera = scene.views[0].camera
+    straight = pycolmap.Camera(
+        model="PINHOLE", width=camera.width, height=camera.height,
+        params=[camera.fx, camera.fy, camera.cx, camera.cy],
+    )  # fmt: skip
+    invalid = read_invalid(tmp_path / "out", "v000")
+    error = np.abs(read_polar(tmp_path / "out", "v000") - behind(light_of(straight)))[:, ~invalid]
+    assert error.max() < 2e-3
+    assert 1 <= invalid.sum() <= 4
+    place = distorted.cam_from_img(np.array([[50.5, 40.5]]))
+    x, y = straight.img_from_cam(np.column_stack([place, [1.0]]))[0]
+    assert np.abs(np.argwhere(invalid) + 0.5 - [y, x]).max() <= 1.5
+
+
+def test_sfm_on_a_textured_scene(tmp_path: Path) -> None:
+    """A textured, polarized plane seen by a camera on an arc: all views register, and training can read them."""
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.uniform(0, 1, (600, 600)).astype(np.float32), (0, 0), 1.5)
+    texture = np.clip((texture - texture.mean()) * 4 + 0.5, 0.05, 1.0)
+    inner = np.array([[260.0, 0, 160], [0, 260, 120], [0, 0, 1]])
+    for index, angle in enumerate(np.radians([-30, -18, -6, 6, 18, 30])):
+        turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+        relief = []
+        for depth, part in ((0.0, np.s_[:, :]), (0.25, np.s_[150:450, 150:450])):
+            offset = turn @ [-0.5, -0.5, -depth] + [0, 0, 1.3]
+            plane = inner @ np.column_stack([turn[:, 0] / 600, turn[:, 1] / 600, offset])
+            mask = np.zeros_like(texture)
+            mask[part] = 1
+            layer = texture if depth == 0 else texture[::-1].copy()
+            relief.append([cv2.warpPerspective(image, plane, (320, 240)) for image in (layer, mask)])
+        s0 = np.where(relief[1][1] > 0.5, relief[1][0], relief[0][0])[..., None] * np.ones(3)
+        light = np.stack([s0, 0.1 * s0, 0.05 * s0])
+        write_shots(tmp_path / "in", f"v{index}", behind(light))
+    heard = Heard()
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", FILTER, heard)
+    assert len(done.views) >= 5
+    assert any("views registered" in text for text in heard.said)
+    assert not (tmp_path / "out" / ".sfm").exists()
+    scene = load_scene(tmp_path / "out")
+    assert len(scene.points) > 100
+    assert scene.views[0].camera.fx == pytest.approx(260, rel=0.25)
+
+
+def test_poses_may_follow_on_none(tmp_path: Path) -> None:
+    for name in NAMES:
+        write_mosaic(tmp_path / "in" / f"{name}.png", mosaic(behind(smooth_light(colour=False)), MONO))
+    settings = replace(MOSAIC, sensor="IMX250MZR", poses="none")
+    prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    written = (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns
+    model = write_model(tmp_path / "model", NAMES[:2], "PINHOLE 64 48 80 82 32 24")
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(settings, poses=str(model)))
+    assert done.new
+    assert done.left_out == ["v002"]
+    assert (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns == written
+    assert len(load_scene(tmp_path / "out").views) == 2
