@@ -141,7 +141,7 @@ ABLATIONS_STOKES: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE_STOKES,
         "without-normals",
         "No term on the normals but what S1 and S2 say.",
-        weights=_NORMAL_TERMS_OFF,
+        weights={**_NORMAL_TERMS_OFF, "consistency": 0.0},
     ),
     varied(
         RECIPE_POLARGUIDE_STOKES,

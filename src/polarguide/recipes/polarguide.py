@@ -65,7 +65,6 @@ RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     blend="fresnel",
     local=True,
     first_strength=0.5,
-    environment_spread=0.2,
     rates={**RECIPE_3DGS_DR.rates, "local_dc": 2.5e-3, "local_rest": 2.5e-3 / 20},
 )
 
