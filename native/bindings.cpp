@@ -11,6 +11,7 @@ namespace nb = nanobind;
 
 void bind_raster(nb::module_ &module);
 void bind_image(nb::module_ &module);
+void bind_axes(nb::module_ &module);
 
 NB_MODULE(_native, module) {
     nb::set_leak_warnings(false); // autograd graphs may outlive the interpreter
@@ -29,4 +30,5 @@ NB_MODULE(_native, module) {
         nb::arg("name"), "Choose 'auto', 'baseline', 'avx2' or 'avx512'.");
     bind_raster(module);
     bind_image(module);
+    bind_axes(module);
 }

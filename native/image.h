@@ -1,4 +1,4 @@
-// Kernels of pictures and colours: photometric loss, cubemap look-up, spherical harmonics.
+// Kernels of pictures and colours: photometric loss, cubemap look-up, spherical harmonics, normals.
 #pragma once
 #include "kernels.h"
 
@@ -49,5 +49,19 @@ struct HarmonicsArgs {
 };
 POLARGUIDE_DECLARE(void harmonics_forward(const HarmonicsArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void harmonics_backward(const HarmonicsArgs &a, int64_t begin, int64_t end))
+
+// Shortest axes of Gaussians turned outward, their gradient, and rays mirrored at them.
+struct AxesArgs {
+    const float *means, *quaternions, *log_scales, *centre; // [N,3] [N,4] [N,3] [3]
+    const float *outward;                                   // [N,3] or null
+    float grazing;                                          // cosine under which `outward` decides
+    const float *normals;                                   // [N,3], of mirrored_forward
+    float *out;                                             // [N,3]
+    const float *grad_out;
+    float *grad_quaternions;
+};
+POLARGUIDE_DECLARE(void axes_forward(const AxesArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void axes_backward(const AxesArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void mirrored_forward(const AxesArgs &a, int64_t begin, int64_t end))
 
 } // namespace polarguide

@@ -89,3 +89,23 @@ def harmonics_backward(
     grad_dc: Tensor,
     grad_rest: Tensor,
 ) -> None: ...
+def axes_forward(
+    means: Tensor,
+    quaternions: Tensor,
+    log_scales: Tensor,
+    centre: Tensor,
+    outward: Tensor | None,
+    grazing: float,
+    out: Tensor,
+) -> None: ...
+def axes_backward(
+    means: Tensor,
+    quaternions: Tensor,
+    log_scales: Tensor,
+    centre: Tensor,
+    outward: Tensor | None,
+    grazing: float,
+    grad_out: Tensor,
+    grad_quaternions: Tensor,
+) -> None: ...
+def mirrored_forward(means: Tensor, centre: Tensor, normals: Tensor, out: Tensor) -> None: ...

@@ -7,11 +7,29 @@ top-left pixel at (0.5, 0.5), as in COLMAP.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from polarguide.vectors import unit
+
+
+@lru_cache(maxsize=4)
+def _pixel_rays(
+    size: tuple[int, int],
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tensor:
+    """Rays of an internal calibration, which views share and every rendering asks for."""
+    x, y = (
+        (torch.arange(n, dtype=dtype, device=device) + 0.5 - c) / f
+        for n, f, c in zip(size, focal, centre, strict=True)
+    )
+    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+    return unit(torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +58,9 @@ class Camera:
         return -self.rotation.T @ self.translation
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """Unit rays through the pixel centres in camera axes, [height, width, 3]."""
-        x = (torch.arange(self.width, dtype=dtype, device=device) + 0.5 - self.cx) / self.fx
-        y = (torch.arange(self.height, dtype=dtype, device=device) + 0.5 - self.cy) / self.fy
-        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
-        directions = torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1)
-        return unit(directions)
+        """Unit rays through the pixel centres in camera axes, [height, width, 3]; not to be written to."""
+        size, focal, centre = (self.width, self.height), (self.fx, self.fy), (self.cx, self.cy)
+        return _pixel_rays(size, focal, centre, dtype, torch.device(device))
 
     def world_rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
         """Unit rays through the pixel centres in world axes, [height, width, 3]."""

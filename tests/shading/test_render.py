@@ -276,8 +276,9 @@ def test_local_light_is_that_of_the_mirrored_direction(rows: dict[str, Tensor]) 
         "local_rest": torch.randn(COUNT, 15, 3, generator=generator),
     }
     rays, normals = (directions(seed)[:COUNT].float() for seed in (4, 5))
-    light = local_light(rows, normals, rays, 3)
-    basis = sh_basis(mirrored(rays, normals), 3)
+    mirrors = mirrored(rays, normals)
+    light = local_light(rows, mirrors, 3)
+    basis = sh_basis(mirrors, 3)
     coefficients = torch.cat((rows["local_dc"][:, None], rows["local_rest"]), dim=1)
     torch.testing.assert_close(light, (basis[..., None] * coefficients).sum(1), atol=1e-5, rtol=1e-5)
 

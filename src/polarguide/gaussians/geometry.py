@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import normalize
+
+from polarguide import _native
+from polarguide.vectors import dot, unit
 
 # Cosine of the angle to the camera under which the outward side decides, not the camera.
 GRAZING = 0.35
@@ -19,6 +25,67 @@ def quaternions_to_rotations(quats: Tensor) -> Tensor:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return torch.stack([torch.stack(row, dim=-1) for row in entries], dim=-2)
+
+
+def shortest_axis_normals_reference(
+    means: Tensor, quaternions: Tensor, log_scales: Tensor, centre: Tensor, outward: Tensor | None = None
+) -> Tensor:
+    """The slow twin of ``shortest_axis_normals``: plain torch, any dtype and device."""
+    # Component by component: reductions over three or four, and one-hot rows, are several times slower.
+    w, x, y, z = quaternions.unbind(-1)
+    first, second, third = log_scales.detach().unbind(-1)
+    is_first = (first <= second) & (first <= third)
+    is_second = ~is_first & (second <= third)
+    ax, ay = is_first.to(w), is_second.to(w)
+    az = 1 - ax - ay
+    length = x * x + y * y + z * z
+    twice = 2 / (w * w + length).clamp(min=1e-24)
+    along = x * ax + y * ay + z * az
+    kept = 1 - twice * length
+    normals = torch.stack(
+        (
+            kept * ax + twice * (x * along + w * (y * az - z * ay)),
+            kept * ay + twice * (y * along + w * (z * ax - x * az)),
+            kept * az + twice * (z * along + w * (x * ay - y * ax)),
+        ),
+        dim=-1,
+    )
+    with torch.no_grad():
+        to_camera = centre.to(means) - means
+        facing = dot(to_camera, normals)
+        if outward is not None:
+            side = dot(outward, normals)
+            # An opaque surface does not face away from a camera that sees it by more than its Gaussians' width.
+            grazing = facing.square() < GRAZING**2 * dot(to_camera, to_camera)
+            facing = torch.where(grazing & (side != 0), side, facing)
+        sign = torch.where(facing >= 0, 1.0, -1.0).to(normals)[:, None]
+    return normals * sign
+
+
+class _Axes(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quaternions: Tensor,
+        log_scales: Tensor,
+        centre: Tensor,
+        outward: Tensor | None,
+    ) -> Tensor:
+        shape = tuple(t.detach().contiguous() for t in (means, quaternions, log_scales, centre))
+        outward = None if outward is None else outward.detach().contiguous()
+        out = torch.empty_like(shape[0])
+        _native.axes_forward(*shape, outward, GRAZING, out)
+        ctx.save_for_backward(*shape, outward)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        *shape, outward = ctx.saved_tensors
+        to_quaternions = torch.empty_like(shape[1])
+        _native.axes_backward(*shape, outward, GRAZING, grad.contiguous(), to_quaternions)
+        return None, to_quaternions, None, None, None
 
 
 def shortest_axis_normals(
@@ -36,16 +103,28 @@ def shortest_axis_normals(
     Returns:
         [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
     """
-    q = normalize(quaternions, dim=-1, eps=1e-12)
-    axis = torch.nn.functional.one_hot(log_scales.detach().argmin(dim=-1), 3).to(q)
-    w, u = q[:, :1], q[:, 1:]
-    cross = torch.linalg.cross(u, axis)
-    normals = axis + 2 * (w * cross + torch.linalg.cross(u, cross))
-    facing = (normalize(centre.to(means) - means.detach(), dim=-1) * normals.detach()).sum(
-        dim=-1, keepdim=True
-    )
-    if outward is not None:
-        side = (outward.detach() * normals.detach()).sum(dim=-1, keepdim=True)
-        # An opaque surface does not face away from a camera that sees it by more than its Gaussians' width.
-        facing = torch.where((facing.abs() < GRAZING) & (side != 0), side, facing)
-    return torch.where(facing >= 0, normals, -normals)
+    centre = centre.detach().to(means)
+    given = (means, quaternions, log_scales) if outward is None else (means, quaternions, log_scales, outward)
+    if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in given):
+        result: Tensor = _Axes.apply(means, quaternions, log_scales, centre, outward)
+        return result
+    return shortest_axis_normals_reference(means, quaternions, log_scales, centre, outward)
+
+
+def mirrored_directions(means: Tensor, centre: Tensor, normals: Tensor) -> Tensor:
+    """Where a ray from the camera goes after reflection at each Gaussian; without gradients.
+
+    Args:
+        means: [N, 3]. centre: [3] camera centre. normals: [N, 3] unit.
+
+    Returns:
+        [N, 3], unit; zero for a mean at the centre.
+    """
+    means, normals = means.detach(), normals.detach()
+    centre = centre.detach().to(means)
+    if means.device.type == "cpu" and means.dtype == normals.dtype == torch.float32:
+        out = torch.empty_like(means)
+        _native.mirrored_forward(means.contiguous(), centre.contiguous(), normals.contiguous(), out)
+        return out
+    rays = unit(means - centre, 1e-12)
+    return rays - 2 * dot(rays, normals)[..., None] * normals

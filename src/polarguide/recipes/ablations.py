@@ -45,7 +45,7 @@ def varied(
     return replace(base, name=f"{base.name}:{name}", about=about, stages=stages, priors=changed, **fields)
 
 
-_NORMAL_TERMS_OFF = {"normal": 0.0, "azimuth": 0.0, "chromatic": 0.0, "agreement": 0.0}
+_NORMAL_TERMS_OFF = {"normal": 0.0, "azimuth": 0.0, "chromatic": 0.0, "agreement": 0.0, "consistency": 0.0}
 
 ABLATIONS_3DGS_DR: tuple[Recipe, ...] = (
     replace(
@@ -118,6 +118,12 @@ ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
     ),
     varied(
         RECIPE_POLARGUIDE,
+        "without-consistency",
+        "Normals need not agree with the depth.",
+        weights={"consistency": 0.0},
+    ),
+    varied(
+        RECIPE_POLARGUIDE,
         "without-flatness",
         "Gaussians need not be flat.",
         weights={"flatness": 0.0},
@@ -141,7 +147,7 @@ ABLATIONS_STOKES: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE_STOKES,
         "without-normals",
         "No term on the normals but what S1 and S2 say.",
-        weights={**_NORMAL_TERMS_OFF, "consistency": 0.0},
+        weights=_NORMAL_TERMS_OFF,
     ),
     varied(
         RECIPE_POLARGUIDE_STOKES,

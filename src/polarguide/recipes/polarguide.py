@@ -36,21 +36,21 @@ def _stages(guided: Weights, final: Weights, *, oriented: bool = False) -> tuple
     )
 
 
+_GEOMETRY_TERMS = Weights(azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1, consistency=0.05)
+
 RECIPE_POLARGUIDE: Recipe = replace(
     RECIPE_3DGS_DR,
     name="polarguide",
     about="The paper's three stages with repaired physics: physical candidates, azimuth, exact separation.",
     stages=_stages(
-        Weights(specular=0.5, diffuse=0.2, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
-        Weights(azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1),
+        replace(_GEOMETRY_TERMS, specular=0.5, diffuse=0.2),
+        _GEOMETRY_TERMS,
     ),
     # An ideal sensor tells the azimuth down to a DoLP of a percent; noise has its own mask.
     priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0, snr=3.0, chromatic=True),
 )
 
-_STOKES_TERMS = Weights(
-    stokes=1.0, azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1, consistency=0.05
-)
+_STOKES_TERMS = replace(_GEOMETRY_TERMS, stokes=1.0)
 
 RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     RECIPE_POLARGUIDE,

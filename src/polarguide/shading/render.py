@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.gaussians.geometry import mirrored_directions, shortest_axis_normals
 from polarguide.gaussians.spherical_harmonics import evaluate_sh
 from polarguide.optics import reflectances_from_cosine
 from polarguide.raster.interface import Rasterise, ScreenStatistic
@@ -35,17 +35,17 @@ def harmonic_colours(rows: Rows, rays: Tensor) -> Tensor:
     return (evaluate_sh(rays, origin, rows["sh_dc"], rows["sh_rest"], 3) + 0.5).clamp(min=0)
 
 
-def local_light(rows: Rows, normals: Tensor, rays: Tensor, sh_degree: int) -> Tensor:
-    """Light [N, 3] that each Gaussian adds along a ray mirrored at its own normal; can be negative.
+def local_light(rows: Rows, directions: Tensor, sh_degree: int) -> Tensor:
+    """Light [N, 3] that each Gaussian adds from a mirrored direction; can be negative.
 
     Args:
         rows: with ``local_dc`` and ``local_rest``, harmonics of the mirrored direction.
-        normals: [N, 3] unit. rays: [N, 3] unit, from the camera to each. sh_degree: as for the base colour.
+        directions: [N, 3] unit, of the mirrored rays. sh_degree: as for the base colour.
 
     Returns:
         [N, 3], differentiable in the harmonics alone.
     """
-    directions = mirrored(rays, normals).detach()
+    directions = directions.detach()
     origin = torch.zeros_like(directions[0])
     return evaluate_sh(directions, origin, rows["local_dc"], rows["local_rest"], sh_degree)
 
@@ -89,8 +89,8 @@ class Shading:
         """Base colour [N, 3], strength [N, 1] and, with ``local``, the Gaussians' own light [N, 3]."""
         channels = [base_colours(rows, centre, sh_degree), torch.sigmoid(rows["strength_logits"])[:, None]]
         if self.local:
-            rays = unit(rows["means"].detach() - centre)
-            channels.append(local_light(rows, normals, rays, sh_degree))
+            directions = mirrored_directions(rows["means"], centre, normals)
+            channels.append(local_light(rows, directions, sh_degree))
         return channels
 
     def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
@@ -102,9 +102,10 @@ class Shading:
 
     def colours(self, rows: Rows, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor) -> Tensor:
         """Colours [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
-        seen = self.light(cubemap_lookup(light["texels"], mirrored(rays, normals).contiguous()))
+        directions = mirrored(rays, normals).contiguous()
+        seen = self.light(cubemap_lookup(light["texels"], directions))
         if self.local:
-            seen = (seen + local_light(rows, normals, rays, 3)).clamp(min=0)
+            seen = (seen + local_light(rows, directions, 3)).clamp(min=0)
         strength = torch.sigmoid(rows["strength_logits"])[:, None]
         cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
         specular, diffuse = self.layers(harmonic_colours(rows, rays), strength, seen, cosine)
