@@ -72,19 +72,21 @@ class _Axes(torch.autograd.Function):
         centre: Tensor,
         outward: Tensor | None,
     ) -> Tensor:
-        shape = tuple(t.detach().contiguous() for t in (means, quaternions, log_scales, centre))
+        means, quaternions, log_scales = (t.detach().contiguous() for t in (means, quaternions, log_scales))
         outward = None if outward is None else outward.detach().contiguous()
-        out = torch.empty_like(shape[0])
-        _native.axes_forward(*shape, outward, GRAZING, out)
-        ctx.save_for_backward(*shape, outward)
+        out = torch.empty_like(means)
+        _native.axes_forward(means, quaternions, log_scales, centre, outward, GRAZING, out)
+        ctx.save_for_backward(means, quaternions, log_scales, centre, outward)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        *shape, outward = ctx.saved_tensors
-        to_quaternions = torch.empty_like(shape[1])
-        _native.axes_backward(*shape, outward, GRAZING, grad.contiguous(), to_quaternions)
+        means, quaternions, log_scales, centre, outward = ctx.saved_tensors
+        to_quaternions = torch.empty_like(quaternions)
+        _native.axes_backward(
+            means, quaternions, log_scales, centre, outward, GRAZING, grad.contiguous(), to_quaternions
+        )
         return None, to_quaternions, None, None, None
 
 
@@ -103,7 +105,7 @@ def shortest_axis_normals(
     Returns:
         [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
     """
-    centre = centre.detach().to(means)
+    centre = centre.detach().to(means).contiguous()
     given = (means, quaternions, log_scales) if outward is None else (means, quaternions, log_scales, outward)
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in given):
         result: Tensor = _Axes.apply(means, quaternions, log_scales, centre, outward)
