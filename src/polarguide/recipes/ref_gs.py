@@ -24,6 +24,6 @@ RECIPE_REF_GS = Recipe(
     },
     directional=DirectionalShading(width=64),
     environment_spread=0.5,
-    environment_rate=2e-3,
+    environment_rate=1e-2,
     environment_resolution=32,
 )
