@@ -64,4 +64,24 @@ POLARGUIDE_DECLARE(void axes_forward(const AxesArgs &a, int64_t begin, int64_t e
 POLARGUIDE_DECLARE(void axes_backward(const AxesArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void mirrored_forward(const AxesArgs &a, int64_t begin, int64_t end))
 
+// Deferred reflection per pixel. Features are base colour, normal, strength and, with `local`, three of light; others
+// may follow. `seen` is what the look-up of `directions` gave.
+struct ReflectArgs {
+    int channels;
+    bool fresnel, local; // Fresnel's weight and exponential light, or the lerp and the logistic function
+    float index;
+    const float *features; // [P,D]
+    const float *rays;     // [P,3] unit
+    const float *seen;     // [P,3]
+    float *directions;     // [P,3]
+    float *final_picture, *specular, *diffuse, *reflection;
+    const float *grad_final, *grad_specular, *grad_diffuse, *grad_reflection; // each may be null
+    const float *grad_directions;
+    float *grad_seen, *grad_features;
+};
+POLARGUIDE_DECLARE(void reflect_directions(const ReflectArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void reflect_layers(const ReflectArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t end))
+
 } // namespace polarguide

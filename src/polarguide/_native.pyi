@@ -109,3 +109,33 @@ def axes_backward(
     grad_quaternions: Tensor,
 ) -> None: ...
 def mirrored_forward(means: Tensor, centre: Tensor, normals: Tensor, out: Tensor) -> None: ...
+def reflect_directions(features: Tensor, rays: Tensor, directions: Tensor) -> None: ...
+def reflect_layers(
+    features: Tensor,
+    rays: Tensor,
+    seen: Tensor,
+    fresnel: bool,
+    local: bool,
+    index: float,
+    final: Tensor,
+    specular: Tensor,
+    diffuse: Tensor,
+    reflection: Tensor,
+) -> None: ...
+def reflect_backward_layers(
+    features: Tensor,
+    rays: Tensor,
+    seen: Tensor,
+    fresnel: bool,
+    local: bool,
+    index: float,
+    grad_final: Tensor | None,
+    grad_specular: Tensor | None,
+    grad_diffuse: Tensor | None,
+    grad_reflection: Tensor | None,
+    grad_seen: Tensor,
+    grad_features: Tensor,
+) -> None: ...
+def reflect_backward_directions(
+    features: Tensor, rays: Tensor, grad_directions: Tensor, grad_features: Tensor
+) -> None: ...

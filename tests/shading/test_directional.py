@@ -145,7 +145,7 @@ def test_degenerate_normals_and_features_stay_finite_with_gradients(scale: float
     direction = (scale * normalize(normal(13, *size, 3), dim=-1)).requires_grad_()
     further = torch.cat((torch.rand(*size, 1), scale * normal(14, *size, FEATURES)), dim=-1).requires_grad_()
     values = {name: t.requires_grad_() for name, t in light().items()}
-    layers = SHADING.shade(GBuffer(albedo, direction, further, alpha), values, camera())
+    layers = SHADING.shade(GBuffer(torch.cat((albedo, direction, further), dim=-1), alpha), values, camera())
     layers["final"].square().mean().backward()
     for tensor in (layers["final"], albedo.grad, direction.grad, further.grad, values["texels"].grad):
         assert tensor is not None

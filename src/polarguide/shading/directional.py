@@ -130,7 +130,7 @@ class DirectionalShading:
 
     def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
         """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the colour that was splatted is albedo."""
-        albedo, normal, further, alpha = splatted
+        albedo, normal, further, alpha = splatted.colour, splatted.normal, splatted.further, splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
         directions = mirrored(rays, unit(normal, 1e-3))
         radiance = self.radiance(

@@ -25,16 +25,28 @@ class GBuffer(NamedTuple):
     """What was splatted for a picture that is shaded afterwards.
 
     Attributes:
-        colour: [H, W, 3].
-        normal: [H, W, 3] blended, world axes.
-        further: [H, W, K] channels of the shading model (others may follow).
+        features: [H, W, 6 + K] blended colour, normal (world axes) and channels of the shading model; others may
+            follow.
         alpha: [H, W].
     """
 
-    colour: Tensor
-    normal: Tensor
-    further: Tensor
+    features: Tensor
     alpha: Tensor
+
+    @property
+    def colour(self) -> Tensor:
+        """[H, W, 3]."""
+        return self.features[..., :3]
+
+    @property
+    def normal(self) -> Tensor:
+        """[H, W, 3] blended, world axes, not normalised."""
+        return self.features[..., 3:6]
+
+    @property
+    def further(self) -> Tensor:
+        """[H, W, K] channels of the shading model."""
+        return self.features[..., 6:]
 
 
 class ShadingModel(Protocol):

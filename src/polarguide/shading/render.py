@@ -16,6 +16,7 @@ from polarguide.optics import reflectances_from_cosine
 from polarguide.raster.interface import Rasterise, ScreenStatistic
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, Rows, ShadingModel, mirrored
+from polarguide.shading.reflection import reflect_native
 from polarguide.shading.result import RenderResult
 from polarguide.vectors import dot, unit
 
@@ -95,9 +96,23 @@ class Shading:
 
     def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
         """The layers of ``reflect``, and ``strength`` [H, W]."""
-        base, normal, further, _ = splatted
-        strength, local = further[..., 0], further[..., 1:4] if self.local else None
-        layers = reflect(base, normal, strength, light["texels"], camera, self, local)
+        features, texels = splatted.features, light["texels"]
+        strength = features[..., 6]
+        if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (features, texels)):
+            size = features.shape[:2]
+            found = reflect_native(
+                features.flatten(0, 1),
+                camera.world_rays().flatten(0, 1),
+                texels,
+                fresnel=self.blend == "fresnel",
+                local=self.local,
+                index=self.index,
+            )
+            final, specular, diffuse, reflection = (layer.unflatten(0, size) for layer in found)
+            layers = {"final": final, "specular": specular, "diffuse": diffuse, "reflection": reflection}
+        else:
+            local = features[..., 7:10] if self.local else None
+            layers = reflect(splatted.colour, splatted.normal, strength, texels, camera, self, local)
         return {**layers, "strength": strength}
 
     def colours(self, rows: Rows, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor) -> Tensor:
@@ -131,7 +146,7 @@ def reflect(
     shading: Shading,
     local: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Deferred reflection per pixel.
+    """Deferred reflection per pixel, in plain torch: any dtype and device. ``reflect_native`` is its twin.
 
     Args:
         base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
@@ -199,7 +214,7 @@ def render(
     normal = picture.features[..., 3:6] if normals or environment is not None else None
     layers = {"final": base}
     if environment is not None and normal is not None:
-        splatted = GBuffer(base, normal, picture.features[..., 6:], picture.alpha)
+        splatted = GBuffer(picture.features, picture.alpha)
         layers = shading.shade(splatted, environment, camera)
     return RenderResult(
         final=layers["final"],

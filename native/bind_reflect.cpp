@@ -1,0 +1,102 @@
+#include "arrays.h"
+#include "image.h"
+#include "parallel.h"
+
+#include <nanobind/stl/optional.h>
+
+#include <optional>
+#include <stdexcept>
+
+namespace nb = nanobind;
+using namespace polarguide;
+
+namespace {
+
+using MaybeArray = std::optional<Array>;
+constexpr int64_t item_chunk = 2048;
+
+ReflectArgs reflect_args(const Array &features, const Array &rays, bool fresnel, bool local, float index) {
+    const int64_t n = features.ndim() == 2 ? int64_t(features.shape(0)) : 0;
+    const int64_t channels = features.ndim() == 2 ? int64_t(features.shape(1)) : 0;
+    expect_shape(features, "features", {n, channels}), expect_shape(rays, "rays", {n, 3});
+    if (channels < (local ? 10 : 7))
+        throw std::invalid_argument("features: expected base colour, normal, strength and what the shading reads");
+    ReflectArgs a{};
+    a.channels = int(channels), a.fresnel = fresnel, a.local = local, a.index = index;
+    a.features = features.data(), a.rays = rays.data();
+    return a;
+}
+
+void run(void (*kernel)(const ReflectArgs &, int64_t, int64_t), const ReflectArgs &a, int64_t count) {
+    nb::gil_scoped_release release;
+    auto body = [&](int64_t b, int64_t e, int) { kernel(a, b, e); };
+    parallel_chunks(count, item_chunk, body);
+}
+
+const float *optional_rows(const MaybeArray &array, const char *name, int64_t n) {
+    if (!array) return nullptr;
+    expect_shape(*array, name, {n, 3});
+    return array->data();
+}
+
+} // namespace
+
+void bind_reflect(nb::module_ &module) {
+    module.def(
+        "reflect_directions",
+        [](const Array &features, const Array &rays, Array directions) {
+            ReflectArgs a = reflect_args(features, rays, false, false, 1.5f);
+            const int64_t n = int64_t(rays.shape(0));
+            expect_shape(directions, "directions", {n, 3});
+            a.directions = directions.data();
+            run(POLARGUIDE_DISPATCH(reflect_directions), a, n);
+        },
+        nb::arg("features"), nb::arg("rays"), nb::arg("directions"), "Rays mirrored at the blended normals.");
+    module.def(
+        "reflect_layers",
+        [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float index,
+           Array final_picture, Array specular, Array diffuse, Array reflection) {
+            ReflectArgs a = reflect_args(features, rays, fresnel, local, index);
+            const int64_t n = int64_t(rays.shape(0));
+            expect_shape(seen, "seen", {n, 3}), expect_shape(final_picture, "final", {n, 3});
+            expect_shape(specular, "specular", {n, 3}), expect_shape(diffuse, "diffuse", {n, 3});
+            expect_shape(reflection, "reflection", {n, 3});
+            a.seen = seen.data(), a.final_picture = final_picture.data(), a.specular = specular.data();
+            a.diffuse = diffuse.data(), a.reflection = reflection.data();
+            run(POLARGUIDE_DISPATCH(reflect_layers), a, n);
+        },
+        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("index"),
+        nb::arg("final"), nb::arg("specular"), nb::arg("diffuse"), nb::arg("reflection"), "The layers of the picture.");
+    module.def(
+        "reflect_backward_layers",
+        [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float index,
+           MaybeArray grad_final, MaybeArray grad_specular, MaybeArray grad_diffuse, MaybeArray grad_reflection,
+           Array grad_seen, Array grad_features) {
+            ReflectArgs a = reflect_args(features, rays, fresnel, local, index);
+            const int64_t n = int64_t(rays.shape(0));
+            expect_shape(seen, "seen", {n, 3}), expect_shape(grad_seen, "grad_seen", {n, 3});
+            expect_shape(grad_features, "grad_features", {n, a.channels});
+            a.grad_final = optional_rows(grad_final, "grad_final", n);
+            a.grad_specular = optional_rows(grad_specular, "grad_specular", n);
+            a.grad_diffuse = optional_rows(grad_diffuse, "grad_diffuse", n);
+            a.grad_reflection = optional_rows(grad_reflection, "grad_reflection", n);
+            a.seen = seen.data(), a.grad_seen = grad_seen.data(), a.grad_features = grad_features.data();
+            run(POLARGUIDE_DISPATCH(reflect_backward_layers), a, n);
+        },
+        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("index"),
+        nb::arg("grad_final").none(), nb::arg("grad_specular").none(), nb::arg("grad_diffuse").none(),
+        nb::arg("grad_reflection").none(), nb::arg("grad_seen"), nb::arg("grad_features"),
+        "Fills the gradients by the look-up and, but for what comes through the look-up, by the features.");
+    module.def(
+        "reflect_backward_directions",
+        [](const Array &features, const Array &rays, const Array &grad_directions, Array grad_features) {
+            ReflectArgs a = reflect_args(features, rays, false, false, 1.5f);
+            const int64_t n = int64_t(rays.shape(0));
+            expect_shape(grad_directions, "grad_directions", {n, 3});
+            expect_shape(grad_features, "grad_features", {n, a.channels});
+            a.grad_directions = grad_directions.data(), a.grad_features = grad_features.data();
+            run(POLARGUIDE_DISPATCH(reflect_backward_directions), a, n);
+        },
+        nb::arg("features"), nb::arg("rays"), nb::arg("grad_directions"), nb::arg("grad_features"),
+        "Adds the normals' gradient that comes through the look-up.");
+}

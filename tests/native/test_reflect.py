@@ -1,0 +1,102 @@
+"""Deferred reflection: the native pass against its twin, forward and gradient."""
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from polarguide import _native
+from polarguide.camera import Camera
+from polarguide.shading.reflection import reflect_native
+from polarguide.shading.render import Shading, reflect
+
+HEIGHT, WIDTH, RESOLUTION = 20, 24, 8
+MODELS = [
+    Shading(),
+    Shading(blend="fresnel", index=1.4),
+    Shading(blend="fresnel", local=True),
+    Shading(local=True),
+]
+LAYERS = ("final", "specular", "diffuse", "reflection")
+
+
+def camera() -> Camera:
+    rotation = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    )[0]
+    return Camera(WIDTH, HEIGHT, 20.0, 21.0, 12.0, 10.0, rotation, torch.zeros(3, dtype=torch.float64))
+
+
+def buffers(spare: int = 1) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(HEIGHT, WIDTH, 10 + spare, generator=generator)
+    rays = camera().world_rays()
+    towards = (features[..., 3:6] * rays).sum(-1, keepdim=True) < 0
+    features[..., 3:6] = torch.where(towards, features[..., 3:6], -features[..., 3:6])  # most face the camera
+    features[0, :, 3:6] *= -1
+    features[1, :, 3:6] *= 1e-4  # below the shortest length
+    features[2, :, 3:6] = 0
+    features[..., 6] = features[..., 6].sigmoid()
+    texels = 3 * torch.randn(6, RESOLUTION, RESOLUTION, 3, generator=generator)
+    return features, texels
+
+
+def native(features: Tensor, texels: Tensor, shading: Shading) -> tuple[Tensor, ...]:
+    return reflect_native(
+        features.flatten(0, 1),
+        camera().world_rays().flatten(0, 1),
+        texels,
+        fresnel=shading.blend == "fresnel",
+        local=shading.local,
+        index=shading.index,
+    )
+
+
+def twin(features: Tensor, texels: Tensor, shading: Shading) -> tuple[Tensor, ...]:
+    local = features[..., 7:10] if shading.local else None
+    layers = reflect(
+        features[..., :3], features[..., 3:6], features[..., 6], texels, camera(), shading, local
+    )
+    return tuple(layers[name].flatten(0, 1) for name in LAYERS)
+
+
+def with_gradients(function, shading: Shading, dtype: torch.dtype, wanted: tuple[int, ...]):
+    leaves = [t.to(dtype).requires_grad_() for t in buffers()]
+    layers = function(*leaves, shading)
+    weights = torch.linspace(-1, 2, layers[0].numel(), dtype=dtype).reshape(layers[0].shape)
+    total = sum(((i + 1) * weights * layers[i]).sum() for i in wanted)
+    return [layer.detach() for layer in layers], torch.autograd.grad(total, leaves)
+
+
+@pytest.mark.parametrize("wanted", [(0,), (1, 2), (0, 1, 2, 3), (3,)])
+@pytest.mark.parametrize("shading", MODELS, ids=str)
+def test_native_agrees_with_the_twin(simd: str, shading: Shading, wanted: tuple[int, ...]) -> None:
+    found, gradients = with_gradients(native, shading, torch.float32, wanted)
+    exact, exact_gradients = with_gradients(twin, shading, torch.float64, wanted)
+    for name, mine, theirs in zip(LAYERS, found, exact, strict=True):
+        assert_close(mine.double(), theirs, rtol=2e-4, atol=2e-4, msg=lambda m, name=name: f"{name}: {m}")
+    by_features, by_features_exact = gradients[0].double(), exact_gradients[0]
+    # Where the mirrored ray passes from one cell of texels to the next, the gradient by the normal jumps.
+    off = (by_features - by_features_exact).abs() > 2e-3 * (1 + by_features_exact.abs())
+    off[1] = (by_features - by_features_exact)[1].abs() > 2e-3 * (1 + by_features_exact[1].abs().max())
+    assert float(off.float().mean()) < 0.002
+    assert not off[..., :3].any()
+    assert not off[..., 6:].any()
+    assert not gradients[0][..., 10:].any()
+    assert_close(gradients[1].double(), exact_gradients[1], rtol=2e-3, atol=2e-3)
+
+
+def test_threads_do_not_change_the_result() -> None:
+    results = []
+    for threads in (1, 2):
+        _native.set_thread_count(threads)
+        layers, gradients = with_gradients(native, MODELS[2], torch.float32, (0, 1, 2, 3))
+        results.append([*layers, *gradients])
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_too_few_channels_are_refused() -> None:
+    features, texels = buffers()
+    with pytest.raises(ValueError, match="features: expected base colour, normal, strength"):
+        native(features[..., :8], texels, MODELS[2])
