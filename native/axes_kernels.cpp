@@ -10,27 +10,28 @@ namespace {
 constexpr float tiny = 1e-24f;
 
 struct Axis {
-    int shortest;
-    float turn; // 1 or -1
+    float chosen[3]; // the shortest of x, y, z: 1, the others 0
+    float turn;      // 1 or -1
     float axis[3];
     float twice; // 2 / |q|^2
 };
 
-// Column `shortest` of the rotation of a quaternion (w, x, y, z) of any length, turned outward.
+// The shortest axis under the rotation of a quaternion (w, x, y, z) of any length, turned outward. Without branches,
+// which nothing could foresee: with e the chosen axis and u = (x, y, z) it is e + 2 / |q|^2 (u u.e + w u x e - e u.u).
 inline Axis outward_axis(const AxesArgs &a, int64_t i) {
     const float *q = a.quaternions + 4 * i, *s = a.log_scales + 3 * i, *m = a.means + 3 * i;
     const float w = q[0], x = q[1], y = q[2], z = q[3];
     Axis r;
-    r.shortest = s[0] <= s[1] && s[0] <= s[2] ? 0 : s[1] <= s[2] ? 1 : 2;
-    const float squared = w * w + x * x + y * y + z * z;
+    const bool first = (s[0] <= s[1]) & (s[0] <= s[2]), second = !first & (s[1] <= s[2]);
+    const float ex = first ? 1.0f : 0.0f, ey = second ? 1.0f : 0.0f, ez = 1.0f - ex - ey;
+    r.chosen[0] = ex, r.chosen[1] = ey, r.chosen[2] = ez;
+    const float length = x * x + y * y + z * z, squared = w * w + length;
     const float t = 2.0f / (squared < tiny ? tiny : squared);
+    const float along = x * ex + y * ey + z * ez, kept = 1.0f - t * length;
     r.twice = t;
-    if (r.shortest == 0)
-        r.axis[0] = 1.0f - t * (y * y + z * z), r.axis[1] = t * (x * y + w * z), r.axis[2] = t * (x * z - w * y);
-    else if (r.shortest == 1)
-        r.axis[0] = t * (x * y - w * z), r.axis[1] = 1.0f - t * (x * x + z * z), r.axis[2] = t * (y * z + w * x);
-    else
-        r.axis[0] = t * (x * z + w * y), r.axis[1] = t * (y * z - w * x), r.axis[2] = 1.0f - t * (x * x + y * y);
+    r.axis[0] = kept * ex + t * (x * along + w * (y * ez - z * ey));
+    r.axis[1] = kept * ey + t * (y * along + w * (z * ex - x * ez));
+    r.axis[2] = kept * ez + t * (z * along + w * (x * ey - y * ex));
     float facing = 0.0f, distance = 0.0f;
     for (int k = 0; k < 3; ++k) {
         const float to_camera = a.centre[k] - m[k];
@@ -39,7 +40,8 @@ inline Axis outward_axis(const AxesArgs &a, int64_t i) {
     if (a.outward) {
         const float *o = a.outward + 3 * i;
         const float side = o[0] * r.axis[0] + o[1] * r.axis[1] + o[2] * r.axis[2];
-        if (side != 0.0f && facing * facing < a.grazing * a.grazing * distance) facing = side;
+        const bool decides = (side != 0.0f) & (facing * facing < a.grazing * a.grazing * distance);
+        facing = decides ? side : facing;
     }
     r.turn = facing >= 0.0f ? 1.0f : -1.0f;
     return r;
@@ -54,29 +56,26 @@ void axes_forward(const AxesArgs &a, int64_t begin, int64_t end) {
     }
 }
 
-// With A(q) = R(q) |q|^2 / 2 without its diagonal's constant, n = e + t A e, t = 2 / |q|^2: the gradient is that of A
-// times t, less the part that t's own change brings, which is along q.
+// The axis is e + t v, t = 2 / |q|^2, v = u u.e + w u x e - e u.u: the gradient is that of v times t, less the part that
+// t's own change brings, which is along q.
 void axes_backward(const AxesArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
         const Axis r = outward_axis(a, i);
-        const float *q = a.quaternions + 4 * i;
-        const float w = q[0], x = q[1], y = q[2], z = q[3];
-        float g[3], d[4], along = 0.0f;
+        const float *q = a.quaternions + 4 * i, *e = r.chosen, *u = q + 1;
+        float g[3], ug = 0.0f, ue = 0.0f, ge = 0.0f, change = 0.0f;
         for (int k = 0; k < 3; ++k) {
             g[k] = a.grad_out[3 * i + k] * r.turn;
-            along += g[k] * (r.axis[k] - (k == r.shortest ? 1.0f : 0.0f));
+            ug += u[k] * g[k], ue += u[k] * e[k], ge += g[k] * e[k];
+            change += g[k] * (r.axis[k] - e[k]);
         }
-        if (r.shortest == 0) {
-            d[0] = z * g[1] - y * g[2], d[1] = y * g[1] + z * g[2];
-            d[2] = -2.0f * y * g[0] + x * g[1] - w * g[2], d[3] = -2.0f * z * g[0] + w * g[1] + x * g[2];
-        } else if (r.shortest == 1) {
-            d[0] = -z * g[0] + x * g[2], d[1] = y * g[0] - 2.0f * x * g[1] + w * g[2];
-            d[2] = x * g[0] + z * g[2], d[3] = -w * g[0] - 2.0f * z * g[1] + y * g[2];
-        } else {
-            d[0] = y * g[0] - x * g[1], d[1] = z * g[0] - w * g[1] - 2.0f * x * g[2];
-            d[2] = w * g[0] + z * g[1] - 2.0f * y * g[2], d[3] = x * g[0] + y * g[1];
+        // e x g, so that g . (u x e) = u . (e x g)
+        const float c[3] = {e[1] * g[2] - e[2] * g[1], e[2] * g[0] - e[0] * g[2], e[0] * g[1] - e[1] * g[0]};
+        float *to = a.grad_quaternions + 4 * i;
+        to[0] = r.twice * (u[0] * c[0] + u[1] * c[1] + u[2] * c[2] - change * q[0]);
+        for (int k = 0; k < 3; ++k) {
+            const float by_u = g[k] * ue + e[k] * ug + q[0] * c[k] - 2.0f * u[k] * ge;
+            to[k + 1] = r.twice * (by_u - change * u[k]);
         }
-        for (int k = 0; k < 4; ++k) a.grad_quaternions[4 * i + k] = r.twice * (d[k] - along * q[k]);
     }
 }
 
