@@ -39,7 +39,7 @@ def train(
     /,
     *,
     out: Path,
-    recipe: str = "polarguide",
+    recipe: str = "polarguide-stokes",
     steps: int = 5000,
     downscale: int = 1,
     seed: int = 0,
@@ -58,8 +58,9 @@ def train(
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
             model in sparse/0.
         out: Run folder to write (configuration, checkpoint, log, PLY).
-        recipe: Which method: 3dgs, 3dgs-dr, ref-gs (all three ignore polarization), polarguide, polarguide-paper, or
-            an ablation of one, such as polarguide:without-normals.
+        recipe: Which method: polarguide-stokes (renders the measured polarization, too), polarguide (the paper's stages
+            with repaired physics), polarguide-paper, 3dgs, 3dgs-dr, ref-gs (these three ignore polarization), or an
+            ablation of one, such as polarguide:without-normals.
         steps: Optimiser steps in all. 3,000 show the scene, 5,000 and more settle it.
         downscale: Average the pictures over boxes of this many pixels first.
         seed: Seed of every random draw.
