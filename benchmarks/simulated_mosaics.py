@@ -53,20 +53,22 @@ def mosaic(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("capture", type=Path, help="folder with I-00, I-45, I-90, I-135 or polar/")
     parser.add_argument("out", type=Path, help="folder for <view>.png")
     parser.add_argument("--transfer", choices=("linear", "srgb"), default="linear")
-    parser.add_argument("--electrons", type=float, default=0.0, help="electrons at full scale (10000 is usual)")
+    parser.add_argument(
+        "--electrons", type=float, default=0.0, help="electrons at full scale (10000 is usual)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     layout = find_layout(options.capture)
     rng = np.random.default_rng(options.seed)
     options.out.mkdir(parents=True, exist_ok=True)
     for view in layout.names:
-        raw = mosaic(
-            linear_intensities(layout, view, options.transfer), electrons=options.electrons, rng=rng
-        )
+        raw = mosaic(linear_intensities(layout, view, options.transfer), electrons=options.electrons, rng=rng)
         if not cv2.imwrite(str(options.out / f"{view}.png"), raw):
             raise OSError(f"{options.out / view}.png cannot be written")
     print(f"{len(layout.names)} mosaics in {options.out}")

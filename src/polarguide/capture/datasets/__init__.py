@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from polarguide.capture.datasets.dataset import Dataset, Light
+from polarguide.capture.datasets.dataset import Dataset, Light, fitted_mask
 from polarguide.capture.datasets.gnerp import is_gnerp, open_gnerp
 from polarguide.capture.datasets.neisf import is_neisf, open_neisf
 from polarguide.capture.datasets.nersp import is_nersp, open_nersp
@@ -41,4 +41,4 @@ def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
     return {"pandora": open_pandora, "pisr": open_pisr, "nersp": open_nersp, "neisf": open_neisf}[name](root)
 
 
-__all__ = ["DATASETS", "PISR_SENSOR", "Dataset", "Light", "detect_dataset", "open_dataset"]
+__all__ = ["DATASETS", "PISR_SENSOR", "Dataset", "Light", "detect_dataset", "fitted_mask", "open_dataset"]

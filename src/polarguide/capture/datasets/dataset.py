@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,3 +136,26 @@ def size_of_first(pictures: Mapping[str, Path], folder: Path) -> tuple[int, int]
     path = pictures[min(pictures)]
     height, width = decode_stored(path, read_file(path)).shape[:2]
     return width, height
+
+
+def fitted_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """The object mask of a view at a picture size (height, width), or None where it has none.
+
+    A mask of another resolution is resized: where half of a pixel or more is object.
+
+    Raises:
+        PolarguideError: the mask has another aspect.
+    """
+    mask = dataset.mask(view)
+    if mask is None or mask.shape == size:
+        return mask
+    height, width = mask.shape
+    if abs(height * size[1] - width * size[0]) > max(height, width):
+        raise PolarguideError(
+            f"mask of view {view}",
+            expected=f"the aspect of the pictures, {size[1]}x{size[0]}",
+            found=f"{width}x{height}",
+            remedy="Take the file from the dataset as it was published.",
+        )
+    way = cv2.INTER_AREA if height > size[0] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(mask.astype(np.float32), (size[1], size[0]), interpolation=way) >= 0.5)

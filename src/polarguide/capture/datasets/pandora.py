@@ -58,7 +58,7 @@ def open_pandora(root: Path) -> Dataset:
         total, plus1, plus2 = (read_radiance(path) for path in files[view])
         for path, other in zip(files[view][1:], (plus1, plus2), strict=True):
             same_shape(path, other.shape, total.shape, files[view][0])
-        stokes = np.stack([total, plus1 - total, plus2 - total]) / np.float32(2)
+        stokes = np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)
         return Light(stokes, np.zeros(total.shape[:2], bool))
 
     def mask(view: str) -> NDArray[np.bool_] | None:

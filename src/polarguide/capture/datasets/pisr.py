@@ -50,8 +50,8 @@ def open_pisr(root: Path) -> Dataset:
     inner = checked_intrinsics(where, finite(where, intrinsics["camera_matrix"], ((3, 3),)))
     coefficients = intrinsics["dist_coeffs"]
     cameras = {
-        number: distorted(f"{inner_file} (dist_coeffs)", SIZE, inner, coefficients, pose)
-        for number, (_, *pose) in read_projections(cameras_file).items()
+        number: distorted(f"{inner_file} (dist_coeffs)", SIZE, inner, coefficients, (rotation, translation))
+        for number, (_, rotation, translation) in read_projections(cameras_file).items()
     }
     masks = index_files(root / "mask", SUFFIXES)
     gamma = _gamma(root)

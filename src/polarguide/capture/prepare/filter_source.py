@@ -40,6 +40,7 @@ class FilterSource:
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
+    cameras = None
 
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
         self._settings = settings

@@ -35,21 +35,28 @@ class RowCounter:
         self.rows = 0
         self._command = [sys.executable, "-I", "-S", "-c", _SCRIPT, str(database), table]
         self._process: subprocess.Popen[str] | None = None
+        self._listener: threading.Thread | None = None
 
     def __enter__(self) -> RowCounter:
         with contextlib.suppress(OSError):  # without a second process there is no progress, but all else
             self._process = subprocess.Popen(
                 self._command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
             )
-            threading.Thread(target=self._listen, daemon=True).start()
+            self._listener = threading.Thread(target=self._listen, daemon=True)
+            self._listener.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+        if self._process is None:
+            return
+        self._process.kill()
+        self._process.wait()
+        if self._listener is not None:
+            self._listener.join()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
 
     def _listen(self) -> None:
         assert self._process is not None
