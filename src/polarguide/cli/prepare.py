@@ -38,6 +38,7 @@ def prepare(
     white_balance: str = "none",
     demosaic: Literal["half", "quarter", "full"] = "half",
     interpolation: Literal["bilinear", "guided"] = "bilinear",
+    register: bool = True,
     transfer: Literal["auto", "linear", "srgb"] = "auto",
     align: bool = True,
     gains: Literal["auto", "none"] = "auto",
@@ -71,6 +72,7 @@ def prepare(
         white_balance: none, grey (the mean colour becomes grey), or gains of R, G and B such as 1.9,1,1.6.
         demosaic: half, quarter or full resolution of the sensor.
         interpolation: How half and full fill in colours and angles.
+        register: Bring the four angles of half size, which lie half a pixel apart, to one place.
         transfer: Encoding of filter shots (auto: the one under which the pair sums agree best) and of GNeRP.
         align: Estimate and correct small shifts between the four shots of a filter.
         gains: auto corrects what the light tells of the gains of the angles; none leaves them.
@@ -90,7 +92,7 @@ def prepare(
         format=format, sensor=sensor, packing=packing, width=width, height=height, bits=bits,
         offset_x=offset_x, offset_y=offset_y, black_level=black_level,
         dark_frame=None if dark_frame is None else os.path.realpath(dark_frame), saturation=saturation,
-        white_balance=white_balance, demosaic=demosaic, interpolation=interpolation, transfer=transfer,
+        white_balance=white_balance, demosaic=demosaic, interpolation=interpolation, register=register, transfer=transfer,
         align=align, gains=gains, calibration=_calibration(calibration, order, sense, zero),
         poses=poses if poses in ORIGINS else os.path.realpath(poses), matching=matching, seed=seed,
     )  # fmt: skip

@@ -146,8 +146,9 @@ class MosaicSource:
         linear = levels.linear(values, dark) * self._sample_gains(values.shape, measured)
         asked = self._settings
         picture = demosaic(
-            linear, saturated | black, self._pattern, mode=asked.demosaic, interpolation=asked.interpolation
-        )
+            linear, saturated | black, self._pattern,
+            mode=asked.demosaic, interpolation=asked.interpolation, registered=asked.register,
+        )  # fmt: skip
         intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), asked.calibration)
         height, width = picture.invalid.shape
         return Developed(

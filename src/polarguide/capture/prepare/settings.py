@@ -16,7 +16,7 @@ from polarguide.errors import PolarguideError
 FORMATS = ("auto", "mosaic", "filter", *DATASETS)
 _MOSAIC_ONLY = (
     "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
-    "saturation", "white_balance", "demosaic", "interpolation",
+    "saturation", "white_balance", "demosaic", "interpolation", "register",
 )  # fmt: skip
 ORIGINS = ("auto", "dataset", "sfm", "none")
 """What poses can be instead of a path."""
@@ -35,6 +35,7 @@ class PrepareSettings:
 
     Attributes:
         white_balance: "none", "grey" or three gains separated by commas.
+        register: whether half size brings the four angles of a cell to one place.
         gains: "auto" or "none"; a calibration with gains goes first.
         poses: "auto" (those of a published dataset, else "sfm"), "dataset", "sfm", "none" or the path of a
             COLMAP model.
@@ -54,6 +55,7 @@ class PrepareSettings:
     white_balance: str = "none"
     demosaic: str = "half"
     interpolation: str = "bilinear"
+    register: bool = True
     transfer: str = "auto"
     align: bool = True
     gains: str = "auto"

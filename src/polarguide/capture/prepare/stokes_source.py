@@ -49,7 +49,7 @@ class StokesSource:
         """One scale for the whole capture, and what it costs; every file is read once.
 
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
-        else this one does, and what exceeds it clips.
+        else twice this one does, and what exceeds it clips.
         """
         peaks: list[NDArray[np.float32]] = []
         largest, negative, broken, count = 0.0, 0, 0, 0
@@ -72,7 +72,7 @@ class StokesSource:
                 found="intensities that are all 0 or less",
                 remedy="Take the files from the dataset as they were published.",
             )
-        white = largest if largest <= _HEADROOM * bright or bright <= 0 else bright
+        white = min(largest, _HEADROOM * bright) if bright > 0 else largest
         share = negative / max(1, 12 * count)
         notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}."]
         notes.append(
