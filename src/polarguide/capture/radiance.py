@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 from types import ModuleType
@@ -18,11 +19,11 @@ from polarguide.errors import PolarguideError
 RADIANCE_SUFFIXES = (".hdr", ".exr", ".npy")
 _HDR_SIZE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
 
+openexr: ModuleType | None
 try:
-    import OpenEXR as _openexr
+    openexr = importlib.import_module("OpenEXR")
 except ImportError:
-    _openexr = None
-openexr: ModuleType | None = _openexr
+    openexr = None
 
 
 def read_radiance(path: Path) -> NDArray[np.float32]:

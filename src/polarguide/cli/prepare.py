@@ -92,8 +92,8 @@ def prepare(
         format=format, sensor=sensor, packing=packing, width=width, height=height, bits=bits,
         offset_x=offset_x, offset_y=offset_y, black_level=black_level,
         dark_frame=None if dark_frame is None else os.path.realpath(dark_frame), saturation=saturation,
-        white_balance=white_balance, demosaic=demosaic, interpolation=interpolation, register=register, transfer=transfer,
-        align=align, gains=gains, calibration=_calibration(calibration, order, sense, zero),
+        white_balance=white_balance, demosaic=demosaic, interpolation=interpolation, register=register,
+        transfer=transfer, align=align, gains=gains, calibration=_calibration(calibration, order, sense, zero),
         poses=poses if poses in ORIGINS else os.path.realpath(poses), matching=matching, seed=seed,
     )  # fmt: skip
     done = prepare_scene(source, out, settings, ConsoleReporter())

@@ -23,7 +23,7 @@ ORIGINS = ("auto", "dataset", "sfm", "none")
 _FLAGS = {
     "mosaic": _MOSAIC_ONLY,
     "pisr": _MOSAIC_ONLY,
-    "filter": ("transfer", "align"),
+    "filter": ("transfer", "align", "white_balance"),
     "gnerp": ("transfer",),
 }
 """Flags that mean something for some formats only."""
