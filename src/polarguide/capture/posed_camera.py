@@ -6,6 +6,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +39,19 @@ class PosedCamera:
     translation: NDArray[np.float64]
 
     @property
+    def intrinsics(self) -> tuple[Any, ...]:
+        """What pictures of one camera have in common."""
+        return (self.model, self.width, self.height, *self.parameters)
+
+    @property
     def centre(self) -> NDArray[np.float64]:
         """Camera centre in the world, [3]."""
         return np.asarray(-self.rotation.T @ self.translation)
 
 
-def write_cameras(folder: Path, cameras: Mapping[str, PosedCamera]) -> None:
+def write_cameras(
+    folder: Path, cameras: Mapping[str, PosedCamera], numbers: Mapping[str, tuple[int, int]] | None = None
+) -> None:
     """Write a binary COLMAP model with one image ``<view>.png`` a view and no points.
 
     Views that share their intrinsics share a camera.
@@ -51,17 +59,21 @@ def write_cameras(folder: Path, cameras: Mapping[str, PosedCamera]) -> None:
     Args:
         folder: exists.
         cameras: by view name; may not be empty.
+        numbers: of each view's image and camera; counted from 1 if None.
     """
-    numbers: dict[tuple[object, ...], int] = {}
+    found: dict[tuple[object, ...], int] = {}
+    used: dict[int, tuple[Any, ...]] = {}
     images = []
     for number, (view, camera) in enumerate(sorted(cameras.items()), 1):
-        key = (camera.model, camera.width, camera.height, *camera.parameters)
-        of_camera = numbers.setdefault(key, len(numbers) + 1)
+        of_camera = found.setdefault(camera.intrinsics, len(found) + 1)
+        if numbers is not None:
+            number, of_camera = numbers[view]
+        used[of_camera] = camera.intrinsics
         pose = (*_quaternion(camera.rotation), *camera.translation)
         name = f"{view}.png".encode() + b"\0"
         images.append(struct.pack("<I7dI", number, *pose, of_camera) + name + struct.pack("<Q", 0))
     intrinsics = []
-    for (model, width, height, *parameters), number in numbers.items():
+    for number, (model, width, height, *parameters) in used.items():
         head = struct.pack("<IiQQ", number, MODELS[str(model)][0], width, height)
         intrinsics.append(head + struct.pack(f"<{len(parameters)}d", *parameters))
     (folder / "cameras.bin").write_bytes(struct.pack("<Q", len(intrinsics)) + b"".join(intrinsics))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
+from polarguide.capture.posed_camera import PosedCamera
 from polarguide.capture.prepare.reporter import Reporter
 from polarguide.capture.prepare.row_counter import RowCounter
 from polarguide.errors import PolarguideError
@@ -27,13 +28,27 @@ def match(
     matching: str,
     seed: int,
     reporter: Reporter,
-) -> None:
+    cameras: Mapping[str, PosedCamera] | None = None,
+) -> dict[str, tuple[int, int]]:
     """Features, matches and two-view geometries of the pictures, into the database.
+
+    Args:
+        database: made, or gone on with.
+        images: folder of ``<view>.png``.
+        sizes: width and height of every picture, by view.
+        matching: "exhaustive" or "sequential".
+        seed: of all random draws.
+        reporter: for progress.
+        cameras: intrinsics by view, where they are known.
+
+    Returns:
+        The numbers of each view's image and camera in the database, where ``cameras`` were given; else nothing.
 
     Raises:
         PolarguideError: COLMAP failed; the database is removed, for it may be the reason.
     """
-    single = len(set(sizes.values())) == 1
+    kinds = set(sizes.values()) if cameras is None else {camera.intrinsics for camera in cameras.values()}
+    single = len(kinds) == 1
     mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE
     count = len(sizes)
     verify = pycolmap.TwoViewGeometryOptions()
@@ -46,6 +61,7 @@ def match(
                 lambda: pycolmap.extract_features(database, images, camera_mode=mode),
                 seed, reporter, "finding features", count, lambda: counter.rows,
             )  # fmt: skip
+        numbers = {} if cameras is None else _know(database, cameras)
         with RowCounter(database, "two_view_geometries") as counter:
             run(
                 lambda: compare(database, verification_options=verify),
@@ -56,6 +72,28 @@ def match(
             with contextlib.suppress(OSError):
                 path.unlink()
         raise
+    return numbers
+
+
+def _know(database: Path, cameras: Mapping[str, PosedCamera]) -> dict[str, tuple[int, int]]:
+    """Write known intrinsics over those that COLMAP guessed: numbers of images and cameras by view."""
+    numbers = {}
+    with pycolmap.Database.open(database) as link:
+        for view, camera in cameras.items():
+            image = link.read_image_with_name(f"{view}.png")
+            assert image is not None
+            numbers[view] = (int(image.image_id), int(image.camera_id))
+            link.update_camera(
+                pycolmap.Camera(
+                    camera_id=image.camera_id,
+                    model=camera.model,
+                    width=camera.width,
+                    height=camera.height,
+                    params=list(camera.parameters),
+                    has_prior_focal_length=True,
+                )
+            )
+    return numbers
 
 
 def run(

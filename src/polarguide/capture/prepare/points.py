@@ -95,7 +95,10 @@ def _triangulated(
     database, images = folder / "database.db", folder / "images"
     sizes = {view: (camera.width, camera.height) for view, camera in cameras.items()}
     try:
-        match(database, images, sizes, matching=matching, seed=seed, reporter=reporter)
+        numbers = match(
+            database, images, sizes, matching=matching, seed=seed, reporter=reporter, cameras=cameras
+        )
+        guarded(lambda: write_cameras(start, cameras, numbers), start)
         model = load_model(start, ".bin")
         options = pycolmap.IncrementalPipelineOptions()
         for part in (options, options.mapper, options.triangulation):
