@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from camera_files import behind, smooth_light, write_mosaic, write_mosaics, write_shots
+from camera_files import behind, smooth_light, write_model, write_mosaic, write_mosaics, write_shots
 from camera_files import mosaic as seen_through
 from damage import EVERYWHERE, colmap_binary, duplicate, patched
 from dataset_files import write_gnerp, write_neisf, write_nersp, write_pandora, write_pisr
@@ -194,6 +194,36 @@ COLMAP: dict[str, tuple[str, Callable[[Path], None], str]] = {
         "cameras.bin", lambda path: path.write_bytes(path.read_bytes() + b"x"), "bytes where its counts ask for"
     ),
 }  # fmt: skip
+
+
+TEXT: dict[str, tuple[str, str, str]] = {
+    "no words": ("cameras.txt", "", "cameras.txt: .*an empty file"),
+    "no images": ("images.txt", "", "images.txt: .*an empty file"),
+    "other words": ("cameras.txt", "hello there\n", "COLMAP model|images called|finite|refuses"),
+    "an unknown model": ("cameras.txt", "1 HOLE 64 48 80 82 32 24\n", "refuses"),
+    "parameters too few": ("cameras.txt", "1 PINHOLE 64 48 80 82\n", "COLMAP model|refuses|finite"),
+    "no size": ("cameras.txt", "1 PINHOLE 0 0 80 82 32 24\n", "expected the size of the pictures, 32x24.* found 0x0"),
+    "negative size": ("cameras.txt", "1 PINHOLE -64 -48 80 82 32 24\n", "expected the size|refuses|positive"),
+    "words for numbers": ("images.txt", "1 one 0 0 0 0 0 2 1 v000.png\n\n", "refuses|finite|images called"),
+    "a line cut short": ("images.txt", "1 1 0 0 0 0 0\n\n", "refuses|images called|COLMAP model"),
+    "another camera": ("images.txt", "1 1 0 0 0 0 0 2 7 v000.png\n\n", "refuses"),
+    "two of a name": (
+        "images.txt", "1 1 0 0 0 0 0 2 1 a/v000.png\n\n2 1 0 0 0 0 0 2 1 b/v000.jpg\n\n", "one image called v000"
+    ),
+    "strangers": ("images.txt", "1 1 0 0 0 0 0 2 1 other.png\n\n", "expected images called like the views"),
+    "a nan pose": ("images.txt", "1 nan 0 0 0 0 0 2 1 v000.png\n\n", "finite pose|refuses"),
+    "an infinite place": ("images.txt", "1 1 0 0 0 inf 0 2 1 v000.png\n\n", "finite pose|refuses"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TEXT)
+def test_colmap_text_models(tmp_path: Path, case: str) -> None:
+    name, text, message = TEXT[case]
+    write_mosaics(tmp_path / "in")
+    model = write_model(tmp_path / "model", ("v000", "v001", "v002"), "PINHOLE 64 48 80 82 32 24")
+    (model / name).write_text(text)
+    said = refused(tmp_path / "in", tmp_path / "out", replace(MOSAIC, poses=str(model)))
+    assert re.search(message, said), said
 
 
 @pytest.mark.parametrize("case", COLMAP)

@@ -78,6 +78,12 @@ def test_orientation_turns_pixels_and_angles(tmp_path: Path) -> None:
     assert error.max() < 2e-3
 
 
+def test_raw_is_not_srgb(tmp_path: Path) -> None:
+    write_shots(tmp_path / "in", smooth_light(64, 96))
+    with pytest.raises(PolarguideError, match="--transfer: expected auto or linear"):
+        prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, transfer="srgb"))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

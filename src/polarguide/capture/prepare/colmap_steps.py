@@ -61,7 +61,9 @@ def match(
                 lambda: pycolmap.extract_features(database, images, camera_mode=mode),
                 seed, reporter, "finding features", count, lambda: counter.rows,
             )  # fmt: skip
-        numbers = {} if cameras is None else _know(database, cameras)
+        numbers: dict[str, tuple[int, int]] = {}
+        if cameras is not None:
+            numbers = run(lambda: _know(database, cameras), seed, reporter, "known cameras", None, lambda: 0)
         with RowCounter(database, "two_view_geometries") as counter:
             run(
                 lambda: compare(database, verification_options=verify),

@@ -59,6 +59,13 @@ class FilterSource:
                 remedy="Leave it out.",
             )
         self._white = white
+        if self._raw and settings.transfer == "srgb":
+            raise PolarguideError(
+                "--transfer",
+                expected="auto or linear for camera raw, which is developed without tone curve",
+                found="srgb",
+                remedy="Leave it out.",
+            )
 
     @property
     def views(self) -> list[str]:

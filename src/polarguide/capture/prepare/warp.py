@@ -81,7 +81,7 @@ def fitted_camera(camera: Any, geometry: Geometry, where: str) -> Any:
         crop, step = (0.0, 0.0), 1.0
     elif size == geometry.stored:
         crop, step = (float(geometry.crop[0]), float(geometry.crop[1])), float(geometry.step)
-    elif size[0] * height == size[1] * width:
+    elif size[0] > 0 and size[0] * height == size[1] * width:
         crop, step = (0.0, 0.0), size[0] / width
     else:
         raise PolarguideError(
