@@ -62,7 +62,7 @@ def add_points(
     if model.is_dir() and note.exists():
         return model, parse_json(note, read_file(note))
     start, trial = folder / "start", folder / "triangulated"
-    for path in (start, trial, model):
+    for path in (start, trial):
         shutil.rmtree(path, ignore_errors=True)
         guarded(lambda path=path: path.mkdir(parents=True), path)  # type: ignore[misc]
     guarded(lambda: write_cameras(start, cameras), start)
@@ -76,10 +76,14 @@ def add_points(
         reporter.say(
             f"The poses came without points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
         )
-    for path in trial.iterdir():
-        path.replace(model / path.name)
+    guarded(lambda: _replace(model, trial), model)
     write_whole(note, (json.dumps(found) + "\n").encode())
     return model, found
+
+
+def _replace(old: Path, new: Path) -> None:
+    shutil.rmtree(old, ignore_errors=True)
+    new.rename(old)
 
 
 def _triangulated(
@@ -145,8 +149,8 @@ def _sample(
     model = load_model(start, ".bin")
     for place, colour in zip(places, _colours(folder, cameras, places), strict=True):
         model.add_point3D(place, pycolmap.Track(), colour)
-    for path in trial.iterdir():
-        path.unlink()
+    shutil.rmtree(trial, ignore_errors=True)
+    guarded(trial.mkdir, trial)
     model.write_binary(str(trial))
     reporter.warn(
         f"The poses came without points, and only {triangulated} could be triangulated (fewer than {FEWEST}): "

@@ -64,16 +64,14 @@ class Workshop:
     def _photographs(self, views: list[str]) -> dict[str, Geometry]:
         """Tone-mapped pictures and object masks of views, and how they lie in the files."""
         images, masks = self._root / "images", self._root / "masks"
-        for path in (images, masks):
-            guarded(lambda path=path: path.mkdir(parents=True, exist_ok=True), path)  # type: ignore[misc]
         measured = self._folder.measured
         assert measured is not None
         known = measured.setdefault(PHOTOGRAPHS, {})
-        for path in images.iterdir():  # of an earlier call with other poses
-            if path.stem not in views:
-                shutil.rmtree(self._root, ignore_errors=True)
-                known.clear()
-                return self._photographs(views)
+        if images.is_dir() and any(path.stem not in views for path in images.iterdir()):
+            shutil.rmtree(self._root, ignore_errors=True)  # of an earlier call with other poses
+            known.clear()
+        for path in (images, masks):
+            guarded(lambda path=path: path.mkdir(parents=True, exist_ok=True), path)  # type: ignore[misc]
         with self._reporter.track("photographs", len(views)) as advance:
             for count, view in enumerate(views, 1):
                 path = images / f"{view}.png"
