@@ -87,6 +87,31 @@ def test_a_pixel_is_invalid_wherever_a_bad_sample_is_used(
             np.testing.assert_array_equal(changed, invalid)
 
 
+@pytest.mark.parametrize("colour", [True, False])
+@pytest.mark.parametrize("interpolation", ["bilinear", "guided"])
+def test_registered_angles_make_less_polarization_of_edges(colour: bool, interpolation: str) -> None:
+    """Unpolarized light with edges: what comes out polarized is wrong, and S0 may not suffer for it."""
+    light = busy_light(96, 128, 2)
+    light[1:] = 0
+    if not colour:
+        light = np.repeat(light[..., 1:2], 3, axis=-1)
+    true = light[0].reshape(48, 2, 64, 2, 3).mean(axis=(1, 3))
+    pattern = sensor_pattern("IMX250MYR" if colour else "IMX250MZR")
+    values = mosaic(behind(light), COLOUR if colour else MONO).astype(np.float32)
+    wrong, blur = {}, {}
+    for registered in (False, True):
+        found = demosaic(
+            values, np.zeros(values.shape, bool), pattern,
+            mode="half", interpolation=interpolation, registered=registered,
+        ).intensities  # fmt: skip
+        s0 = found.sum(axis=0) / 2
+        polarized = np.hypot(found[0] - found[2], found[1] - found[3]) / s0
+        wrong[registered] = polarized[4:-4, 4:-4].mean()
+        blur[registered] = np.sqrt(np.mean((s0 - true)[4:-4, 4:-4] ** 2))
+    assert wrong[True] < 0.65 * wrong[False]
+    assert blur[True] < (1.0001 if interpolation == "bilinear" else 1.3) * blur[False] + 0.004
+
+
 def psnr(found: np.ndarray, true: np.ndarray) -> float:
     inside = np.s_[..., 8:-8, 8:-8, :]
     return float(-10 * np.log10(np.mean((found[inside] - true[inside]) ** 2)))

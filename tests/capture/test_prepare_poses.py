@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -22,6 +21,7 @@ from camera_files import (
     write_mosaics,
     write_shots,
 )
+from relief import write_relief
 
 from polarguide.capture import load_scene
 from polarguide.capture.prepare import PrepareSettings, Reporter, prepare_scene
@@ -126,24 +126,8 @@ def test_one_map_undistorts_all_four_intensities(tmp_path: Path) -> None:
 
 
 def test_sfm_on_a_textured_scene(tmp_path: Path) -> None:
-    """A textured, polarized plane seen by a camera on an arc: all views register, and training can read them."""
-    rng = np.random.default_rng(0)
-    texture = cv2.GaussianBlur(rng.uniform(0, 1, (600, 600)).astype(np.float32), (0, 0), 1.5)
-    texture = np.clip((texture - texture.mean()) * 4 + 0.5, 0.05, 1.0)
-    inner = np.array([[260.0, 0, 160], [0, 260, 120], [0, 0, 1]])
-    for index, angle in enumerate(np.radians([-30, -18, -6, 6, 18, 30])):
-        turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
-        relief = []
-        for depth, part in ((0.0, np.s_[:, :]), (0.25, np.s_[150:450, 150:450])):
-            offset = turn @ [-0.5, -0.5, -depth] + [0, 0, 1.3]
-            plane = inner @ np.column_stack([turn[:, 0] / 600, turn[:, 1] / 600, offset])
-            mask = np.zeros_like(texture)
-            mask[part] = 1
-            layer = texture if depth == 0 else texture[::-1].copy()
-            relief.append([cv2.warpPerspective(image, plane, (320, 240)) for image in (layer, mask)])
-        s0 = np.where(relief[1][1] > 0.5, relief[1][0], relief[0][0])[..., None] * np.ones(3)
-        light = np.stack([s0, 0.1 * s0, 0.05 * s0])
-        write_shots(tmp_path / "in", f"v{index}", behind(light))
+    """A textured, polarized relief seen by a camera on an arc: all views register, and training can read them."""
+    write_relief(tmp_path / "in")
     heard = Heard()
     done = prepare_scene(tmp_path / "in", tmp_path / "out", FILTER, heard)
     assert len(done.views) >= 5

@@ -37,6 +37,7 @@ def test_mosaics_to_a_trained_scene(
     source, scene, out = (str(tmp_path / name) for name in ("raw", "scene", "run"))
     model = str(demo_scene / "sparse" / "0")
     command = ["prepare", source, "--out", scene, "--sensor", "IMX250MYR", "--poses", model, "--threads", "1"]
+    command.append("--no-register")  # the samples of these cells lie in one place
     assert run(command) == 0
     printed = capsys.readouterr().out
     assert f"scene: {scene} (6 views)" in printed

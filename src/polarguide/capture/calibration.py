@@ -37,13 +37,14 @@ class Calibration:
         gains: response of the pictures, in the order of their names; intensities are divided by them. None
             to estimate the ratio of the pair sums.
         order: the angle that each of the pictures called 0, 45, 90 and 135 was really taken at.
-        sense: "ccw" or "cw", how these angles count as the picture is displayed.
+        sense: "ccw" or "cw", how these angles count as the picture is displayed; None for what is usual for the
+            source: "ccw", but for published datasets that say otherwise.
         zero: where their zero lies, in degrees counter-clockwise from the image's horizontal.
     """
 
     gains: Gains | None = None
     order: tuple[int, int, int, int] = ANGLES
-    sense: str = "ccw"
+    sense: str | None = None
     zero: float = 0.0
 
     @property
@@ -58,7 +59,7 @@ class Calibration:
 
     def record(self) -> dict[str, Any]:
         """Order, sense and zero for ``scene.json``."""
-        return {"order": list(self.order), "sense": self.sense, "zero_degrees": self.zero}
+        return {"order": list(self.order), "sense": self.sense or "ccw", "zero_degrees": self.zero}
 
 
 def checked(calibration: Calibration, where: object) -> Calibration:
@@ -72,7 +73,7 @@ def checked(calibration: Calibration, where: object) -> Calibration:
         (gains is not None and not all(math.isfinite(g) and 0.5 <= g <= 2.0 for g in gains),
          "gains", "four numbers from 0.5 to 2", gains),
         (sorted(order) != sorted(ANGLES), "order", "0, 45, 90 and 135, each once", order),
-        (calibration.sense not in ("cw", "ccw"), "sense", "cw or ccw", calibration.sense),
+        (calibration.sense not in (None, "cw", "ccw"), "sense", "cw or ccw", calibration.sense),
         (not math.isfinite(calibration.zero), "zero", "a finite number of degrees", calibration.zero),
     )  # fmt: skip
     for wrong, name, expected, found in faults:
@@ -106,7 +107,7 @@ def read_calibration(path: Path) -> Calibration:
         if "order" in content:
             first, second, third, fourth = (int(angle) for angle in content["order"])
             found = replace(found, order=(first, second, third, fourth))
-        found = replace(found, sense=content.get("sense", "ccw"), zero=float(content.get("zero", 0.0)))
+        found = replace(found, sense=content.get("sense"), zero=float(content.get("zero", 0.0)))
     except (ValueError, TypeError) as error:
         raise PolarguideError(
             path,
@@ -156,7 +157,7 @@ def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDAr
     Returns:
         [4, ...], at least 0 and at most ``calibration.peak`` times the largest given.
     """
-    sign = 1 if calibration.sense == "ccw" else -1
+    sign = -1 if calibration.sense == "cw" else 1
     turn = calibration.zero if calibration.permutes else 0.0
     targets = [int(sign * angle + turn) % 180 for angle in calibration.order]
     placed = intensities[[targets.index(angle) for angle in ANGLES]]

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import shutil
+import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,9 +17,11 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
+from polarguide.capture.colmap_files import check_model_files
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
+MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 # Perspective models that are a plain pinhole when all of their distortion parameters are zero.
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
@@ -71,8 +77,7 @@ def read_model(root: Path) -> ColmapModel:
         PolarguideError: there is no model, it cannot be read, or it has no points.
     """
     folder, kind = find_model(root, itself=False)
-    names = ("cameras", "images", "points3D", "rigs", "frames")
-    files = tuple(path for path in (folder / (name + kind) for name in names) if path.exists())
+    files = tuple(path for path in (folder / (name + kind) for name in MODEL_FILES) if path.exists())
     model = load_model(folder, kind)
     images = posed_images(model)
     points, colours, dropped = _points_of(model)
@@ -126,16 +131,22 @@ def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
     return [f"The COLMAP model has poses for {len(unused)} images without pictures ({listed(unused)})."]
 
 
-def find_model(root: Path, *, itself: bool = True) -> tuple[Path, str]:
+def find_model(root: Path, *, itself: bool = True, points: bool = True) -> tuple[Path, str]:
     """The folder of a model and the suffix of its files: in ``sparse/0`` or ``sparse``, else ``0`` or ``root`` itself.
+
+    Args:
+        root: where to look.
+        itself: whether the files may lie in ``root`` or ``root/0``.
+        points: whether the file of points has to be there.
 
     Raises:
         PolarguideError: there is none, or a file of it is missing.
     """
+    needed = ("images", "points3D") if points else ("images",)
     for folder in (root / "sparse" / "0", root / "sparse", *([root / "0", root] if itself else [])):
         for kind in (".bin", ".txt"):
             if (folder / ("cameras" + kind)).exists():
-                missing = [n for n in ("images", "points3D") if not (folder / (n + kind)).exists()]
+                missing = [n for n in needed if not (folder / (n + kind)).exists()]
                 if missing:
                     raise PolarguideError(
                         folder / (missing[0] + kind),
@@ -153,14 +164,16 @@ def find_model(root: Path, *, itself: bool = True) -> tuple[Path, str]:
 
 
 def load_model(folder: Path, kind: str) -> Any:
-    """The model in a folder, as pycolmap's ``Reconstruction``.
+    """The model in a folder, as pycolmap's ``Reconstruction``; without points if it has no file of them.
 
     Raises:
         PolarguideError: pycolmap refuses it.
     """
     model = pycolmap.Reconstruction()
+    check_model_files(folder, kind)
     try:
-        model.read_binary(str(folder)) if kind == ".bin" else model.read_text(str(folder))
+        with _whole(folder, kind) as whole:
+            model.read_binary(str(whole)) if kind == ".bin" else model.read_text(str(whole))
     except Exception as error:  # pycolmap raises whatever C++ threw: ValueError, IndexError, MemoryError, ...
         raise PolarguideError(
             folder,
@@ -169,6 +182,20 @@ def load_model(folder: Path, kind: str) -> Any:
             remedy="Export the model again; text files need two lines per image.",
         ) from error
     return model
+
+
+@contextlib.contextmanager
+def _whole(folder: Path, kind: str) -> Iterator[Path]:
+    """The folder, or a copy with an empty file of points where it has none."""
+    if (folder / ("points3D" + kind)).exists():
+        yield folder
+        return
+    with tempfile.TemporaryDirectory() as made:
+        for name in MODEL_FILES:
+            if (folder / (name + kind)).exists():
+                shutil.copyfile(folder / (name + kind), Path(made) / (name + kind))
+        (Path(made) / ("points3D" + kind)).write_bytes(bytes(8) if kind == ".bin" else b"")
+        yield Path(made)
 
 
 def posed_images(model: Any) -> dict[str, list[Any]]:

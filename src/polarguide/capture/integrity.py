@@ -40,6 +40,40 @@ def find_damage(data: bytes) -> str | None:
     return "a file that is none of these"
 
 
+def stated_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that the head of a PNG, JPEG or TIFF file without damage states; None where it does not."""
+    if data.startswith(_PNG_SIGNATURE):
+        return struct.unpack_from(">II", data, 16) if len(data) >= 24 else None
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_size(data)
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        return _tiff_size(data)
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        kind = data[at + 1]
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 1 if kind == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    order = "<" if data[:2] == b"II" else ">"
+    found = {}
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, start)
+    for index in range(count):
+        tag, kind = struct.unpack_from(order + "HH", data, start + 2 + 12 * index)
+        if tag in (256, 257) and kind in (3, 4):
+            (found[tag],) = struct.unpack_from(order + _TIFF_CODES[kind], data, start + 10 + 12 * index)
+    return (found[256], found[257]) if len(found) == 2 else None
+
+
 def _png_damage(data: bytes) -> str | None:
     """Walk the chunks of a PNG file and check their checksums."""
     at = len(_PNG_SIGNATURE)

@@ -151,7 +151,9 @@ def _read_flat(folder: Path, warnings: list[str]) -> dict[str, dict[int, Path]]:
     return pictures
 
 
-def pictures_of_folders(root: Path, folders: dict[int, Path]) -> dict[str, dict[int, Path]]:
+def pictures_of_folders(
+    root: Path, folders: dict[int, Path], suffixes: tuple[str, ...] = SUFFIXES
+) -> dict[str, dict[int, Path]]:
     """View -> angle -> file, from one folder per angle with equally named pictures.
 
     Raises:
@@ -167,7 +169,7 @@ def pictures_of_folders(root: Path, folders: dict[int, Path]) -> dict[str, dict[
         )
     pictures: dict[str, dict[int, Path]] = {}
     for angle, folder in folders.items():
-        for stem, path in index_files(folder, SUFFIXES).items():
+        for stem, path in index_files(folder, suffixes).items():
             pictures.setdefault(stem, {})[angle] = path
     return pictures
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.integrity import find_damage
+from polarguide.capture.integrity import find_damage, stated_size
 from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 TRANSFERS = ("linear", "srgb")
+LARGEST_PIXELS = 150_000_000
+"""More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
+_LARGEST_FILE = 1 << 31
 
 
 def read_file(path: Path) -> bytes:
@@ -25,7 +29,13 @@ def read_file(path: Path) -> bytes:
         PolarguideError: the file cannot be read.
     """
     try:
-        return path.read_bytes()
+        about = path.stat()
+        if stat.S_ISREG(about.st_mode) and about.st_size <= _LARGEST_FILE:
+            return path.read_bytes()
+        found = f"one of {about.st_size} bytes" if stat.S_ISREG(about.st_mode) else "a folder, pipe or device"
+        raise PolarguideError(
+            path, expected="a file of at most 2 GiB", found=found, remedy="Remove it from the capture."
+        )
     except OSError as error:
         raise PolarguideError(
             path,
@@ -104,6 +114,9 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
         PolarguideError: the file is damaged, cut short, or of another kind.
     """
     damage = find_damage(data)
+    size = None if damage is not None else stated_size(data)
+    if size is not None and size[0] * size[1] > LARGEST_PIXELS:
+        damage = f"one of {size[0]}x{size[1]} pixels, more than any camera takes"
     pixels = None
     if damage is None:
         try:

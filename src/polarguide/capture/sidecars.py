@@ -21,7 +21,7 @@ def parse_json(path: Path, data: bytes) -> dict[str, Any]:
     """
     try:
         content = json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise PolarguideError(
             path, expected="a JSON file", found=f"broken JSON ({error})", remedy="Correct or remove the file."
         ) from error

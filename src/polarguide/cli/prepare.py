@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from polarguide.capture.calibration import Calibration, read_calibration
-from polarguide.capture.prepare import PrepareSettings, Reporter, prepare_scene
+from polarguide.capture.prepare import ORIGINS, PrepareSettings, Reporter, prepare_scene
 from polarguide.cli.common import console, use_threads
 from polarguide.errors import PolarguideError
 
@@ -23,7 +24,7 @@ def prepare(
     /,
     *,
     out: Path,
-    format: Literal["auto", "mosaic", "filter"] = "auto",
+    format: Literal["auto", "mosaic", "filter", "pandora", "pisr", "nersp", "neisf", "gnerp"] = "auto",
     sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None,
     packing: Literal["10p", "12p", "12packed"] | None = None,
     width: int | None = None,
@@ -37,6 +38,7 @@ def prepare(
     white_balance: str = "none",
     demosaic: Literal["half", "quarter", "full"] = "half",
     interpolation: Literal["bilinear", "guided"] = "bilinear",
+    register: bool = True,
     transfer: Literal["auto", "linear", "srgb"] = "auto",
     align: bool = True,
     gains: Literal["auto", "none"] = "auto",
@@ -44,19 +46,19 @@ def prepare(
     order: str | None = None,
     sense: Literal["cw", "ccw"] | None = None,
     zero: float | None = None,
-    poses: str = "sfm",
+    poses: str = "auto",
     matching: Literal["exhaustive", "sequential"] = "exhaustive",
     seed: int = 0,
     threads: int = 0,
 ) -> None:
-    """Camera files to a scene folder: raw polarization mosaics, or shots through a rotating filter.
+    """Camera files to a scene folder: raw mosaics, shots through a rotating filter, published datasets.
 
     A preparation that was stopped goes on with the same command. docs/formats.md describes the files.
 
     Args:
-        source: Folder of raw mosaics (one file a view), or of filter shots (four folders or four suffixes).
+        source: Folder of raw mosaics (one file a view), of filter shots (four folders or suffixes), or of a dataset.
         out: Scene folder to write.
-        format: What the source is; auto looks for the four shots of a filter, else takes mosaics.
+        format: What the source is; auto looks for datasets and the four shots of a filter, else takes mosaics.
         sensor: Sensor of raw mosaics: MYR are colour, MZR is monochrome.
         packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
         width: Width of .raw files in pixels.
@@ -70,14 +72,15 @@ def prepare(
         white_balance: none, grey (the mean colour becomes grey), or gains of R, G and B such as 1.9,1,1.6.
         demosaic: half, quarter or full resolution of the sensor.
         interpolation: How half and full fill in colours and angles.
-        transfer: Encoding of filter shots; auto takes the one under which the pair sums agree best.
+        register: Bring the four angles of half size, which lie half a pixel apart, to one place.
+        transfer: Encoding of filter shots (auto: the one under which the pair sums agree best) and of GNeRP.
         align: Estimate and correct small shifts between the four shots of a filter.
         gains: auto corrects what the light tells of the gains of the angles; none leaves them.
         calibration: JSON file with gains, order, sense and zero; the three flags below go first.
         order: Angle of the pictures called 0, 45, 90 and 135, such as 90,45,0,135.
-        sense: How the angles count as the picture is displayed.
+        sense: How the angles count as the picture is displayed; without it ccw, or as the dataset says.
         zero: Where their zero lies, in degrees counter-clockwise from the image's horizontal.
-        poses: sfm, none, or the path of a COLMAP model.
+        poses: sfm, dataset, none, or the path of a COLMAP model; auto takes those of a dataset, else sfm.
         matching: Pairs that SfM compares: all, or neighbours in the order of their names.
         seed: Seed of SfM.
         threads: Threads for the pictures; 0 takes all cores, as SfM always does.
@@ -88,10 +91,10 @@ def prepare(
     settings = PrepareSettings(
         format=format, sensor=sensor, packing=packing, width=width, height=height, bits=bits,
         offset_x=offset_x, offset_y=offset_y, black_level=black_level,
-        dark_frame=None if dark_frame is None else str(dark_frame.resolve()), saturation=saturation,
-        white_balance=white_balance, demosaic=demosaic, interpolation=interpolation, transfer=transfer,
-        align=align, gains=gains, calibration=_calibration(calibration, order, sense, zero),
-        poses=poses if poses in ("sfm", "none") else str(Path(poses).resolve()), matching=matching, seed=seed,
+        dark_frame=None if dark_frame is None else os.path.realpath(dark_frame), saturation=saturation,
+        white_balance=white_balance, demosaic=demosaic, interpolation=interpolation, register=register,
+        transfer=transfer, align=align, gains=gains, calibration=_calibration(calibration, order, sense, zero),
+        poses=poses if poses in ORIGINS else os.path.realpath(poses), matching=matching, seed=seed,
     )  # fmt: skip
     done = prepare_scene(source, out, settings, ConsoleReporter())
     without = f", {len(done.left_out)} left out" if done.left_out else ""

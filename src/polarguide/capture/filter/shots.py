@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
 from polarguide.capture.filter.exif import orientation
 from polarguide.capture.layout import angle_folders, index_files, pictures_of_folders
 from polarguide.capture.pictures import SUFFIXES, decode_picture, read_file
@@ -17,6 +18,7 @@ from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import require_alike
 from polarguide.errors import PolarguideError
 
+SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 _SUFFIX = re.compile(
     r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE
 )
@@ -55,9 +57,9 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
     """
     folders = angle_folders(root)
     if folders:
-        return pictures_of_folders(root, folders)
+        return pictures_of_folders(root, folders, SHOT_SUFFIXES)
     shots: dict[str, dict[int, Path]] = {}
-    for stem, path in index_files(root, SUFFIXES).items():
+    for stem, path in index_files(root, SHOT_SUFFIXES).items():
         match = _SUFFIX.fullmatch(stem)
         if match is None:
             continue
@@ -90,8 +92,8 @@ def require_all(root: Path, shots: dict[str, dict[int, Path]]) -> None:
             )
 
 
-def read_shots(files: dict[int, Path]) -> Shots:
-    """Read the four shots of a view.
+def read_shots(files: dict[int, Path], gains: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Shots:
+    """Read the four shots of a view; ``gains`` of R, G and B are for camera raw files.
 
     Raises:
         PolarguideError: one cannot be read, or they differ in size, depth or orientation.
@@ -99,12 +101,11 @@ def read_shots(files: dict[int, Path]) -> Shots:
     pictures: list[NDArray[Any]] = []
     codes: list[int] = []
     for angle in ANGLES:
-        data = read_file(files[angle])
-        picture = decode_picture(files[angle], data)
+        picture, code = _read_shot(files[angle], gains)
         if pictures:
             require_alike(files[angle], picture, files[0], pictures[0])
         pictures.append(picture)
-        codes.append(orientation(data))
+        codes.append(code)
         if codes[-1] != codes[0]:
             raise PolarguideError(
                 files[angle],
@@ -117,3 +118,11 @@ def read_shots(files: dict[int, Path]) -> Shots:
     full = _JPEG_FULL if jpeg else int(np.iinfo(stack.dtype).max)
     clipped, lit = np.asarray((stack >= full).any(axis=3)), np.asarray(stack.any(axis=(0, 3)))
     return Shots(stack, codes[0], clipped, ~lit)
+
+
+def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[Any], int]:
+    """Stored values [H, W, 3] of a shot and its EXIF orientation."""
+    if is_camera_raw(path):
+        return read_camera_raw(path, gains)
+    data = read_file(path)
+    return decode_picture(path, data), orientation(data)

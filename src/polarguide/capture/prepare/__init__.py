@@ -2,6 +2,6 @@
 
 from polarguide.capture.prepare.reporter import Reporter
 from polarguide.capture.prepare.run import Prepared, prepare_scene
-from polarguide.capture.prepare.settings import PrepareSettings
+from polarguide.capture.prepare.settings import ORIGINS, PrepareSettings
 
-__all__ = ["PrepareSettings", "Prepared", "Reporter", "prepare_scene"]
+__all__ = ["ORIGINS", "PrepareSettings", "Prepared", "Reporter", "prepare_scene"]

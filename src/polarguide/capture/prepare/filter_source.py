@@ -25,13 +25,15 @@ from polarguide.capture.filter import (
     decoded,
     find_shifts,
     find_shots,
+    is_camera_raw,
     read_shots,
 )
 from polarguide.capture.filter.exif import turned, turned_angles
 from polarguide.capture.filter.shots import require_all
-from polarguide.capture.prepare.settings import PrepareSettings
+from polarguide.capture.prepare.settings import PrepareSettings, white_gains
 from polarguide.capture.prepare.source import Developed, Geometry
 from polarguide.capture.view import ANGLES
+from polarguide.errors import PolarguideError
 
 _JUDGED_VIEWS = 8
 
@@ -40,12 +42,30 @@ class FilterSource:
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
+    cameras = None
 
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
         self._settings = settings
         shots = find_shots(root)
         require_all(root, shots)
         self._files = dict(sorted(shots.items()))
+        self._raw = [path for path in self.paths if is_camera_raw(path)]
+        white = white_gains(settings.white_balance)
+        if white is None or (white != (1.0, 1.0, 1.0) and len(self._raw) < len(self.paths)):
+            raise PolarguideError(
+                "--white-balance",
+                expected="none for pictures; none or three gains for camera raw",
+                found=settings.white_balance,
+                remedy="Leave it out.",
+            )
+        self._white = white
+        if self._raw and settings.transfer == "srgb":
+            raise PolarguideError(
+                "--transfer",
+                expected="auto or linear for camera raw, which is developed without tone curve",
+                found="srgb",
+                remedy="Leave it out.",
+            )
 
     @property
     def views(self) -> list[str]:
@@ -62,11 +82,14 @@ class FilterSource:
         asked = self._settings
         notes: list[str] = []
         transfer = asked.transfer
+        if transfer == "auto" and len(self._raw) == len(self.paths):
+            transfer = "linear"
+            notes.append("Transfer linear: camera raw, developed without tone curve, alike for all shots.")
         if transfer == "auto":
             step = max(1, math.ceil(len(self._files) / _JUDGED_VIEWS))
             judged = []
             for view in self.views[::step]:
-                judged.append(read_shots(self._files[view]))
+                judged.append(read_shots(self._files[view], self._white))
                 advance(len(judged) * step)
             suffix = self.paths[0].suffix.lower()
             decision = decide_transfer(judged, jpeg=suffix in (".jpg", ".jpeg"))
@@ -83,7 +106,7 @@ class FilterSource:
     def develop(self, view: str, measured: dict[str, Any]) -> Developed:
         """Read the four shots: validity, transfer, shifts, gains, the sense of the angles, then the turn."""
         asked = self._settings
-        shots = read_shots(self._files[view])
+        shots = read_shots(self._files[view], self._white)
         linear, bad = decoded(shots.pictures, measured["transfer"]), shots.clipped | shots.dark
         shifts, notes = [Shift(0.0, 0.0, True)] * 4, []
         if asked.align:

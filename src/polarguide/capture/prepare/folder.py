@@ -124,12 +124,16 @@ class SceneFolder:
         intensities: NDArray[np.float32],
         invalid: NDArray[np.bool_],
         record: dict[str, Any],
+        mask: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Write the five pictures of a view, then note it."""
+        """Write the pictures of a view, then note it."""
         files = {}
         for angle, codes in zip(ANGLES, picture_codes(intensities, invalid), strict=True):
             files[f"polar/{view}_{angle:03d}.png"] = codes[..., ::-1]
         files[f"invalid/{view}.png"] = invalid.astype(np.uint8) * 255
+        if mask is not None:
+            guarded(lambda: (self.root / "masks").mkdir(exist_ok=True), self.root)
+            files[f"masks/{view}.png"] = mask.astype(np.uint8) * 255
         sizes = {name: write_whole(self.root / name, encoded(pixels)) for name, pixels in files.items()}
         self.views[view] = {**record, "files": sizes}
         self.save()

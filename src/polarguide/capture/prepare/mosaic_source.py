@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_gains, oriented, pair_ratio
+from polarguide.capture.datasets import Dataset, fitted_mask
 from polarguide.capture.layout import index_files
+from polarguide.capture.prepare.mosaic_samples import blocks, grey_world, sampled
 from polarguide.capture.prepare.settings import PrepareSettings, white_gains
 from polarguide.capture.prepare.source import Developed, Geometry
 from polarguide.capture.sensor import (
@@ -30,16 +33,26 @@ from polarguide.capture.sensor import (
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 
-_BLOCKS = 1024
 _SMALLEST = 16
 
 
 class MosaicSource:
     """Raw mosaics of a division-of-focal-plane sensor."""
 
-    kind = "mosaic"
+    def __init__(self, root: Path, settings: PrepareSettings, dataset: Dataset | None = None) -> None:
+        """Look for the files.
 
-    def __init__(self, root: Path, settings: PrepareSettings) -> None:
+        Args:
+            root: the folder of mosaics.
+            settings: what to do.
+            dataset: what else is known of them, where they belong to a published dataset.
+
+        Raises:
+            PolarguideError: the sensor is not named, or a setting does not fit it.
+        """
+        self.kind = "mosaic" if dataset is None else dataset.name
+        self.cameras = None if dataset is None else dataset.cameras
+        self._dataset = dataset
         if settings.sensor is None:
             raise PolarguideError(
                 "--sensor",
@@ -52,10 +65,10 @@ class MosaicSource:
         self._dark_path = None if settings.dark_frame is None else Path(settings.dark_frame)
         files = index_files(root, RAW_SUFFIXES)
         if self._dark_path is not None:
-            files = {
-                view: path for view, path in files.items() if path.resolve() != self._dark_path.resolve()
-            }
-        self._files = dict(sorted(files.items()))
+            dark = os.path.realpath(self._dark_path)
+            files = {view: path for view, path in files.items() if os.path.realpath(path) != dark}
+        names = files.keys() if dataset is None else dataset.views
+        self._files = {view: files[view] for view in sorted(names)}
         pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
         self._crop = pattern.cell_corner()
         self._pattern = pattern.shifted(*self._crop)
@@ -76,7 +89,8 @@ class MosaicSource:
     @property
     def paths(self) -> list[Path]:
         """All files that are read."""
-        return [*self._files.values(), *([] if self._dark_path is None else [self._dark_path])]
+        own = list(self._files.values()) if self._dataset is None else self._dataset.paths
+        return [*own, *([] if self._dark_path is None else [self._dark_path])]
 
     def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
         """Levels, gains of the angles and white balance of the capture; every file is read once."""
@@ -89,23 +103,26 @@ class MosaicSource:
             self._require_alike(path, values, shape)
             container = self._container(path, values)
             largest, used = max(largest, int(values.max())), used | int(np.bitwise_or.reduce(values, None))
-            samples.append(_blocks(self._cut(values), 2 * self._pattern.period))
+            samples.append(blocks(self._cut(values), 2 * self._pattern.period))
             advance(count)
         assert shape is not None
         asked = self._settings
         levels = find_levels(
             largest, used, container, bits=asked.bits, black=asked.black_level, saturation=asked.saturation
         )
+        if self._dataset is not None:
+            levels = replace(levels, gamma=self._dataset.gamma)
         dark = self._dark(shape[0])
-        floor = None if dark is None else _blocks(dark, 2 * self._pattern.period)
-        angles, colours, usable = self._sampled(samples, levels, floor)
+        floor = None if dark is None else blocks(dark, 2 * self._pattern.period)
+        angles, colours, usable = sampled(samples, levels, floor, self._pattern)
         ratio = pair_ratio(angles, usable)
         gains, notes = self._gains(ratio)
+        notes += [] if self._dataset is None else self._dataset.notes
         if asked.bits is None and container == 16:
             notes.append(
                 f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale."
             )
-        white = self._white or _grey_world(colours[:, usable])
+        white = self._white or grey_world(colours[:, usable])
         peak = max(white) / min(gains) * asked.calibration.peak
         return {
             "levels": asdict(levels),
@@ -129,8 +146,9 @@ class MosaicSource:
         linear = levels.linear(values, dark) * self._sample_gains(values.shape, measured)
         asked = self._settings
         picture = demosaic(
-            linear, saturated | black, self._pattern, mode=asked.demosaic, interpolation=asked.interpolation
-        )
+            linear, saturated | black, self._pattern,
+            mode=asked.demosaic, interpolation=asked.interpolation, registered=asked.register,
+        )  # fmt: skip
         intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), asked.calibration)
         height, width = picture.invalid.shape
         return Developed(
@@ -147,7 +165,12 @@ class MosaicSource:
                 "dark_share": round(float(black.mean()), 6),
                 "invalid_share": round(float(picture.invalid.mean()), 6),
             },
+            mask=self._mask(view, (height, width)),
         )
+
+    def _mask(self, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        """The object mask, resized where it was made for another resolution of the same picture."""
+        return None if self._dataset is None else fitted_mask(self._dataset, view, size)
 
     def _container(self, path: Path, values: NDArray[Any]) -> int:
         """Bits that a pixel takes in the file."""
@@ -190,34 +213,6 @@ class MosaicSource:
             )
         return self._cut(dark).astype(np.float32)
 
-    def _sampled(
-        self, samples: list[NDArray[Any]], levels: Levels, floor: NDArray[np.float32] | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Light at the centres of blocks: by angle [4, N], by colour [3, N], and those that can be used [N].
-
-        Samples of different angles lie beside one another; weights that interpolate all of them to the centre
-        of a block of two periods keep gradients of the picture out of the ratio of the pair sums.
-        """
-        blocks = np.concatenate(samples)
-        base = levels.black if floor is None else np.tile(floor, (len(samples), 1, 1))
-        linear = (blocks - base) / (levels.white - levels.black)
-        period = self._pattern.period
-        rising = (np.arange(period) + 0.5) / period
-        tent = np.concatenate([rising, rising[::-1]])
-        weighted = linear * tent[:, None] * tent
-        places = np.tile(self._pattern.angles, (2, 2))
-        filters = (
-            np.zeros_like(places) if self._pattern.colours is None else np.tile(self._pattern.colours, (2, 2))
-        )
-        # The weights of one angle and colour add up to 1 a sample of the period.
-        angles = np.stack([weighted[:, places == angle].sum(axis=1) for angle in ANGLES])
-        angles *= 4 / period**2
-        colours = np.ones((3, len(blocks)))
-        if self._pattern.colours is not None:
-            colours = np.stack([weighted[:, filters == c].sum(axis=1) for c in range(3)]) / [[4], [8], [4]]
-        usable = (blocks < levels.saturation).all(axis=(1, 2)) & (blocks > base).any(axis=(1, 2))
-        return angles, colours, np.asarray(usable)
-
     def _gains(self, ratio: float | None) -> tuple[tuple[float, float, float, float], list[str]]:
         """Gains of the angles, and what to say about them."""
         asked = self._settings
@@ -244,17 +239,3 @@ class MosaicSource:
             gains = gains * np.asarray(measured["white_balance"])[pattern.colours]
         repeat = [-(-length // pattern.period) for length in shape]
         return np.tile(gains.astype(np.float32), repeat)[: shape[0], : shape[1]]
-
-
-def _grey_world(colours: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Gains that make the mean of [3, N] colours grey; green keeps its own."""
-    mean = np.maximum(colours.mean(axis=1) if colours.size else np.ones(3), 1e-6)
-    return float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2])
-
-
-def _blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
-    """Some blocks of a mosaic, spread over it, [N, size, size]."""
-    rows, columns = values.shape[0] // size, values.shape[1] // size
-    grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
-    blocks = grid.swapaxes(1, 2).reshape(-1, size, size)
-    return blocks[:: max(1, len(blocks) // _BLOCKS)].copy()

@@ -3,97 +3,43 @@
 from __future__ import annotations
 
 import copy
-import functools
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import pycolmap
-from numpy.typing import NDArray
 
-from polarguide.capture.colmap import PINHOLES, find_model, load_model, posed_images
+from polarguide.capture.colmap import MODEL_FILES, find_model, load_model, posed_images
+from polarguide.capture.posed_camera import PosedCamera, write_cameras
 from polarguide.capture.prepare.source import Geometry
+from polarguide.capture.prepare.warp import Warp, fitted_camera, warp_of
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
 Key = tuple[int, Geometry]
 
 
-@dataclass(frozen=True, eq=False)
-class Warp:
-    """How a picture becomes that of a pinhole camera.
-
-    Attributes:
-        source: the camera of the developed picture, as pycolmap's.
-        target: the pinhole camera.
-        moves: whether pixels move.
-    """
-
-    source: Any
-    target: Any
-    moves: bool
-
-    def record(self) -> dict[str, Any] | None:
-        """The camera that was taken out, or None."""
-        if not self.moves:
-            return None
-        return {"model": self.source.model_name, "parameters": [float(value) for value in self.source.params]}
-
-    def apply(
-        self, intensities: NDArray[np.float32], invalid: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Resample intensities [4, H, W, 3] with one map; a pixel is invalid if it uses one, or none inside."""
-        if not self.moves:
-            return intensities, invalid
-        x, y = self._map
-        moved = [cv2.remap(p, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in intensities]
-        wrong = cv2.remap(
-            invalid.astype(np.float32),
-            x,
-            y,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=1.0,
-        )
-        return np.stack(moved), np.asarray(wrong > 0)
-
-    @functools.cached_property
-    def _map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where the pixels of the target lie in the source, in OpenCV's pixels."""
-        rows, columns = np.mgrid[: self.target.height, : self.target.width]
-        places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)  # COLMAP's pixel centres
-        rays = self.target.cam_from_img(places)
-        seen = self.source.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
-        seen = np.nan_to_num(seen, nan=-10.0).reshape(*rows.shape, 2).astype(np.float32) - np.float32(0.5)
-        return np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
-
-
 class Poses:
     """A COLMAP model and the views of a capture that it has poses for."""
 
-    def __init__(self, path: Path, views: list[str]) -> None:
-        """Read a model and match its images with views by stem.
+    def __init__(self, model: Any, where: Path, views: list[str], files: Sequence[Path] = ()) -> None:
+        """Match the images of a model with views by stem.
 
         Args:
-            path: a folder with the model's files, or with ``sparse/0`` or ``sparse``.
+            model: pycolmap's ``Reconstruction``.
+            where: where it came from, for messages.
             views: view names of the capture.
+            files: the files it was read from.
 
         Raises:
-            PolarguideError: there is no readable model, none of its images is a view, two images claim one,
-                or a pose or camera has broken numbers.
+            PolarguideError: none of its images is a view, two images claim one, or a pose or camera has
+                broken numbers.
         """
-        self.folder, kind = find_model(path)
-        self._model = load_model(self.folder, kind)
+        self.folder = where
+        self.files = tuple(files)
+        self._model = model
         images = posed_images(self._model)
-        if not self._model.points3D:
-            raise PolarguideError(
-                self.folder,
-                expected="3D points to start from",
-                found="none",
-                remedy="Triangulate points with the known poses (colmap point_triangulator).",
-            )
         self.views = [view for view in views if view in images]
         self.missing = [view for view in views if view not in images]
         if not self.views:
@@ -116,6 +62,50 @@ class Poses:
         self._warps: dict[Key, Warp] = {}
         self._of_camera: dict[int, Warp] = {}
 
+    @classmethod
+    def read(cls, path: Path, views: list[str]) -> Poses:
+        """A model from a folder with its files, or with ``sparse/0`` or ``sparse``; it may lack points.
+
+        Raises:
+            PolarguideError: there is no readable model, or as for the model itself.
+        """
+        folder, kind = find_model(path, points=False)
+        files = [folder / (name + kind) for name in MODEL_FILES]
+        return cls(load_model(folder, kind), folder, views, [file for file in files if file.exists()])
+
+    @classmethod
+    def of_cameras(cls, cameras: Mapping[str, PosedCamera], where: Path, views: list[str]) -> Poses:
+        """A model without points from cameras by view name; ``where`` they came from is for messages."""
+        with tempfile.TemporaryDirectory() as made:
+            write_cameras(Path(made), cameras)
+            return cls(load_model(Path(made), ".bin"), where, views)
+
+    @property
+    def points(self) -> int:
+        """How many 3D points the model has."""
+        return len(self._model.points3D)
+
+    def developed(self, geometries: Mapping[str, Geometry]) -> dict[str, PosedCamera]:
+        """Cameras of the developed pictures, distortion and all, by view.
+
+        Raises:
+            PolarguideError: as in ``warp``.
+        """
+        found = {}
+        for view in self.views:
+            image = self._images[view]
+            camera = self.warp(view, geometries[view]).source
+            pose = _pose(image)
+            found[view] = PosedCamera(
+                camera.width,
+                camera.height,
+                camera.model_name,
+                tuple(float(value) for value in camera.params),
+                np.asarray(pose.rotation.matrix(), np.float64),
+                np.asarray(pose.translation, np.float64),
+            )
+        return found
+
     def warp(self, view: str, geometry: Geometry) -> Warp:
         """What the view's picture has to go through.
 
@@ -125,8 +115,10 @@ class Poses:
         number = self._images[view].camera_id
         key = (number, geometry)
         if key not in self._warps:
-            camera = _fitted(self._model.cameras[number], geometry, f"{self.folder} (camera of view {view})")
-            self._warps[key] = _warp(camera)
+            camera = fitted_camera(
+                self._model.cameras[number], geometry, f"{self.folder} (camera of view {view})"
+            )
+            self._warps[key] = warp_of(camera)
         warp = self._warps[key]
         if self._of_camera.setdefault(number, warp) is not warp:
             raise PolarguideError(
@@ -163,7 +155,7 @@ class Poses:
 
     def _require_numbers(self, view: str) -> None:
         image = self._images[view]
-        pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+        pose = _pose(image)
         quaternion, translation = np.asarray(pose.rotation.quat), np.asarray(pose.translation)
         camera = self._model.cameras[image.camera_id]
         finite = np.isfinite([*quaternion, *translation, *camera.params]).all()
@@ -176,41 +168,6 @@ class Poses:
             )
 
 
-def _fitted(camera: Any, geometry: Geometry, where: str) -> Any:
-    """A COLMAP camera in the pixels of the developed picture."""
-    width, height = geometry.size
-    size = (camera.width, camera.height)
-    if size == geometry.size:
-        crop, step = (0.0, 0.0), 1.0
-    elif size == geometry.stored:
-        crop, step = (float(geometry.crop[0]), float(geometry.crop[1])), float(geometry.step)
-    elif size[0] * height == size[1] * width:
-        crop, step = (0.0, 0.0), size[0] / width
-    else:
-        raise PolarguideError(
-            where,
-            expected=f"the size of the pictures, {width}x{height}, or of the files, "
-            f"{geometry.stored[0]}x{geometry.stored[1]}",
-            found=f"{size[0]}x{size[1]}",
-            remedy="Give a model that was made from these pictures, without a crop.",
-        )
-    fitted = copy.copy(camera)
-    params = np.array(camera.params, dtype=np.float64)
-    params[list(camera.focal_length_idxs())] /= step
-    for index, cut in zip(camera.principal_point_idxs(), crop, strict=True):
-        params[index] = (params[index] - cut) / step
-    fitted.params, fitted.width, fitted.height = params, width, height
-    return fitted
-
-
-def _warp(camera: Any) -> Warp:
-    straight = camera.model_name in PINHOLES and all(
-        camera.params[i] == 0 for i in camera.extra_params_idxs()
-    )
-    if not straight:
-        return Warp(camera, pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera), True)
-    inner = [camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y]
-    target = pycolmap.Camera(
-        model="PINHOLE", width=camera.width, height=camera.height, params=inner, camera_id=camera.camera_id
-    )
-    return Warp(camera, target, False)
+def _pose(image: Any) -> Any:
+    """World to camera, whatever the version of pycolmap."""
+    return image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import os
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from polarguide import __version__
 from polarguide.capture.colmap import read_model
-from polarguide.capture.filter import find_shots
-from polarguide.capture.layout import angle_folders, contents
-from polarguide.capture.prepare.filter_source import FilterSource
-from polarguide.capture.prepare.folder import SFM, SceneFolder, encoded, guarded, write_whole
-from polarguide.capture.prepare.mosaic_source import MosaicSource
+from polarguide.capture.prepare.folder import SFM, SceneFolder, guarded
+from polarguide.capture.prepare.open_source import given_poses, open_source, origin_of_poses
 from polarguide.capture.prepare.poses import Poses
 from polarguide.capture.prepare.reporter import Reporter
-from polarguide.capture.prepare.settings import PrepareSettings, check_format, check_settings
-from polarguide.capture.prepare.sfm import reconstruct, tone_mapped
+from polarguide.capture.prepare.settings import PrepareSettings, check_settings
 from polarguide.capture.prepare.source import Geometry, Source
+from polarguide.capture.prepare.workshop import PHOTOGRAPHS, Workshop
 from polarguide.capture.view import listed
-from polarguide.errors import PolarguideError
 
 _PARTIAL = ".sparse.partial"
 
@@ -69,7 +65,8 @@ def prepare_scene(
     root, target = Path(source), Path(out)
     check_settings(settings)
     pictures = open_source(root, settings)
-    poses = Poses(Path(settings.poses), pictures.views) if settings.poses not in ("sfm", "none") else None
+    settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
+    poses = given_poses(root, pictures, settings.poses)
     folder = SceneFolder(target, _request(root, pictures, settings, poses))
     if folder.finished:
         reporter.say(f"{target} is complete already; nothing to do.")
@@ -81,8 +78,15 @@ def prepare_scene(
         for note in folder.measured["notes"]:
             reporter.say(note)
     folder.start()
+    work = Workshop(folder, pictures, settings, reporter)
+    points: dict[str, Any] | None = None
     if settings.poses == "sfm":
-        poses = Poses(_structure(folder, pictures, settings, reporter), pictures.views)
+        poses = Poses.read(work.structure(), pictures.views)
+        points = {"from": "structure from motion", "count": poses.points}
+    elif poses is not None and not poses.points:
+        poses, points = work.points(poses)
+    elif poses is not None:
+        points = {"from": "the model given", "count": poses.points}
     if poses is not None and poses.missing:
         reporter.warn(
             f"{len(poses.missing)} of {len(pictures.views)} views have no pose and are left out "
@@ -91,38 +95,9 @@ def prepare_scene(
     _write_views(folder, pictures, poses, reporter)
     if poses is not None:
         _write_model(folder, poses)
-    folder.finish(_summary(folder, pictures, settings))
+    folder.finish(_summary(folder, pictures, settings, points))
     shutil.rmtree(target / SFM, ignore_errors=True)
     return _outcome(folder, pictures, settings, new=True)
-
-
-def open_source(root: Path, settings: PrepareSettings) -> Source:
-    """The pictures in a folder, in the format asked for or found.
-
-    Raises:
-        PolarguideError: there is no such folder, or nothing in it that can be read.
-    """
-    if not root.is_dir():
-        raise PolarguideError(
-            root,
-            expected="a folder of camera files",
-            found="a file" if root.exists() else "nothing",
-            remedy="Give the folder that holds the raw mosaics, or the shots through the filter.",
-        )
-    kind = settings.format
-    if kind == "auto":
-        several = any(len(files) > 1 for files in find_shots(root).values())
-        kind = "filter" if several or angle_folders(root) else "mosaic"
-    check_format(settings, kind)
-    found = FilterSource(root, settings) if kind == "filter" else MosaicSource(root, settings)
-    if not found.views:
-        raise PolarguideError(
-            root,
-            expected="raw mosaics (PNG, TIFF, .npy, .raw) or four shots per view (folders 0, 45, 90, 135)",
-            found=contents(root),
-            remedy="See docs/formats.md for the layouts.",
-        )
-    return found
 
 
 def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Poses | None) -> dict[str, Any]:
@@ -133,36 +108,14 @@ def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Pos
         return [found.st_size, found.st_mtime_ns]
 
     request = {
-        "source": str(root.resolve()),
+        "source": os.path.realpath(root),
         "format": pictures.kind,
         "settings": settings.record(),
         "file": {str(path): fingerprint(path) for path in pictures.paths if path.exists()},
     }
-    if poses is not None:
-        request["model"] = {path.name: fingerprint(path) for path in sorted(poses.folder.iterdir())}
+    if poses is not None and poses.files:
+        request["model"] = {path.name: fingerprint(path) for path in poses.files}
     return request
-
-
-def _structure(folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter) -> Path:
-    """Tone-mapped photographs of all views, and the model that SfM finds in them."""
-    images = folder.root / SFM / "images"
-    guarded(lambda: images.mkdir(parents=True, exist_ok=True), images)
-    sizes: dict[str, tuple[int, int]] = {}
-    assert folder.measured is not None
-    with reporter.track("photographs for SfM", len(pictures.views)) as advance:
-        for count, view in enumerate(pictures.views, 1):
-            path = images / f"{view}.png"
-            known = folder.measured.setdefault("sfm_sizes", {})
-            if view not in known or not path.exists():
-                shown = tone_mapped(pictures.develop(view, folder.measured).intensities)
-                write_whole(path, encoded(shown))
-                known[view] = [shown.shape[1], shown.shape[0]]
-                folder.save()
-            sizes[view] = (known[view][0], known[view][1])
-            advance(count)
-    return reconstruct(
-        folder.root / SFM, sizes, matching=settings.matching, seed=settings.seed, reporter=reporter
-    )
 
 
 def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:
@@ -187,14 +140,14 @@ def _write_view(
 ) -> None:
     assert folder.measured is not None
     done = pictures.develop(view, folder.measured)
-    intensities, invalid, record = done.intensities, done.invalid, None
+    intensities, invalid, mask, warped = done.intensities, done.invalid, done.mask, None
     if poses is not None:
         warp = poses.warp(view, done.geometry)
         intensities, invalid = warp.apply(intensities, invalid)
-        record = warp.record()
-    folder.write_view(
-        view, intensities, invalid, {**done.record, "geometry": done.geometry.record(), "warp": record}
-    )
+        mask = None if mask is None else warp.apply_mask(mask)
+        warped = warp.record()
+    record = {**done.record, "geometry": done.geometry.record(), "warp": warped}
+    folder.write_view(view, intensities, invalid, record, mask)
     for note in done.notes:
         reporter.say(note)
 
@@ -213,10 +166,14 @@ def _write_model(folder: SceneFolder, poses: Poses) -> None:
     shutil.rmtree(partial, ignore_errors=True)
 
 
-def _summary(folder: SceneFolder, pictures: Source, settings: PrepareSettings) -> dict[str, Any]:
+def _summary(
+    folder: SceneFolder, pictures: Source, settings: PrepareSettings, points: dict[str, Any] | None
+) -> dict[str, Any]:
     """What ``scene.json`` says to people; everything else is under "prepare"."""
     measured = dict(folder.measured or {})
-    measured.pop("sfm_sizes", None)
+    measured.pop(PHOTOGRAPHS, None)
+    calibration = settings.calibration.record()
+    calibration["sense"] = measured.pop("sense", calibration["sense"])
     shares = [record["clipped_share"] for record in folder.views.values()]
     return {
         "prepared_by": f"polarguide {__version__}",
@@ -224,9 +181,10 @@ def _summary(folder: SceneFolder, pictures: Source, settings: PrepareSettings) -
         "sensor": settings.sensor,
         "packing": settings.packing,
         **measured,
-        "calibration": settings.calibration.record(),
+        "calibration": calibration,
         "clipped_share": round(sum(shares) / max(1, len(shares)), 6),
         "poses": settings.poses,
+        "points": points,
     }
 
 

@@ -9,15 +9,24 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from polarguide.capture.calibration import Calibration, checked
+from polarguide.capture.datasets import DATASETS
 from polarguide.capture.sensor import DEMOSAIC_MODES, INTERPOLATIONS, PACKINGS, sensor_pattern
 from polarguide.errors import PolarguideError
 
-FORMATS = ("auto", "mosaic", "filter")
+FORMATS = ("auto", "mosaic", "filter", *DATASETS)
 _MOSAIC_ONLY = (
     "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
-    "saturation", "white_balance", "demosaic", "interpolation",
+    "saturation", "white_balance", "demosaic", "interpolation", "register",
 )  # fmt: skip
-_FILTER_ONLY = ("transfer", "align")
+ORIGINS = ("auto", "dataset", "sfm", "none")
+"""What poses can be instead of a path."""
+_FLAGS = {
+    "mosaic": _MOSAIC_ONLY,
+    "pisr": _MOSAIC_ONLY,
+    "filter": ("transfer", "align", "white_balance"),
+    "gnerp": ("transfer",),
+}
+"""Flags that mean something for some formats only."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +35,10 @@ class PrepareSettings:
 
     Attributes:
         white_balance: "none", "grey" or three gains separated by commas.
+        register: whether half size brings the four angles of a cell to one place.
         gains: "auto" or "none"; a calibration with gains goes first.
-        poses: "sfm", "none" or the path of a COLMAP model.
+        poses: "auto" (those of a published dataset, else "sfm"), "dataset", "sfm", "none" or the path of a
+            COLMAP model.
     """
 
     format: str = "auto"
@@ -44,11 +55,12 @@ class PrepareSettings:
     white_balance: str = "none"
     demosaic: str = "half"
     interpolation: str = "bilinear"
+    register: bool = True
     transfer: str = "auto"
     align: bool = True
     gains: str = "auto"
     calibration: Calibration = field(default_factory=Calibration)
-    poses: str = "sfm"
+    poses: str = "auto"
     matching: str = "exhaustive"
     seed: int = 0
 
@@ -96,15 +108,28 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
         PolarguideError: one is set.
     """
     default = PrepareSettings()
-    names, other = (_FILTER_ONLY, "rotating filters") if kind == "mosaic" else (_MOSAIC_ONLY, "raw mosaics")
-    for name in names:
+    mine = _FLAGS.get(kind, ())
+    for name in sorted({name for names in _FLAGS.values() for name in names} - set(mine)):
         if getattr(settings, name) != getattr(default, name):
             raise PolarguideError(
                 flag(name),
                 expected=f"only flags that apply to the format {kind}",
-                found=f"one for {other}",
-                remedy="Leave it out, or choose the other --format.",
+                found=f"one for {_owners(name)}",
+                remedy="Leave it out, or choose another --format.",
             )
+    if kind in DATASETS and kind != "pisr" and settings.calibration.gains is not None:
+        raise PolarguideError(
+            "calibration (gains)",
+            expected=f"none for the format {kind}, whose four intensities are made from Stokes vectors",
+            found=str(settings.calibration.gains),
+            remedy="Leave the gains out; order, sense and zero apply.",
+        )
+
+
+def _owners(name: str) -> str:
+    """The formats that a flag is for, in words."""
+    words = {"mosaic": "raw mosaics", "filter": "rotating filters"}
+    return " and ".join(words.get(kind, kind) for kind, names in _FLAGS.items() if name in names)
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:

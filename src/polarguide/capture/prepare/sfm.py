@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
-import threading
-from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +10,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from polarguide.capture.prepare.colmap_steps import match, run, seeded
 from polarguide.capture.prepare.folder import guarded
 from polarguide.capture.prepare.reporter import Reporter
 from polarguide.errors import PolarguideError
 
-_POLL_SECONDS = 0.5
 _FEW_SHARE = 0.8
 _LEAST = 3
-# COLMAP logs every picture and pair; what fails comes as an exception.
-_FATAL = 3
 ADVICE = (
     "More views with more overlap (15 degrees or less between neighbours), a textured ground under the object and "
     "sharp pictures help; --matching exhaustive finds more pairs than sequential."
@@ -65,7 +59,7 @@ def reconstruct(
     if model.is_dir():
         return model
     database, images, trial = folder / "database.db", folder / "images", folder / "models"
-    _match(database, images, sizes, matching, seed, reporter)
+    match(database, images, sizes, matching=matching, seed=seed, reporter=reporter)
     shutil.rmtree(trial, ignore_errors=True)
     guarded(lambda: trial.mkdir(), trial)
     models = _map(database, images, trial, len(sizes), seed, reporter)
@@ -93,32 +87,6 @@ def reconstruct(
     return model
 
 
-def _match(
-    database: Path,
-    images: Path,
-    sizes: dict[str, tuple[int, int]],
-    matching: str,
-    seed: int,
-    reporter: Reporter,
-) -> None:
-    """Features, matches and two-view geometries of the pictures, into the database."""
-    single = len(set(sizes.values())) == 1
-    mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE
-    count = len(sizes)
-    _run(
-        lambda: pycolmap.extract_features(database, images, camera_mode=mode),
-        seed, reporter, "finding features", count, lambda: _rows(database, "keypoints"),
-    )  # fmt: skip
-    verify = pycolmap.TwoViewGeometryOptions()
-    _seed(verify.ransac, seed)
-    match = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
-    pairs = count * (count - 1) // 2 if matching == "exhaustive" else None
-    _run(
-        lambda: match(database, verification_options=verify),
-        seed, reporter, "matching pairs", pairs, lambda: _rows(database, "two_view_geometries"),
-    )  # fmt: skip
-
-
 def _map(
     database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter
 ) -> dict[int, Any]:
@@ -126,67 +94,14 @@ def _map(
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = _LEAST
     for part in (options, options.mapper, options.triangulation):
-        _seed(part, seed)
+        seeded(part, seed)
     placed = [0]
 
     def step() -> None:
         placed[0] += 1
 
-    found: dict[int, Any] = _run(
+    found: dict[int, Any] = run(
         lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
         seed, reporter, "placing cameras", count, lambda: placed[0] + 2 if placed[0] else 0,
     )  # fmt: skip
     return found
-
-
-def _run(
-    work: Callable[[], Any],
-    seed: int,
-    reporter: Reporter,
-    label: str,
-    total: int | None,
-    done: Callable[[], int],
-) -> Any:
-    """Run a step of COLMAP in a thread, so that progress shows and Ctrl-C ends the program at once."""
-    outcome: dict[str, Any] = {}
-
-    def target() -> None:
-        level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _FATAL
-        try:
-            pycolmap.set_random_seed(seed)  # each thread has its own generator
-            outcome["value"] = work()
-        except Exception as error:  # whatever C++ threw
-            outcome["error"] = error
-        finally:
-            pycolmap.logging.minloglevel = level
-
-    thread = threading.Thread(target=target, daemon=True)
-    with reporter.track(label, total) as advance:
-        thread.start()
-        while thread.is_alive():
-            thread.join(_POLL_SECONDS)
-            advance(done())
-    if "error" in outcome:
-        raise PolarguideError(
-            label,
-            expected="COLMAP to succeed",
-            found=str(outcome["error"]).strip().splitlines()[0],
-            remedy="Repeat the command, or bring a model with --poses PATH.",
-        ) from outcome["error"]
-    return outcome["value"]
-
-
-def _rows(database: Path, table: str) -> int:
-    """Rows of a table while COLMAP writes it; 0 where that cannot be told."""
-    try:
-        with closing(
-            sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.1)
-        ) as link:
-            return int(link.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-    except sqlite3.Error:
-        return 0
-
-
-def _seed(options: Any, seed: int) -> None:
-    if hasattr(options, "random_seed"):
-        options.random_seed = seed

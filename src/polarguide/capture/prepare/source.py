@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from polarguide.capture.posed_camera import PosedCamera
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class Developed:
         intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees.
         invalid: pixels that used a sample without meaning, [H, W].
         geometry: where it lies in the stored picture.
+        mask: the object, [H, W], where the source brings one.
         record: what was found, for ``scene.json``.
         notes: sentences for the user.
     """
@@ -57,12 +60,19 @@ class Developed:
     geometry: Geometry
     record: dict[str, Any]
     notes: tuple[str, ...] = ()
+    mask: NDArray[np.bool_] | None = None
 
 
 class Source(Protocol):
     """Pictures of one format."""
 
-    kind: str
+    @property
+    def kind(self) -> str:
+        """Name of the format."""
+
+    @property
+    def cameras(self) -> Mapping[str, PosedCamera] | None:
+        """Cameras by view name, where the source brings poses."""
 
     @property
     def views(self) -> list[str]:

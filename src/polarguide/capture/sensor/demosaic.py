@@ -39,7 +39,9 @@ class Picture:
     invalid: Mask
 
 
-def demosaic(values: Array, bad: Mask, pattern: Pattern, *, mode: str, interpolation: str) -> Picture:
+def demosaic(
+    values: Array, bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True
+) -> Picture:
     """Demosaic one mosaic.
 
     ``half``: each 2x2 polarizer cell is one pixel; the cells of a colour sensor form a Bayer picture per angle.
@@ -47,12 +49,17 @@ def demosaic(values: Array, bad: Mask, pattern: Pattern, *, mode: str, interpola
     interpolated. ``full``: every sensor pixel; colours are interpolated between cells of one angle, then angles
     between neighbouring pixels.
 
+    The four samples of a cell lie half a cell apart. ``half`` brings them to its centre if ``registered``: S1 and S2
+    are means over the cell of what ``full`` makes of it, and so is S0 if interpolation is guided; bilinear
+    interpolation would only blur S0, which is that of the cell's own samples.
+
     Args:
         values: linear intensities [H, W], black level and gains already applied.
         bad: unusable samples, [H, W].
         pattern: of the top-left pixel, which starts a whole polarizer cell.
         mode: a key of ``DEMOSAIC_MODES``.
-        interpolation: one of ``INTERPOLATIONS``; ``quarter`` and a monochrome ``half`` interpolate nothing.
+        interpolation: one of ``INTERPOLATIONS``; ``quarter`` and a monochrome ``half`` interpolate no colours.
+        registered: whether ``half`` brings the four angles to one place.
 
     Returns:
         The picture, of size ``H // s`` x ``W // s`` for s = 2, 4 or 1 (what fills no cell is cut). A
@@ -64,9 +71,10 @@ def demosaic(values: Array, bad: Mask, pattern: Pattern, *, mode: str, interpola
     if mode == "quarter":
         return _superpixels(values, bad, pattern)
     cells = _cells(values, bad, pattern, interpolation)
-    if mode == "half":
-        return _in_order(cells, pattern)
-    return _full(cells, pattern, interpolation)
+    if mode == "full":
+        return _full(cells, pattern, interpolation)
+    plain = _in_order(cells, pattern)
+    return _registered(plain, _full(cells, pattern, interpolation), interpolation) if registered else plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +132,17 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Picture:
     else:
         invalid = _grown(bad, GUIDED_RADIUS)
     return Picture(_three(np.stack(planes, axis=-1)), np.asarray(invalid))
+
+
+def _registered(plain: Picture, full: Picture, interpolation: str) -> Picture:
+    """Half size, all angles at the centres of the cells."""
+    angles, height, width, channels = plain.intensities.shape
+    cells = full.intensities.reshape(angles, height, 2, width, 2, channels)
+    centred = cells.mean(axis=(2, 4), dtype=np.float32)
+    if interpolation == "bilinear":
+        centred += (plain.intensities.sum(axis=0) - centred.sum(axis=0)) / np.float32(4)
+    invalid = full.invalid.reshape(height, 2, width, 2).any(axis=(1, 3))
+    return Picture(centred, np.asarray(plain.invalid | invalid))
 
 
 def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> Picture:

@@ -20,22 +20,27 @@ class Levels:
         white: the value that becomes linear 1.
         saturation: the value from which a sample counts as saturated.
         black: the value without light.
+        gamma: stored values are the light to the power of this number.
     """
 
     bits: int
     white: int
     saturation: int
     black: float
+    gamma: float = 1.0
 
     def linear(self, values: NDArray[Any], dark: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """(value - black) / (white - black), [H, W] float32; noise below black stays negative.
+        """(value - black) / (white - black), made linear, float32; noise below black stays negative.
 
         Args:
-            values: [H, W] stored values.
-            dark: dark frame in stored values, [H, W]; it takes the place of the black level pixel by pixel.
+            values: [..., H, W] stored values.
+            dark: dark frame in stored values, in the same shape; it takes the place of the black level pixel by pixel.
         """
         floor = np.float32(self.black) if dark is None else dark
-        return ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(np.float32)
+        shown = ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(np.float32)
+        if self.gamma == 1.0:
+            return shown
+        return np.asarray(np.copysign(np.abs(shown) ** np.float32(1 / self.gamma), shown))
 
 
 def find_levels(

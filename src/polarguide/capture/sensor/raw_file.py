@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.arrays import read_array
 from polarguide.capture.pictures import decode_stored, read_file
 from polarguide.capture.sensor.packing import PACKINGS, packed_size, unpack
 from polarguide.errors import PolarguideError
@@ -39,11 +39,10 @@ def read_mosaic(path: Path, raw: RawFormat) -> NDArray[Any]:
     Raises:
         PolarguideError: the file cannot be read, is damaged, has colour channels or another size.
     """
-    data = read_file(path)
     suffix = path.suffix.lower()
     if suffix == ".raw":
-        return _read_packed(path, data, raw)
-    values = _read_npy(path, data) if suffix == ".npy" else decode_stored(path, data)
+        return _read_packed(path, read_file(path), raw)
+    values = read_array(path) if suffix == ".npy" else decode_stored(path, read_file(path))
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
@@ -64,18 +63,6 @@ def read_mosaic(path: Path, raw: RawFormat) -> NDArray[Any]:
             remedy="Leave the two flags out for files that know their size.",
         )
     return values
-
-
-def _read_npy(path: Path, data: bytes) -> NDArray[Any]:
-    try:
-        return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
-    except (ValueError, EOFError, OSError) as error:
-        raise PolarguideError(
-            path,
-            expected="a complete .npy file of numbers",
-            found="an empty file" if not data else f"{len(data)} bytes that are none",
-            remedy="Copy or export the file again.",
-        ) from error
 
 
 def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[np.uint16]:

@@ -1,0 +1,161 @@
+"""What a published dataset offers once its layout is understood."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.pictures import decode_stored, read_file
+from polarguide.capture.posed_camera import PosedCamera
+from polarguide.capture.view import listed
+from polarguide.errors import PolarguideError
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The light of one view.
+
+    Attributes:
+        stokes: [3, H, W, 3] float32, in the sense of angles that the dataset has.
+        clipped: pixels that the dataset's own pictures had at full scale, [H, W].
+    """
+
+    stokes: NDArray[np.float32]
+    clipped: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A folder of a published dataset.
+
+    Attributes:
+        name: "pandora", "pisr", ...
+        views: view names, sorted.
+        paths: all files that are read.
+        cameras: view -> camera.
+        light: reads the light of a view; None where ``mosaics`` holds raw files instead.
+        mask: reads the object mask of a view, [H, W]; None where it has none.
+        sense: how its angles count as displayed, "ccw" or "cw".
+        mosaics: folder of raw mosaics, or None.
+        gamma: exponent that the stored values of mosaics were raised to.
+        notes: what the user should know.
+    """
+
+    name: str
+    views: list[str]
+    paths: list[Path]
+    cameras: Mapping[str, PosedCamera]
+    light: Callable[[str], Light] | None
+    mask: Callable[[str], NDArray[np.bool_] | None]
+    sense: str = "ccw"
+    mosaics: Path | None = None
+    gamma: float = 1.0
+    notes: tuple[str, ...] = field(default=())
+
+
+def require_files(files: Mapping[str, Path], kind: str) -> None:
+    """Check that files are there.
+
+    Raises:
+        PolarguideError: one is missing.
+    """
+    for view, path in files.items():
+        if not path.is_file():
+            raise PolarguideError(
+                path,
+                expected=f"the {kind} of view {view}",
+                found="nothing",
+                remedy="Add the file, or remove the others of the view.",
+            )
+
+
+def cameras_of_views(
+    path: Path, numbers: Mapping[str, int], cameras: Mapping[int, PosedCamera], entry: str
+) -> dict[str, PosedCamera]:
+    """Cameras by view name.
+
+    Args:
+        path: the camera file, for messages.
+        numbers: view -> number of its camera.
+        cameras: by number.
+        entry: what an entry of the file is called, up to its number.
+
+    Raises:
+        PolarguideError: a view has none.
+    """
+    without = [view for view, number in numbers.items() if number not in cameras]
+    if without:
+        number = numbers[without[0]]
+        raise PolarguideError(
+            path,
+            expected=f"the entry {entry}{number} for view {without[0]}",
+            found=f"none; {len(without)} of {len(numbers)} views have no camera ({listed(without)})",
+            remedy="Take the file from the dataset as it was published, or remove the pictures of the view.",
+        )
+    return {view: cameras[number] for view, number in numbers.items()}
+
+
+def same_shape(path: Path, found: tuple[int, ...], first: tuple[int, ...], like: Path) -> None:
+    """Check that a file has the size of another one of its view.
+
+    Raises:
+        PolarguideError: it has not.
+    """
+    if found[:2] != first[:2]:
+        raise PolarguideError(
+            path,
+            expected=f"{first[1]}x{first[0]} pixels like {like.name}",
+            found=f"{found[1]}x{found[0]}",
+            remedy="Take the files from the dataset as they were published.",
+        )
+
+
+def numbered(stems: set[str]) -> dict[str, int]:
+    """View -> number, for the stems that are one."""
+    return {stem: int(stem) for stem in sorted(stems) if stem.isascii() and stem.isdigit() and len(stem) < 7}
+
+
+def size_of_first(pictures: Mapping[str, Path], folder: Path) -> tuple[int, int]:
+    """Width and height of the first picture, which the intrinsics belong to.
+
+    Raises:
+        PolarguideError: there is none, or it is damaged.
+    """
+    if not pictures:
+        raise PolarguideError(
+            folder,
+            expected="the pictures that the intrinsics belong to",
+            found="none",
+            remedy="Take the folder from the dataset as it was published.",
+        )
+    path = pictures[min(pictures)]
+    height, width = decode_stored(path, read_file(path)).shape[:2]
+    return width, height
+
+
+def fitted_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """The object mask of a view at a picture size (height, width), or None where it has none.
+
+    A mask of another resolution is resized: where half of a pixel or more is object.
+
+    Raises:
+        PolarguideError: the mask has another aspect.
+    """
+    mask = dataset.mask(view)
+    if mask is None or mask.shape == size:
+        return mask
+    height, width = mask.shape
+    if abs(height * size[1] - width * size[0]) > max(height, width):
+        raise PolarguideError(
+            f"mask of view {view}",
+            expected=f"the aspect of the pictures, {size[1]}x{size[0]}",
+            found=f"{width}x{height}",
+            remedy="Take the file from the dataset as it was published.",
+        )
+    way = cv2.INTER_AREA if height > size[0] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(mask.astype(np.float32), (size[1], size[0]), interpolation=way) >= 0.5)

@@ -1,0 +1,76 @@
+"""PANDORA: Stokes vectors as HDR pictures, cameras of the RGB pictures beside them.
+
+``images_stokes/%02d_s0.hdr, _s0p1.hdr, _s0p2.hdr`` with S0 = s0 / 2, S1 = (s0p1 - s0) / 2, S2 = (s0p2 - s0) / 2;
+``images/``, which the intrinsics were made for; ``mask/%02d.png``; ``cameras.npz``. Files count from 1 and cameras
+from 0, as in its release; where there is a file 00, files count from 0.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.datasets.cameras import pinhole, read_projections
+from polarguide.capture.datasets.dataset import (
+    Dataset,
+    Light,
+    cameras_of_views,
+    require_files,
+    same_shape,
+    size_of_first,
+)
+from polarguide.capture.layout import index_files
+from polarguide.capture.pictures import SUFFIXES, decode_mask, read_file
+from polarguide.capture.radiance import read_radiance
+
+_PARTS = ("s0", "s0p1", "s0p2")
+_STEM = re.compile(r"(?P<view>\d{1,6})_(?P<part>s0|s0p1|s0p2)")
+
+
+def is_pandora(root: Path) -> bool:
+    """Whether a folder has the layout."""
+    return (root / "images_stokes").is_dir()
+
+
+def open_pandora(root: Path) -> Dataset:
+    """Look for the files.
+
+    Raises:
+        PolarguideError: one is missing, or the cameras make no sense.
+    """
+    folder, cameras_file = root / "images_stokes", root / "cameras.npz"
+    matches = [_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
+    views = sorted({match["view"] for match in matches if match is not None})
+    files = {view: [folder / f"{view}_{part}.hdr" for part in _PARTS] for view in views}
+    for index, part in enumerate(_PARTS):
+        require_files({view: paths[index] for view, paths in files.items()}, part)
+    masks = index_files(root / "mask", SUFFIXES)
+    pictures = index_files(root / "images", SUFFIXES)
+    first = 0 if any(int(view) == 0 for view in views) else 1
+    size = size_of_first(pictures, root / "images") if views else (1, 1)
+    found = {i: pinhole(size, *camera) for i, camera in read_projections(cameras_file).items()}
+    numbers = {view: int(view) - first for view in views}
+
+    def light(view: str) -> Light:
+        total, plus1, plus2 = (read_radiance(path) for path in files[view])
+        for path, other in zip(files[view][1:], (plus1, plus2), strict=True):
+            same_shape(path, other.shape, total.shape, files[view][0])
+        stokes = np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)
+        return Light(stokes, np.zeros(total.shape[:2], bool))
+
+    def mask(view: str) -> NDArray[np.bool_] | None:
+        path = masks.get(view)
+        return None if path is None else decode_mask(path, read_file(path), any_value=False)
+
+    return Dataset(
+        name="pandora",
+        views=views,
+        paths=[*(p for paths in files.values() for p in paths), *masks.values(), cameras_file],
+        cameras=cameras_of_views(cameras_file, numbers, found, "world_mat_"),
+        light=light,
+        mask=mask,
+        notes=(f"Files count from {first}, cameras from 0.",),
+    )

@@ -1,0 +1,101 @@
+"""PISR: raw mosaics of a colour sensor, a calibrated lens.
+
+``raw/%03d.npy`` (12 bits in 16, 2448x2048); ``mask/%03d.png``; ``intrinsics.npz`` (camera_matrix at half the sensor's
+size, dist_coeffs, both of OpenCV); ``cameras_sphere.npz`` for the poses; ``gamma<number>.txt``: stored values are the
+light to the power of this number. ``image``, ``aop`` and ``dop`` are made from the raw files and not read.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.arrays import numbers as finite
+from polarguide.capture.arrays import read_arrays
+from polarguide.capture.datasets.cameras import checked_intrinsics, distorted, missing, read_projections
+from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, numbered
+from polarguide.capture.layout import index_files
+from polarguide.capture.pictures import SUFFIXES, decode_mask, read_file
+from polarguide.errors import PolarguideError
+
+SENSOR = "IMX250MYR"
+SIZE = (1224, 1024)
+"""Size that ``camera_matrix`` was made for."""
+_CAMERAS = ("cameras_sphere.npz", "cameras.npz")
+
+
+def is_pisr(root: Path) -> bool:
+    """Whether a folder has the layout."""
+    return (root / "raw").is_dir() and (root / "intrinsics.npz").is_file()
+
+
+def open_pisr(root: Path) -> Dataset:
+    """Look for the files.
+
+    Raises:
+        PolarguideError: one is missing, or the cameras make no sense.
+    """
+    files = index_files(root / "raw", (".npy",))
+    numbers = numbered(set(files))
+    cameras_file = next((root / name for name in _CAMERAS if (root / name).exists()), root / _CAMERAS[0])
+    inner_file = root / "intrinsics.npz"
+    intrinsics = read_arrays(inner_file)
+    for key in ("camera_matrix", "dist_coeffs"):
+        if key not in intrinsics:
+            raise missing(inner_file, key, intrinsics)
+    where = f"{inner_file} (camera_matrix)"
+    inner = checked_intrinsics(where, finite(where, intrinsics["camera_matrix"], ((3, 3),)))
+    coefficients = intrinsics["dist_coeffs"]
+    cameras = {
+        number: distorted(f"{inner_file} (dist_coeffs)", SIZE, inner, coefficients, (rotation, translation))
+        for number, (_, rotation, translation) in read_projections(cameras_file).items()
+    }
+    masks = index_files(root / "mask", SUFFIXES)
+    gamma = _gamma(root)
+
+    def mask(view: str) -> NDArray[np.bool_] | None:
+        path = masks.get(view)
+        return None if path is None else decode_mask(path, read_file(path), any_value=False)
+
+    said = (
+        (f"Stored values are the light to the power of {gamma:g} (gamma file): undone.",)
+        if gamma != 1
+        else ()
+    )
+    return Dataset(
+        name="pisr",
+        views=sorted(numbers),
+        paths=[*files.values(), *masks.values(), inner_file, cameras_file, *_gamma_files(root)],
+        cameras=cameras_of_views(cameras_file, numbers, cameras, "world_mat_"),
+        light=None,
+        mask=mask,
+        mosaics=root / "raw",
+        gamma=gamma,
+        notes=said,
+    )
+
+
+def _gamma_files(root: Path) -> list[Path]:
+    return sorted(path for path in root.iterdir() if path.name.startswith("gamma"))
+
+
+def _gamma(root: Path) -> float:
+    """The number in the name of the gamma file; 1 without one."""
+    files = _gamma_files(root)
+    if not files:
+        return 1.0
+    try:
+        gamma = float(files[0].name.removeprefix("gamma").removesuffix(".txt"))
+    except ValueError:
+        gamma = math.nan
+    if len(files) > 1 or not 0.2 <= gamma <= 5:
+        raise PolarguideError(
+            root,
+            expected="one file called gamma<number>.txt with a number from 0.2 to 5",
+            found=", ".join(path.name for path in files),
+            remedy="Take the file from the dataset as it was published.",
+        )
+    return gamma

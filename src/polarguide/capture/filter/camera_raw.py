@@ -1,0 +1,117 @@
+"""Camera raw files -> linear pictures, every shot in the same way.
+
+LibRaw (package rawpy) develops them with everything off that looks at the picture: no automatic brightness, white
+level or white balance, no gamma, no colour matrix. What is left is the same for every shot: black level, fixed
+gains, a linear scale and demosaicing.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.pictures import LARGEST_PIXELS, read_file
+from polarguide.errors import PolarguideError
+
+CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+"""Suffixes that are read as camera raw."""
+_EXIF_OF_FLIP = {0: 1, 3: 3, 5: 8, 6: 6}
+
+rawpy: ModuleType | None
+try:
+    rawpy = importlib.import_module("rawpy")
+except ImportError:
+    rawpy = None
+
+
+def is_camera_raw(path: Path) -> bool:
+    """Whether a file is one, by its suffix."""
+    return path.suffix.lower() in CAMERA_RAW
+
+
+def read_camera_raw(
+    path: Path, gains: tuple[float, float, float], *, opener: Callable[[io.BytesIO], Any] | None = None
+) -> tuple[NDArray[np.uint16], int]:
+    """Develop a camera raw file.
+
+    Args:
+        path: the file.
+        gains: of R, G and B; the smallest becomes 1, so that full scale of the sensor is full scale of the picture.
+        opener: takes the file's bytes and returns what ``rawpy.imread`` would; rawpy itself if None.
+
+    Returns:
+        [H, W, 3] linear RGB in the camera's own colours, not turned; and the EXIF orientation, 1 to 8.
+
+    Raises:
+        PolarguideError: rawpy is missing, or the file cannot be read or is damaged.
+    """
+    if opener is None and rawpy is None:
+        raise PolarguideError(
+            path,
+            expected="the package rawpy, which reads camera raw files",
+            found="that it is not installed",
+            remedy="pip install 'polarguide[raw]'",
+        )
+    data = read_file(path)
+    try:
+        with (opener or rawpy.imread)(io.BytesIO(data)) as raw:  # type: ignore[union-attr]
+            if raw.sizes.raw_width * raw.sizes.raw_height > LARGEST_PIXELS:
+                raise ValueError(f"{raw.sizes.raw_width}x{raw.sizes.raw_height} pixels")
+            flip = int(raw.sizes.flip)  # before user_flip takes its place
+            pixels = np.asarray(raw.postprocess(**development(gains)))
+    except Exception as error:  # LibRaw's errors have a class each; damaged files raise others, too
+        said = _words(error)
+        raise PolarguideError(
+            path,
+            expected="a complete camera raw file",
+            found="an empty file" if not data else f"one that cannot be developed ({said})",
+            remedy="Copy the file again, or develop it to 16-bit linear TIFF.",
+        ) from error
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint16:
+        raise PolarguideError(
+            path,
+            expected="a camera raw file with three colours",
+            found=f"an array {'x'.join(map(str, pixels.shape))} of {pixels.dtype}",
+            remedy="Develop it to 16-bit linear TIFF.",
+        )
+    return pixels, _EXIF_OF_FLIP.get(flip, 1)
+
+
+def _words(error: Exception) -> str:
+    """What LibRaw says, whose messages are bytes, in one line."""
+    said = error.args[0] if error.args else ""
+    text = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
+    return (text.strip().splitlines() or [type(error).__name__])[0]
+
+
+def development(gains: tuple[float, float, float]) -> dict[str, Any]:
+    """LibRaw's settings, by the names of ``rawpy.Params``."""
+    red, green, blue = (gain / min(gains) for gain in gains)
+    settings: dict[str, Any] = {
+        "gamma": (1.0, 1.0),
+        "output_bps": 16,
+        "no_auto_bright": True,
+        "bright": 1.0,
+        # Otherwise the white level follows the brightest pixel of each shot.
+        "adjust_maximum_thr": 0.0,
+        "use_camera_wb": False,
+        "use_auto_wb": False,
+        "user_wb": [red, green, blue, green],
+        "user_flip": 0,
+        "median_filter_passes": 0,
+    }
+    if rawpy is not None:
+        settings |= {
+            "output_color": rawpy.ColorSpace.raw,
+            "demosaic_algorithm": rawpy.DemosaicAlgorithm.LINEAR,
+            "highlight_mode": rawpy.HighlightMode.Clip,
+            "fbdd_noise_reduction": rawpy.FBDDNoiseReductionMode.Off,
+        }
+    return settings
