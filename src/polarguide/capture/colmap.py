@@ -239,7 +239,6 @@ def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...],
     finite = np.isfinite(places).all(axis=1)
     tracks = tuple(
         tuple(element.image_id for element in point.track.elements)
-        for point, kept in zip(points, finite.tolist(), strict=True)
-        if kept
+        for point in (points[place] for place in np.flatnonzero(finite))
     )
     return torch.from_numpy(places[finite]), torch.from_numpy(colours[finite]), tracks, int((~finite).sum())

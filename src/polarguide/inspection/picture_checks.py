@@ -125,7 +125,11 @@ def _saturation(capture: Capture, readings: Sequence[Readings]) -> Check:
     key, title = "saturation", "Saturation"
     shares = [r.saturated for r in readings]
     lost = [r.saturated + r.invalid for r in readings]
-    figures = {"saturated": float(np.mean(shares)), "worst": max(shares), "invalid": float(np.mean([r.invalid for r in readings]))}
+    figures = {
+        "saturated": float(np.mean(shares)),
+        "worst": max(shares),
+        "invalid": float(np.mean([r.invalid for r in readings])),
+    }
     largest = max(view.peak for view in capture.views)
     if capture.bits == 16 and 0 < largest < (FULL_CODE + 1) // 16:
         return Check(
@@ -153,7 +157,8 @@ def _noise(readings: Sequence[Readings]) -> Check:
     off = tuple(r.view for r in readings if r.noise_share > NOISY or r.bright < 0.01)
     said = (
         f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), which makes a DoLP "
-        f"of {3 * 2**0.5 * share / 2:.3f} three times its noise; the brightest percent of the values reaches {bright:.0%} of full scale."
+        f"of {3 * 2**0.5 * share / 2:.3f} three times its noise; "
+        f"the brightest percent of the values reaches {bright:.0%} of full scale."
     )
     figures = {"noise_share": share, "bright": bright}
     if not off:
@@ -169,7 +174,8 @@ def _polarization(readings: Sequence[Readings]) -> Check:
     key, title = "low_dolp", "Enough polarization"
     share = float(np.median([r.polarized for r in readings]))
     median = float(np.median([r.dolp[0] for r in readings]))
-    said = f"{share:.0%} of the pixels have a DoLP over {POLARIZED:g} beyond their noise; the median DoLP is {median:.3f}."
+    said = f"{share:.0%} of the pixels have a DoLP over {POLARIZED:g} beyond their noise; "
+    said += f"the median DoLP is {median:.3f}."
     figures = {"polarized": share, "median_dolp": median}
     if share >= LITTLE:
         return Check(key, title, "ok", said, figures=figures)

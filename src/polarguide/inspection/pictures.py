@@ -119,7 +119,9 @@ def read_capture(
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     sidecar = root / "scene.json"
-    index = refractive_index_of(sidecar, parse_json(sidecar, read_file(sidecar)) if sidecar.exists() else None)
+    index = refractive_index_of(
+        sidecar, parse_json(sidecar, read_file(sidecar)) if sidecar.exists() else None
+    )
     factor = downscale or _fitting_factor(layout, names[0])
     data: list[ViewData] = []
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -33,7 +33,7 @@ class Readings:
         sum_error: median of |I0 + I90 - I45 - I135| / S0.
         dolp: quantiles 0.5 and 0.99 of the DoLP.
         polarized: share with a DoLP over 0.05 and over three times its noise.
-        above_limit: share with a DoLP over the most that diffuse light can have, and over that by three times its noise.
+        above_limit: share with a DoLP over the most that diffuse light can have by three times its noise.
     """
 
     view: str
@@ -68,22 +68,29 @@ def read_view_figures(view: Pictures, index: float) -> Readings:
     share = float(good.float().mean())
     noise = optics.intensity_noise(grey)
     bright = _quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
-    common = {
-        "view": view.name,
-        "bright": bright,
-        "saturated": float(view.saturated.float().mean()),
-        "invalid": float(view.invalid.float().mean()),
-        "dark": float(dark.float().mean()),
-    }
+    saturated, invalid = (float(mask.float().mean()) for mask in (view.saturated, view.invalid))
+    nothing = Readings(
+        view.name,
+        bright,
+        saturated,
+        invalid,
+        float(dark.float().mean()),
+        0.0,
+        0.0,
+        None,
+        0.0,
+        (0.0, 0.0),
+        0.0,
+        0.0,
+    )
     if share < 0.001:
-        return Readings(**common, noise=0.0, noise_share=0.0, pair_ratio=None, sum_error=0.0,
-                        dolp=(0.0, 0.0), polarized=0.0, above_limit=0.0)  # fmt: skip
+        return nothing
     i0, i45, i90, i135 = (angle[good] for angle in grey)
     s0 = stokes[0][good]
     degree, spread = optics.dolp(stokes)[good], optics.dolp_noise(stokes, noise)[good]
     limit = float(optics.diffuse_dolp_limit(index))
-    return Readings(
-        **common,
+    return replace(
+        nothing,
         noise=_quantile(noise[good], 0.5),
         noise_share=_quantile(noise[good] / (s0 / 2), 0.5),
         pair_ratio=_quantile((i0 + i90) / (i45 + i135).clamp(min=1e-6), 0.5),

@@ -30,8 +30,9 @@ ZENITH_MARGIN = math.radians(15.0)
 LEAST_ZENITH = math.radians(15.0)
 LEAST_DOLP = 0.03
 FEWEST = 500
-LEAST_INLIERS = 0.35
-"""Share of pixels whose AoLP must agree with the normals at the best zero; below, the normals are not good enough."""
+LEAST_INLIERS, LARGEST_ERROR, LEAST_CONCENTRATION = 0.5, math.radians(10.0), 0.25
+"""When normals are good enough: share of the pixels that agree, error of the normals there, and length of the mean of
+``exp(4 i (AoLP - azimuth))``, which is 1 for perfect agreement modulo a quarter turn and 0 for none."""
 _SPECULAR = 0.95
 _NORMAL_ERRORS = tuple(math.radians(angle) for angle in (3.0, 6.0, 10.0, 16.0))
 _INLIERS = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
@@ -104,7 +105,8 @@ def surface_pixels(pairs: Iterable[tuple[Pictures, Surface]], pairing: int = 0, 
         flat = torch.stack([*(row.flatten() for row in rows), *place.reshape(-1, 3).unbind(-1)])
         found.append(flat[:, chosen])
     rows_found = torch.cat(found, dim=1) if found else torch.zeros(8, 0)
-    return Pixels(*rows_found[:5], place=rows_found[5:].T)
+    aolp, dolp, noise_of, azimuth, zenith_of = rows_found[:5].unbind(0)
+    return Pixels(aolp, dolp, noise_of, azimuth, zenith_of, rows_found[5:].T)
 
 
 def surface_evidence(pixels: Pixels, index: float) -> Evidence:
@@ -128,11 +130,22 @@ def surface_evidence(pixels: Pixels, index: float) -> Evidence:
     ]
     _, error, inliers = max(fits)
     values = _log_likelihood(pixels, must, torch.arange(DEGREES), error, inliers)
+    coherent = _concentration(pixels)
     note = (
         f"{count} pixels, {int(must.sum())} of which must be specular; the AoLP of {inliers:.0%} agrees with the "
-        f"normals, whose error is about {math.degrees(error):.0f}°."
+        f"normals, whose error is about {math.degrees(error):.0f}° (agreement modulo 90°: {coherent:.2f} of 1)."
     )
-    return Evidence(SOURCE, cluster_sums(values, cells(pixels.place)), count, inliers >= LEAST_INLIERS, note)
+    usable = inliers >= LEAST_INLIERS and error <= LARGEST_ERROR and coherent >= LEAST_CONCENTRATION
+    return Evidence(SOURCE, cluster_sums(values, cells(pixels.place)), count, usable, note)
+
+
+def _concentration(pixels: Pixels) -> float:
+    """How well AoLP and azimuth agree modulo a quarter turn, for the better sense and the best zero, in [0, 1]."""
+    lengths = []
+    for sense in SENSES:
+        angle = 4 * (sense * pixels.aolp - pixels.azimuth)
+        lengths.append(float(torch.hypot(torch.cos(angle).mean(), torch.sin(angle).mean())))
+    return max(lengths)
 
 
 def _log_likelihood(pixels: Pixels, must: Tensor, zeros: Tensor, error: float, inliers: float) -> Tensor:
