@@ -43,7 +43,7 @@ def correction(capture: Capture, angles: Angles) -> Calibration | None:
             found="one that geometry does not decide",
             remedy="Nothing was written. See the report for what to do; --order of prepare sets it by hand.",
         )
-    zero = -round(angles.offset, 2) if angles.offset is not None else 0.0
+    zero = round(angles.offset, 2) if angles.offset is not None else 0.0
     return None if files == ANGLES and zero == 0.0 else Calibration(order=files, zero=zero)
 
 
