@@ -101,7 +101,9 @@ def _say(found: Inspection) -> None:
         ranked = sorted(zip(ORDERS, odds.probabilities, odds.log_odds, strict=True), key=lambda row: -row[1])
         for order, probability, against in ranked:
             files = ", ".join(f"{angle:3d}" for angle in order.files(PAIRINGS[found.angles.pairing]))
-            console.print(f"  {files}   {probability:7.2%}  ({0.0 - against:.1f})  {order.label}", markup=False)
+            console.print(
+                f"  {files}   {probability:7.2%}  ({0.0 - against:.1f})  {order.label}", markup=False
+            )
     for evidence in found.angles.sources:
         used = "" if evidence.usable else " (not used)"
         console.print(f"  {evidence.source}{used}: {evidence.note}", markup=False)
