@@ -66,6 +66,7 @@ def fix_scene(
     Raises:
         PolarguideError: ``out`` exists, or a file cannot be read or written.
     """
+    out = out.absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise PolarguideError(
             out,
