@@ -43,7 +43,7 @@ def test_a_sound_capture_is_not_flagged(tmp_path) -> None:
         (gained(1, 1, 1.05, 1), {"exposure": "look"}),
         (gained(1, 1, 1, 1.05), {"exposure": "look"}),
         (gained(1.008, 1, 1, 1), {}),
-        (gained(1.13, 1, 1, 1), {"exposure": "wrong"}),
+        (gained(1.13, 1, 1, 1), {"exposure": "wrong", "pair_sums": "wrong"}),
     ],
 )
 def test_a_fault_is_flagged_by_its_check(tmp_path, change, expected) -> None:
