@@ -6,7 +6,7 @@ import contextlib
 import difflib
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -45,6 +45,7 @@ class ColmapModel:
     warnings: tuple[str, ...]
     _images: dict[str, list[Any]] = field(repr=False)
     _cameras: dict[int, Any] = field(repr=False)
+    _tracks: tuple[tuple[int, ...], ...] = field(repr=False, default=())
 
     @property
     def names(self) -> list[str]:
@@ -69,6 +70,20 @@ class ColmapModel:
             )
         return _camera_of(self.folder, images[0], self._cameras[images[0].camera_id])
 
+    def sightings(self, views: Sequence[str]) -> Tensor:
+        """Which of the views each point was triangulated from, [M, V] bool; all False where no tracks are stored."""
+        columns = {view: column for column, view in enumerate(views)}
+        by_id = {
+            image.image_id: columns[view]
+            for view, images in self._images.items()
+            if view in columns
+            for image in images
+        }
+        seen = torch.zeros(len(self._tracks), len(views), dtype=torch.bool)
+        for row, track in enumerate(self._tracks):
+            seen[row, [by_id[number] for number in track if number in by_id]] = True
+        return seen
+
 
 def read_model(root: Path) -> ColmapModel:
     """Read the COLMAP model in ``root/sparse/0`` or ``root/sparse``: binary, else text.
@@ -80,7 +95,7 @@ def read_model(root: Path) -> ColmapModel:
     files = tuple(path for path in (folder / (name + kind) for name in MODEL_FILES) if path.exists())
     model = load_model(folder, kind)
     images = posed_images(model)
-    points, colours, dropped = _points_of(model)
+    points, colours, tracks, dropped = _points_of(model)
     if len(points) == 0:
         raise PolarguideError(
             folder / ("points3D" + kind),
@@ -93,7 +108,7 @@ def read_model(root: Path) -> ColmapModel:
         if dropped
         else ()
     )
-    return ColmapModel(folder, files, points, colours, warnings, images, dict(model.cameras))
+    return ColmapModel(folder, files, points, colours, warnings, images, dict(model.cameras), tracks)
 
 
 def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: str) -> Camera:
@@ -241,11 +256,15 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     )
 
 
-def _points_of(model: Any) -> tuple[Tensor, Tensor, int]:
-    """Finite points and their colours, and how many points are not finite."""
+def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], int]:
+    """Finite points, their colours and the numbers of the images that see them; how many points are not finite."""
     points = [point for _, point in sorted(model.points3D.items())]
     with np.errstate(over="ignore"):
         places = np.array([point.xyz for point in points]).reshape(-1, 3).astype(np.float32)
     colours = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     finite = np.isfinite(places).all(axis=1)
-    return torch.from_numpy(places[finite]), torch.from_numpy(colours[finite]), int((~finite).sum())
+    tracks = tuple(
+        tuple(element.image_id for element in point.track.elements)
+        for point in (points[place] for place in np.flatnonzero(finite))
+    )
+    return torch.from_numpy(places[finite]), torch.from_numpy(colours[finite]), tracks, int((~finite).sum())

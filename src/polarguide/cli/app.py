@@ -14,6 +14,7 @@ from polarguide.cli.ablate import ablate
 from polarguide.cli.compare import compare
 from polarguide.cli.demo import demo
 from polarguide.cli.evaluate import evaluate
+from polarguide.cli.inspect import inspect
 from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
@@ -23,6 +24,7 @@ from polarguide.errors import PolarguideError
 VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
     "prepare": prepare,
+    "inspect": inspect,
     "train": train,
     "eval": evaluate,
     "render": render_views,

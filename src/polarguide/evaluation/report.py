@@ -55,7 +55,7 @@ def report_html(
         notes=_list(notes(results)),
         pictures_hidden="" if views else "hidden",
         remarks=_list(remarks),
-        gradient=_gradient("inferno"),
+        gradient=colour_gradient("inferno"),
         legend=_script_data(LEGEND),
         data=_script_data([vars(view) for view in views]),
         layers=_script_data(LAYERS),
@@ -161,7 +161,7 @@ def _provenance(results: Mapping[str, Any]) -> str:
     return "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in rows)
 
 
-def _gradient(colour_map: str) -> str:
+def colour_gradient(colour_map: str) -> str:
     """A colour map of the figures as the stops of a CSS gradient."""
     levels = np.linspace(0, 255, 9).round().astype(np.uint8)[None]
     colours = cv2.applyColorMap(levels, COLOUR_MAPS[colour_map])[0, :, ::-1]

@@ -1,0 +1,121 @@
+"""What ``polarguide inspect`` says of scenes whose faults are planted.
+
+    python benchmarks/inspection_verdicts.py SCENE [SCENE ...]
+
+The eight orders that keep the pairs, a zero turned by 10 degrees, gamma-encoded files, one angle exposed 5 % longer,
+and pictures overexposed three times are made from each scene in memory, and judged by points seen in several views and
+by the pictures alone (no training).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polarguide.capture import checks
+from polarguide.capture.calibration import Calibration, oriented
+from polarguide.inspection.angle_checks import order_check, weigh, zero_check
+from polarguide.inspection.orders import ORDERS
+from polarguide.inspection.picture_checks import pairing_of, picture_checks
+from polarguide.inspection.pictures import Capture, read_capture
+from polarguide.inspection.points import point_evidence
+from polarguide.inspection.readings import read_view_figures
+
+Change = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+
+
+def altered(capture: Capture, change: Change) -> Capture:
+    """The capture with other intensities [4, H, W, 3]; what reaches full scale is saturated."""
+    views = []
+    for view in capture.views:
+        values = change(view.intensities().numpy())
+        codes = np.rint(np.clip(values, 0, 1) * 65535).astype(np.uint16)
+        saturated = view.saturated.numpy() | (codes == 65535).any(axis=(0, 3))
+        measures = checks.measure(codes, ~(view.invalid.numpy() | saturated))
+        views.append(
+            dataclasses.replace(
+                view, codes=torch.from_numpy(codes), saturated=torch.from_numpy(saturated), measures=measures
+            )
+        )
+    return dataclasses.replace(capture, views=tuple(views))
+
+
+def turned(degrees: float) -> Change:
+    """An instrument whose zero lies at ``degrees``: measured angles are smaller by as much."""
+    return lambda values: oriented(values, Calibration(zero=-degrees))
+
+
+def misnamed(files: tuple[int, int, int, int]) -> Change:
+    """Pictures called 0, 45, 90, 135 that were taken at ``files``."""
+    return lambda values: values[[(0, 45, 90, 135).index(angle) for angle in files]]
+
+
+def encoded(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.where(
+        values <= 0.0031308, 12.92 * values, 1.055 * np.maximum(values, 1e-9) ** (1 / 2.4) - 0.055
+    )
+
+
+def exposed(place: int) -> Change:
+    """One picture exposed 5 % longer."""
+    gains = np.ones((4, 1, 1, 1), np.float32)
+    gains[place] = 1.05
+    return lambda values: values * gains
+
+
+def angles_line(capture: Capture, index: float) -> str:
+    pairing = pairing_of(capture) or 0
+    evidence, _ = point_evidence(capture.posed, capture.model, index, pairing)
+    angles = weigh([evidence], pairing)
+    order, zero = order_check(angles), zero_check(angles)
+    if angles.odds is None:
+        return f"order {order.verdict}: {evidence.note}"
+    best = ORDERS[angles.odds.best].files()
+    return (
+        f"order {order.verdict:5} {','.join(map(str, best)):14} p {max(angles.odds.probabilities):.4f}  "
+        f"zero {zero.verdict:5} {angles.odds.offset:+.2f} +- {angles.odds.offset_error:.2f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--pictures-only", action="store_true", help="leave out what takes poses")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    for path in arguments.scenes:
+        capture = read_capture(path)
+        index = capture.refractive_index or 1.5
+        plants: dict[str, Change] = {
+            "untouched": lambda values: values,
+            "gamma": encoded,
+            **{f"5 % at {(0, 45, 90, 135)[k]}": exposed(k) for k in range(4)},
+            "overexposed x3": lambda values: values * 3,
+        }
+        for name, change in plants.items():
+            planted = altered(capture, change)
+            readings = [read_view_figures(view, index) for view in planted.views]
+            found = picture_checks(planted, readings, pairing_of(planted))
+            flagged = [f"{check.key} {check.verdict}" for check in found if check.verdict != "ok"]
+            print(f"{path.name:9} {name:15} {', '.join(flagged) or 'all ok'}", flush=True)
+        if arguments.pictures_only:
+            continue
+        for order in ORDERS:
+            line = angles_line(altered(capture, misnamed(order.files())), index)
+            print(f"{path.name:9} {','.join(map(str, order.files())):15} {line}", flush=True)
+        print(
+            f"{path.name:9} {'zero at 10':15} {angles_line(altered(capture, turned(10.0)), index)}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Inspection: verdicts on a capture; order, sense and zero of the polarizer angles by geometry."""

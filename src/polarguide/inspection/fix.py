@@ -1,0 +1,148 @@
+"""A corrected copy of a scene: pictures under the names of their true angles, the zero turned back."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polarguide import __version__
+from polarguide.capture.calibration import Calibration, oriented
+from polarguide.capture.layout import contents
+from polarguide.capture.pictures import read_file
+from polarguide.capture.prepare.folder import encoded, guarded, picture_codes, write_whole
+from polarguide.capture.sidecars import parse_json
+from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.view_reader import read_view
+from polarguide.errors import PolarguideError
+from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.orders import FileOrder, swaps
+from polarguide.inspection.pictures import Capture
+
+SIDES = ("sparse", "masks", "invalid", "gt", "split.json")
+"""What is copied as it is, beside the pictures."""
+SCENE = "scene.json"
+
+
+def correction(capture: Capture, angles: Angles) -> Calibration | None:
+    """What puts the angles right, or None where they are right already.
+
+    Raises:
+        PolarguideError: the order is not decided; nothing may be written then.
+    """
+    files = angles.files
+    if files is None:
+        raise PolarguideError(
+            capture.root,
+            expected="a decided order of the angles",
+            found="one that geometry does not decide",
+            remedy="Nothing was written. See the report for what to do; --order of prepare sets it by hand.",
+        )
+    zero = round(angles.offset, 2) if angles.offset is not None else 0.0
+    return None if files == ANGLES and zero == 0.0 else Calibration(order=files, zero=zero)
+
+
+def fix_scene(
+    capture: Capture, change: Calibration, out: Path, advance: Callable[[int], None] = lambda done: None
+) -> str:
+    """Write a corrected copy of the scene; the scene itself is left as it is.
+
+    A pure exchange copies the files under their right names, byte by byte. A turned zero forms the four
+    intensities anew, as linear 16-bit PNG; they are divided by 1.21 so that none exceeds full scale, and saturated
+    pixels become invalid. The folder appears when it is complete.
+
+    Args:
+        capture: as read. change: from ``correction``. out: a folder that does not exist.
+        advance: called with the number of views written.
+
+    Returns:
+        What was done, a sentence.
+
+    Raises:
+        PolarguideError: ``out`` exists, or a file cannot be read or written.
+    """
+    out = out.absolute()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise PolarguideError(
+            out,
+            expected="a new folder",
+            found="a file" if not out.is_dir() else contents(out),
+            remedy="Give another --fix; nothing was written.",
+        )
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        guarded(lambda: _write(capture, change, partial, advance), out)
+        if out.is_dir():
+            out.rmdir()
+        guarded(lambda: os.replace(partial, out), out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return described(change)
+
+
+def described(change: Calibration) -> str:
+    """What a correction does, in words."""
+    parts = []
+    if change.order != ANGLES:
+        parts.append(f"the files were renamed ({swaps(change.order)})")
+    if change.zero:
+        parts.append(f"the Stokes vectors were turned by {change.zero:+.2f}°")
+    return " and ".join(parts)
+
+
+def _write(capture: Capture, change: Calibration, folder: Path, advance: Callable[[int], None]) -> None:
+    (folder / "polar").mkdir(parents=True)
+    for name in SIDES:
+        source = capture.root / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name)
+        elif source.exists():
+            shutil.copy2(source, folder / name)
+    for done, view in enumerate(capture.layout.names):
+        if change.zero:
+            _turn_view(capture, change, folder, view)
+        else:
+            _rename_view(capture, change.order, folder, view)
+        advance(done + 1)
+    write_whole(folder / SCENE, _sidecar(capture, change))
+
+
+def _rename_view(capture: Capture, order: FileOrder, folder: Path, view: str) -> None:
+    for name, true in zip(ANGLES, order, strict=True):
+        source = capture.layout.pictures[view][name]
+        shutil.copy2(source, folder / "polar" / f"{view}_{true:03d}{source.suffix}")
+
+
+def _turn_view(capture: Capture, change: Calibration, folder: Path, view: str) -> None:
+    data = read_view(capture.layout, view, factor=1, transfer=capture.transfer)
+    full = int(np.iinfo(data.peak.dtype).max)
+    lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
+    turned = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
+    for angle, codes in zip(ANGLES, picture_codes(turned, lost), strict=True):
+        write_whole(folder / "polar" / f"{view}_{angle:03d}.png", encoded(codes[..., ::-1]))
+    (folder / "invalid").mkdir(exist_ok=True)
+    for old in (folder / "invalid").glob(f"{view}.*"):
+        old.unlink()
+    write_whole(folder / "invalid" / f"{view}.png", encoded(lost.astype(np.uint8) * 255))
+
+
+def _sidecar(capture: Capture, change: Calibration) -> bytes:
+    """``scene.json`` of the copy: that of the scene, and a note on what was changed."""
+    path = capture.root / SCENE
+    content: dict[str, Any] = parse_json(path, read_file(path)) if path.exists() else {}
+    note = {
+        "program": f"polarguide {__version__}",
+        "from": capture.name,
+        "digest": capture.digest,
+        "change": described(change),
+        **change.record(),
+        "scale": 1.0 / change.peak,
+    }
+    content["corrections"] = [*content.get("corrections", []), note]
+    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()

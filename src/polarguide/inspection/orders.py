@@ -1,0 +1,55 @@
+"""The orders that four pictures may have, and what each does to an angle of polarization.
+
+The pair sums tell which pictures are perpendicular to each other (three pairings). Within a pairing eight orders
+remain, the symmetries of a square: the angle of a picture is ``sense * L + zero`` of what its name says, with a
+sense of +1 or -1 and a zero of 0, 45, 90 or 135 degrees. The measured AoLP turns the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from polarguide.capture.view import ANGLES
+
+FileOrder = tuple[int, int, int, int]
+
+PAIRINGS: tuple[FileOrder, ...] = ((0, 45, 90, 135), (0, 90, 45, 135), (0, 45, 135, 90))
+"""One order for each way to pair the pictures, in the order of ``capture.checks.Measures.residuals``."""
+SENSES = (1, -1)
+ZEROS = (0, 45, 90, 135)
+
+
+@dataclass(frozen=True)
+class Order:
+    """One of the eight orders within a pairing.
+
+    Attributes:
+        sense: +1 where the angles count counter-clockwise as displayed, -1 where clockwise.
+        zero: where their zero lies, degrees counter-clockwise from the image's horizontal.
+    """
+
+    sense: int
+    zero: int
+
+    def files(self, pairing: FileOrder = ANGLES) -> FileOrder:
+        """The angle that the pictures called 0, 45, 90 and 135 were really taken at."""
+        first, second, third, fourth = ((self.sense * angle + self.zero) % 180 for angle in pairing)
+        return first, second, third, fourth
+
+    @property
+    def label(self) -> str:
+        """For people: sense and zero."""
+        return f"{'counter-clockwise' if self.sense > 0 else 'clockwise'}, zero at {self.zero}°"
+
+
+ORDERS: tuple[Order, ...] = tuple(Order(sense, zero) for sense in SENSES for zero in ZEROS)
+"""All eight; the first is that of an untouched capture."""
+IDENTITY = ORDERS[0]
+
+
+def swaps(files: FileOrder) -> str:
+    """What is wrong with the names of the files, in words."""
+    moved = [(name, true) for name, true in zip(ANGLES, files, strict=True) if name != true]
+    if not moved:
+        return "nothing"
+    return ", ".join(f"the picture called {name}° was taken at {true}°" for name, true in moved)

@@ -1,0 +1,185 @@
+"""The page of an inspection: one HTML file that needs nothing beside itself, nor scripts."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable
+from importlib import resources
+from string import Template
+
+import torch
+
+from polarguide.evaluation import figures
+from polarguide.evaluation.report import colour_gradient
+from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.layers import LAYERS, layer_uris
+from polarguide.inspection.orders import ORDERS, PAIRINGS
+from polarguide.inspection.readings import Readings
+from polarguide.inspection.run import Inspection
+from polarguide.inspection.verdict import Check, Verdict
+
+FILE = "inspection.html"
+_CLASSES: dict[Verdict, str] = {"ok": "ok", "look": "look", "wrong": "wrong", "n/a": "na"}
+
+
+def inspection_html(found: Inspection, advance: Callable[[int], None] = lambda done: None) -> str:
+    """The page; all names and texts in it are escaped.
+
+    Args:
+        found: the findings.
+        advance: called with the number of views drawn.
+    """
+    capture = found.capture
+    marked = {name for check in found.checks for name in check.views}
+    tiles = []
+    for done, (view, reading) in enumerate(zip(capture.views, found.readings, strict=True)):
+        tiles.append(_tile(layer_uris(view), reading, view.name in marked))
+        advance(done + 1)
+    posed = f"{len(capture.posed)} with a pose" if capture.model is not None else "no poses"
+    width, height = capture.size
+    return Template(_part("inspection.html")).substitute(
+        title=html.escape(f"Inspection of {capture.name}"),
+        style=Template(_part("inspection.css")).substitute(switching=_switching()),
+        summary=html.escape(f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}"),
+        overall=found.verdict,
+        overall_class=_CLASSES[found.verdict],
+        checks="".join(map(_check_row, found.checks)),
+        angles=_angles(found.angles),
+        inputs="".join(
+            f'<input type="radio" name="layer" id="layer-{layer.key}"{" checked" if not k else ""}>'
+            for k, layer in enumerate(LAYERS)
+        ),
+        labels="".join(f'<label for="layer-{layer.key}">{html.escape(layer.label)}</label>' for layer in LAYERS),
+        legends=_legends(),
+        tiles="".join(tiles),
+        figures=_figures(found.readings),
+        facts=_facts(found),
+    )  # fmt: skip
+
+
+def _part(name: str) -> str:
+    return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")
+
+
+def _switching() -> str:
+    """Rules by which the chosen radio button shows its layer."""
+    return "\n".join(
+        f"#layer-{layer.key}:checked ~ .tiles .{layer.key} {{ display: block; }}\n"
+        f"#layer-{layer.key}:checked ~ .legend.{layer.key} {{ display: flex; }}\n"
+        f"#layer-{layer.key}:checked ~ .switch label[for=layer-{layer.key}] "
+        "{ background: var(--accent); color: #fff; }\n"
+        f"#layer-{layer.key}:focus-visible ~ .switch label[for=layer-{layer.key}] "
+        "{ outline: 2px solid var(--accent); outline-offset: 2px; }"
+        for layer in LAYERS
+    )
+
+
+def _badge(verdict: Verdict) -> str:
+    return f'<span class="badge {_CLASSES[verdict]}">{verdict}</span>'
+
+
+def _check_row(check: Check) -> str:
+    return (
+        f'<tr id="check-{html.escape(check.key)}"><td>{_badge(check.verdict)}</td><th>{html.escape(check.title)}</th>'
+        f"<td>{html.escape(check.finding)}</td><td>{html.escape(check.remedy)}</td></tr>"
+    )
+
+
+def _angles(angles: Angles) -> str:
+    notes = "".join(
+        f'<p class="note">{html.escape(e.source.capitalize())}{"" if e.usable else " (not used)"}: '
+        f"{html.escape(e.note)}</p>"
+        for e in angles.sources
+    )
+    if angles.odds is None:
+        return "<p>Not judged: it takes poses, and surfaces that reflect.</p>" + notes
+    rows = []
+    for k, order in enumerate(ORDERS):
+        files = ", ".join(f"{angle}°" for angle in order.files(PAIRINGS[angles.pairing]))
+        p, against = angles.odds.probabilities[k], angles.odds.log_odds[k]
+        mark = ' class="best"' if k == angles.odds.best else ""
+        said = "" if k == angles.odds.best else f"{-against:.1f}"
+        rows.append(
+            f"<tr{mark}><th>{files}</th><td>{html.escape(order.label)}</td><td>{p:.2%}</td>"
+            f'<td><span class="bar"><i style="width:{100 * p:.1f}%"></i></span></td><td>{said}</td></tr>'
+        )
+    return (
+        '<table class="odds"><thead><tr><th>pictures called 0°, 45°, 90°, 135° taken at</th><th>angles count</th>'
+        "<th>probability</th><th></th><th>log-odds to the best</th></tr></thead><tbody>"
+        + "".join(rows)
+        + "</tbody></table>"
+        + f'<p class="note">Zero offset beyond the best order: {angles.odds.offset:+.2f}° ± '
+        f"{angles.odds.offset_error:.2f}°.</p>" + notes
+    )
+
+
+def _legends() -> str:
+    parts = []
+    for layer in LAYERS:
+        bar = ""
+        if layer.ramp is not None:
+            bar = f'<span class="ramp" style="background:linear-gradient(90deg,{colour_gradient(layer.ramp)})"></span>'
+        elif layer.key == "aolp":
+            bar = aolp_wheel()
+        parts.append(f'<p class="legend {layer.key}">{bar}{html.escape(layer.legend)}</p>')
+    return "".join(parts)
+
+
+def aolp_wheel() -> str:
+    """The colours of the AoLP as half a disc, 0 to the right, counter-clockwise, as an SVG drawing."""
+    count, cx, cy, radius = 36, 66.0, 58.0, 40.0
+    angles = (torch.arange(count, dtype=torch.float64) + 0.5) * math.pi / count
+    colours = figures.aolp_to_rgb(angles[None])[0].tolist()
+    wedges = []
+    for k, (r, g, b) in enumerate(colours):
+        (x1, y1), (x2, y2) = (
+            (cx + radius * math.cos(a), cy - radius * math.sin(a))
+            for a in (k * math.pi / count, (k + 1.15 if k < count - 1 else k + 1) * math.pi / count)
+        )
+        wedges.append(f'<path fill="rgb({r},{g},{b})" d="M{cx} {cy}L{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}Z"/>')
+    texts = "".join(
+        f'<text x="{cx + (radius + 12) * math.cos(math.radians(a)):.1f}" '
+        f'y="{cy - (radius + 8) * math.sin(math.radians(a)) + 2:.1f}">{a}°</text>'
+        for a in (0, 45, 90, 135, 180)
+    )
+    drawing = "".join(wedges) + texts
+    return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by colour">{drawing}</svg>'
+
+
+def _tile(uris: dict[str, str], reading: Readings, marked: bool) -> str:
+    name = html.escape(reading.view)
+    captions = "".join(f'<span class="{la.key}">{html.escape(la.caption(reading))}</span>' for la in LAYERS)
+    pictures = "".join(
+        f'<img class="{la.key}" src="{uris[la.key]}" alt="{name}, {html.escape(la.label)}">' for la in LAYERS
+    )
+    kind = "tile marked" if marked else "tile"
+    return f'<figure class="{kind}"><figcaption><b>{name}</b>{captions}</figcaption>{pictures}</figure>'
+
+
+def _figures(readings: tuple[Readings, ...]) -> str:
+    heads = ("view", "99 % under", "saturated", "invalid", "dark", "noise", "pair ratio", "sum error", "DoLP median",
+             "DoLP 99 %", "polarized", "over diffuse limit")  # fmt: skip
+    rows = []
+    for r in readings:
+        ratio = "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}"
+        cells = (f"{r.bright:.3f}", f"{r.saturated:.2%}", f"{r.invalid:.2%}", f"{r.dark:.2%}", f"{r.noise_share:.2%}",
+                 ratio, f"{r.sum_error:.2%}", f"{r.dolp[0]:.3f}", f"{r.dolp[1]:.3f}", f"{r.polarized:.1%}",
+                 f"{r.above_limit:.1%}")  # fmt: skip
+        rows.append(
+            f"<tr><th>{html.escape(r.view)}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        )
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
+    return f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
+
+
+def _facts(found: Inspection) -> str:
+    capture, settings = found.capture, found.settings
+    facts = {
+        "transfer": capture.transfer,
+        "averaged over": f"{capture.factor} x {capture.factor} pixels",
+        "refractive index": f"{found.index:g}",
+        "normals": f"{settings.normals}, {settings.steps} steps where they are trained",
+        "digest of the pictures": capture.digest,
+    }
+    return "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())

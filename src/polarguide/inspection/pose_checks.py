@@ -1,0 +1,99 @@
+"""Checks of the poses: do they explain the pictures, and do they leave gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.view import listed
+from polarguide.inspection.epipolar import epipolar_errors, view_errors
+from polarguide.inspection.pictures import Capture
+from polarguide.inspection.verdict import Check, Verdict
+
+TYPICAL_PX, VIEW_PX = 2.0, 2.0
+"""Median epipolar errors in stored pixels above which a capture, and one view of it, are to be looked at."""
+STANDS_OUT = 2.5
+"""... provided the view is this many times worse than the median view."""
+GAP_DEG = 25.0
+FEW_VIEWS = 20
+
+
+def pose_check(capture: Capture) -> Check:
+    """Whether the poses explain the pictures."""
+    key, title = "poses", "Pose quality"
+    if capture.model is None:
+        return Check(
+            key,
+            title,
+            "n/a",
+            "There are no poses.",
+            "Run polarguide prepare with --poses sfm or --poses PATH.",
+        )
+    missing = tuple(view.name for view in capture.views if view.camera is None)
+    errors = view_errors(epipolar_errors(capture))
+    if len(errors) < 3:
+        return Check(
+            key, title, "n/a" if not missing else "look",
+            f"Too few features match between neighbouring views to judge the poses. {len(missing)} views have none.",
+            "Structure from motion needs texture that stays put." if missing else "", missing,
+            {"views": {}, "without_pose": len(missing)},
+        )  # fmt: skip
+    typical = float(np.median(list(errors.values())))
+    bad = tuple(name for name, e in errors.items() if e > max(VIEW_PX, STANDS_OUT * typical))
+    figures = {"median_px": typical, "views": errors, "without_pose": len(missing)}
+    said = f"Matches lie {typical:.2f} px from their epipolar lines (median view of {len(errors)})."
+    verdict: Verdict = "ok"
+    remedies = []
+    if bad:
+        verdict = "look"
+        said += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
+        remedies.append("Leave these views out, or register them again.")
+    if missing:
+        verdict = "look"
+        said += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
+        remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
+    if typical > TYPICAL_PX:
+        verdict = "wrong" if typical > 2 * TYPICAL_PX else "look"
+        remedies.append("Refine the model (bundle adjustment), and check that it belongs to these pictures.")
+    return Check(key, title, verdict, said, " ".join(remedies), (*bad, *missing), figures)
+
+
+def coverage_check(capture: Capture) -> Check:
+    """Whether the views leave no gap."""
+    key, title = "coverage", "Coverage"
+    cameras = [view.camera for view in capture.posed if view.camera is not None]
+    if len(cameras) < 2:
+        return Check(key, title, "n/a", "Fewer than two views have a pose.")
+    centres = np.stack([camera.centre.numpy() for camera in cameras])
+    axes = np.stack([camera.rotation[2].numpy() for camera in cameras])
+    focus = _nearest_to_axes(centres, axes)
+    seen = centres - focus
+    seen = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    angles = np.degrees(np.arccos(np.clip(seen @ seen.T, -1, 1))) + 360 * np.eye(len(seen))
+    nearest = angles.min(axis=1)
+    spread = float(np.degrees(np.arccos(np.clip(seen @ _unit(seen.mean(axis=0)), -1, 1))).max())
+    figures = {"views": len(seen), "median_step_deg": float(np.median(nearest)),
+               "largest_step_deg": float(nearest.max()), "half_angle_deg": spread}  # fmt: skip
+    said = (
+        f"{len(seen)} views, {np.median(nearest):.0f}° from the next one (median; at most {nearest.max():.0f}°), "
+        f"within {spread:.0f}° of their middle direction."
+    )
+    lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
+    if lonely or len(seen) < FEW_VIEWS:
+        return Check(
+            key, title, "look", said,
+            "Reconstruction is unsure across gaps: add views, neighbours 15 degrees or less apart.", lonely, figures,
+        )  # fmt: skip
+    return Check(key, title, "ok", said, figures=figures)
+
+
+def _nearest_to_axes(centres: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The place nearest to all optical axes (least squares)."""
+    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
+    return np.asarray(
+        np.linalg.lstsq(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0], rcond=None)[0]
+    )
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)

@@ -1,0 +1,107 @@
+"""Normals without polarization: a short training on the photographs, kept in a folder so that it goes on.
+
+The photograph is the mean of the four pictures, which is the same in every order of them; so what comes out may be
+compared with the AoLP without begging the question, and stays good after the order is put right.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from polarguide.capture import Scene, View
+from polarguide.errors import PolarguideError
+from polarguide.inspection.surfaces import Surface
+from polarguide.raster import Backend
+from polarguide.recipes import recipe_named
+from polarguide.shading.render import render
+from polarguide.training.consistency import depth_normals
+from polarguide.training.priors import guide_normals
+from polarguide.training.run import CHECKPOINT, atomic, load_checkpoint, save_checkpoint
+from polarguide.training.state import TrainingState
+from polarguide.training.trainer import StepReport, Trainer, TrainSettings
+from polarguide.vectors import dot, unit
+
+RECIPE = "3dgs-dr:consistent"
+LONGEST = 160
+"""Pixels of the longer side that the training's pictures are averaged down to (by a whole factor)."""
+KEY = "short_run.json"
+SAVE_EVERY = 100
+_OPAQUE = 0.9
+_AGREEMENT = 0.9
+
+
+def photograph_digest(scene: Scene) -> str:
+    """SHA-256 over what the short training sees: photographs, poses, points. No order of the pictures changes it."""
+    digest = hashlib.sha256(scene.points.numpy().tobytes())
+    for view in scene.train_views:
+        camera = view.camera
+        digest.update(view.codes.to(torch.int32).sum(dim=0).numpy().tobytes())
+        digest.update(view.invalid.numpy().tobytes())
+        digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
+        digest.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
+    return digest.hexdigest()
+
+
+def short_run(
+    scene: Scene,
+    folder: Path,
+    *,
+    steps: int,
+    backend: Backend,
+    on_step: Callable[[StepReport], None],
+) -> TrainingState:
+    """Train, or go on, or take what is there.
+
+    Args:
+        scene: at the size to train at.
+        folder: where its state is kept; one of another scene or length is replaced.
+        steps: optimiser steps.
+        backend: device and rasteriser.
+        on_step: called after every step.
+    """
+    recipe = recipe_named(RECIPE)
+    wanted = {"photographs": photograph_digest(scene), "steps": steps, "recipe": RECIPE}
+    state = load_checkpoint(folder, recipe) if _same(folder, wanted) else None
+    trainer = Trainer(scene, recipe, TrainSettings(steps, 0), backend, state)
+    if state is None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+        with atomic(folder / KEY) as path:
+            path.write_text(json.dumps(wanted))
+    try:
+        while trainer.state.step < steps:
+            on_step(trainer.step())
+            if trainer.state.step % SAVE_EVERY == 0 or trainer.state.step == steps:
+                save_checkpoint(folder, trainer.state)
+    except KeyboardInterrupt:
+        save_checkpoint(folder, trainer.state)
+        raise
+    return trainer.state
+
+
+def _same(folder: Path, wanted: dict[str, object]) -> bool:
+    """Whether the folder holds a readable state of the same training."""
+    try:
+        return bool(json.loads((folder / KEY).read_text()) == wanted) and (folder / CHECKPOINT).exists()
+    except (OSError, ValueError):
+        return False
+
+
+@torch.no_grad()
+def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
+    """What the trained Gaussians say of the surface in one view."""
+    result = render(state.rows, view.camera, backend.rasterise, sh_degree=0, normals=True, depth=True)
+    if result.normal is None or result.depth is None:
+        raise PolarguideError(
+            view.name, expected="normals and depth", found="none", remedy="Report this: it is a fault here."
+        )
+    rays = view.camera.rays()
+    normal, known = guide_normals(view.camera.to_camera(result.normal), rays)
+    by_depth = unit(view.camera.to_camera(depth_normals(result.depth, view.camera)))
+    known = known & (result.alpha > _OPAQUE) & (dot(normal, by_depth) > _AGREEMENT)
+    return Surface(view.camera, normal, result.depth, known)

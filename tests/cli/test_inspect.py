@@ -1,0 +1,144 @@
+"""``polarguide inspect`` from the command line: page, record, --fix, and wrong input."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from polarguide.cli.app import run
+from polarguide.inspection.layers import LAYERS
+
+VOID = {"meta", "input", "img", "br"}
+
+
+class Tags(HTMLParser):
+    """Collects tags and checks that they close."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+
+@pytest.fixture(scope="module")
+def unposed(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three views of the demo without poses, one with a name that HTML would read."""
+    root = tmp_path_factory.mktemp("inspect") / "scene <b>&amp;"
+    (root / "polar").mkdir(parents=True)
+    for old, new in (("v000", "v000"), ("v022", "v022"), ("v044", "<i>ü\"'&</i>".replace("/", "\u2215"))):
+        for angle in ("000", "045", "090", "135"):
+            shutil.copy(demo_scene / "polar" / f"{old}_{angle}.png", root / "polar" / f"{new}_{angle}.png")
+    return root
+
+
+def inspected(root: Path, out: Path, *more: str) -> tuple[dict, str]:
+    assert run(["inspect", str(root), "--out", str(out), "--threads", "1", *more]) == 0
+    return (
+        json.loads((out / "inspection.json").read_text("utf-8")),
+        (out / "inspection.html").read_text("utf-8"),
+    )
+
+
+def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record, page = inspected(unposed, tmp_path / "out")
+    verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
+    assert record["schema"] == 1
+    assert record["scene"]["posed_views"] == 0
+    for key in ("poses", "coverage", "angle_order", "handedness", "zero_offset"):
+        assert verdicts.pop(key) == "n/a"
+    assert set(verdicts.values()) == {"ok"}
+    assert record["verdict"] == "ok"
+    assert len(record["views"]) == 3
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.out + printed.err
+    assert "inspection.html" in printed.out
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == []
+    kinds = [tag for tag, _ in tags.found]
+    assert kinds.count("img") == 3 * len(LAYERS)
+    assert "script" not in kinds
+    assert "<i>ü" not in page
+    assert "scene <b>" not in page
+    assert "&lt;i&gt;ü" in page
+    outside = [
+        a
+        for _, attrs in tags.found
+        for k in ("src", "href")
+        if (a := attrs.get(k)) and not a.startswith("data:")
+    ]
+    assert outside == []
+    assert not re.search(r"url\(|@import|https?:", page)
+
+
+def test_a_capture_with_poses_and_points_alone(demo_scene: Path, tmp_path: Path) -> None:
+    record, _ = inspected(demo_scene, tmp_path / "out", "--normals", "points")
+    verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
+    assert verdicts["angle_order"] == "n/a"  # its few small views leave too few sightings
+    assert record["angles"]["sources"][0]["usable"] is False
+    assert verdicts["coverage"] == "ok"
+    assert record["scene"]["posed_views"] == 27
+    assert not (tmp_path / "out" / "short_run").exists()
+
+
+def test_fix_refuses_what_is_not_decided(
+    unposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fixed = tmp_path / "fixed"
+    arguments = [
+        "inspect",
+        str(unposed),
+        "--out",
+        str(tmp_path / "out"),
+        "--fix",
+        str(fixed),
+        "--threads",
+        "1",
+    ]
+    assert run(arguments) == 2
+    assert "geometry does not decide" in capsys.readouterr().err
+    assert not fixed.exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [
+        (["--steps", "0"], "--steps"),
+        (["--downscale", "-1"], "--downscale"),
+        (["--refractive-index", "0.9"], "--refractive-index"),
+        (["--threads", "-1"], "--threads"),
+        (["--downscale", "5000"], "downscale"),
+    ],
+)
+def test_wrong_flags(
+    unposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], named: str
+) -> None:
+    assert run(["inspect", str(unposed), "--out", str(tmp_path / "out"), *more]) == 2
+    assert named in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_wrong_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["inspect", str(tmp_path / "nowhere")]) == 2
+    assert "expected a capture folder" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    (tmp_path / "scene").mkdir()
+    assert run(["inspect", str(tmp_path / "scene"), "--out", str(tmp_path / "file")]) == 2
+    assert "expected a folder to write" in capsys.readouterr().err
+    assert list((tmp_path / "scene").iterdir()) == []

@@ -1,0 +1,116 @@
+"""--fix: pictures under their true names, zeros turned back, sources untouched, nothing half-written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from captures import soft_intensities, write_scene
+
+from polarguide.capture.calibration import Calibration, oriented
+from polarguide.errors import PolarguideError
+from polarguide.inspection import fix
+from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.odds import Odds
+from polarguide.inspection.orders import ORDERS, PAIRINGS
+from polarguide.inspection.pictures import read_capture
+
+
+def decided(order: int, offset: float = 0.0, error: float = 0.1, p: float = 0.99, pairing: int = 0) -> Angles:
+    rest = (1 - p) / 7
+    probabilities = tuple(p if k == order else rest for k in range(8))
+    return Angles(pairing, (), Odds((0.0,) * 8, probabilities, offset, error))
+
+
+def hashes(root: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize(("order", "pairing"), [*((k, 0) for k in range(1, 8)), (3, 1), (6, 2)])
+def test_misnamed_files_get_their_names_back_byte_by_byte(tmp_path, order: int, pairing: int) -> None:
+    right = write_scene(tmp_path / "right")
+    files = ORDERS[order].files(PAIRINGS[pairing])
+    places = [(0, 45, 90, 135).index(angle) for angle in files]
+    root = write_scene(tmp_path / "wrong", lambda values: values[places])
+    (root / "split.json").write_text('{"test": ["v0"]}')
+    (root / "masks").mkdir()
+    (root / "masks" / "v0.png").write_bytes((root / "polar" / "v0_000.png").read_bytes())
+    before = hashes(root)
+    change = fix.correction(read_capture(root), decided(order, pairing=pairing))
+    assert change == Calibration(order=files)
+    said = fix.fix_scene(read_capture(root), change, tmp_path / "fixed")
+    assert "was taken at" in said
+    fixed = hashes(tmp_path / "fixed")
+    assert {k: v for k, v in fixed.items() if k.startswith("polar")} == hashes(right)
+    assert fixed["split.json"] == before["split.json"]
+    assert fixed["masks/v0.png"] == before["masks/v0.png"]
+    assert hashes(root) == before
+    note = json.loads((tmp_path / "fixed" / "scene.json").read_text())["corrections"][0]
+    assert note["order"] == list(files)
+    assert note["change"] == said
+
+
+def test_a_zero_is_turned_back_and_saturated_pixels_become_invalid(tmp_path) -> None:
+    def turned(values: np.ndarray) -> np.ndarray:
+        values = oriented(values.astype(np.float32), Calibration(zero=-10.0))
+        values[0, 5, 7] = 1.0
+        return values
+
+    root = write_scene(tmp_path / "turned", turned)
+    (root / "scene.json").write_text('{"refractive_index": 1.4, "corrections": [{"change": "earlier"}]}')
+    change = fix.correction(read_capture(root), decided(0, offset=10.0))
+    assert change is not None
+    assert change.zero == 10.0
+    fix.fix_scene(read_capture(root), change, tmp_path / "fixed")
+    found = read_capture(tmp_path / "fixed")
+    assert found.refractive_index == 1.4
+    view = found.views[1]
+    assert view.invalid[5, 7]
+    assert view.invalid.sum() == 1
+    expected = soft_intensities(1) / change.peak
+    off = np.abs(view.intensities().numpy() - expected)[:, ~view.invalid.numpy()]
+    assert off.max() < 1e-3
+    corrections = json.loads((tmp_path / "fixed" / "scene.json").read_text())["corrections"]
+    assert corrections[0] == {"change": "earlier"}
+    assert corrections[1]["scale"] == pytest.approx(1 / change.peak)
+
+
+def test_what_is_right_is_left_alone(tmp_path) -> None:
+    capture = read_capture(write_scene(tmp_path / "s"))
+    assert fix.correction(capture, decided(0)) is None
+    assert fix.correction(capture, decided(0, offset=2.0)) is None
+    assert fix.correction(capture, decided(0, offset=8.0, error=4.0)) is None
+
+
+@pytest.mark.parametrize("angles", [decided(2, p=0.9), Angles(0, (), None)])
+def test_what_is_not_decided_is_refused(tmp_path, angles: Angles) -> None:
+    capture = read_capture(write_scene(tmp_path / "s"))
+    with pytest.raises(PolarguideError, match="a decided order of the angles"):
+        fix.correction(capture, angles)
+
+
+def test_a_folder_with_something_in_it_is_refused(tmp_path) -> None:
+    capture = read_capture(write_scene(tmp_path / "s"))
+    before = hashes(tmp_path)
+    with pytest.raises(PolarguideError, match="a new folder"):
+        fix.fix_scene(capture, Calibration(order=(90, 45, 0, 135)), tmp_path / "s")
+    assert hashes(tmp_path) == before
+
+
+def test_a_full_disk_leaves_nothing_behind(tmp_path, monkeypatch) -> None:
+    capture = read_capture(write_scene(tmp_path / "s"))
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(fix, "write_whole", full)
+    with pytest.raises(PolarguideError, match="No space left"):
+        fix.fix_scene(capture, Calibration(order=(90, 45, 0, 135)), tmp_path / "fixed")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["s"]

@@ -1,0 +1,46 @@
+"""The eight orders: what they do to names, pictures and angles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from polarguide import optics
+from polarguide.capture.calibration import Calibration, oriented
+from polarguide.inspection.orders import IDENTITY, ORDERS, PAIRINGS, swaps
+
+
+def test_three_pairings_of_eight_orders_are_all_permutations() -> None:
+    found = {order.files(pairing) for pairing in PAIRINGS for order in ORDERS}
+    assert len(found) == 24
+    assert all(sorted(files) == [0, 45, 90, 135] for files in found)
+    assert IDENTITY.files() == (0, 45, 90, 135)
+
+
+def test_orders_of_the_first_pairing_keep_the_pairs() -> None:
+    for order in ORDERS:
+        i0, i45, i90, i135 = order.files()
+        assert (i0 - i90) % 180 == 90
+        assert (i45 - i135) % 180 == 90
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_an_order_turns_the_aolp_as_its_sense_and_zero_say(order) -> None:
+    rng = np.random.default_rng(0)
+    values = rng.uniform(0.1, 0.9, (4, 5, 6, 3)).astype(np.float32)
+    values[3] = values[0] + values[2] - values[1]  # an ideal capture
+    right = oriented(values, Calibration(order=order.files()))
+    before, after = (optics.aolp(optics.stokes(torch.from_numpy(v).double())) for v in (values, right))
+    expected = order.sense * before + math.radians(order.zero)
+    torch.testing.assert_close(torch.cos(2 * after), torch.cos(2 * expected), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.sin(2 * after), torch.sin(2 * expected), atol=1e-5, rtol=0)
+
+
+def test_swaps_in_words() -> None:
+    assert swaps((0, 45, 90, 135)) == "nothing"
+    assert swaps((90, 45, 0, 135)) == (
+        "the picture called 0° was taken at 90°, the picture called 90° was taken at 0°"
+    )

@@ -1,0 +1,115 @@
+"""Each fault of the pictures is flagged by its own check and by no other; a sound capture is not flagged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from captures import encode, gained, one_view, write_scene
+
+from polarguide.inspection.orders import PAIRINGS
+from polarguide.inspection.picture_checks import pairing_of, picture_checks
+from polarguide.inspection.pictures import read_capture
+from polarguide.inspection.readings import read_view_figures
+from polarguide.inspection.verdict import Check
+
+
+def checked(root: Path) -> dict[str, Check]:
+    capture = read_capture(root)
+    readings = [read_view_figures(view, 1.5) for view in capture.views]
+    return {check.key: check for check in picture_checks(capture, readings, pairing_of(capture))}
+
+
+def flagged(found: dict[str, Check]) -> dict[str, str]:
+    return {key: check.verdict for key, check in found.items() if check.verdict != "ok"}
+
+
+def test_a_sound_capture_is_not_flagged(tmp_path) -> None:
+    found = checked(write_scene(tmp_path / "s"))
+    assert flagged(found) == {}
+    assert all(check.remedy == "" for check in found.values())
+    assert abs(found["exposure"].figures["pair_ratio"] - 1) < 1e-3
+    assert abs(found["encoding"].figures["curvature"]) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (encode, {"encoding": "wrong"}),
+        (lambda v: v**1.6, {"encoding": "wrong"}),
+        (gained(1.05, 1, 1, 1), {"exposure": "look"}),
+        (gained(1, 1.05, 1, 1), {"exposure": "look"}),
+        (gained(1, 1, 1.05, 1), {"exposure": "look"}),
+        (gained(1, 1, 1, 1.05), {"exposure": "look"}),
+        (gained(1.008, 1, 1, 1), {}),
+        (gained(1.13, 1, 1, 1), {"exposure": "wrong", "pair_sums": "wrong"}),
+    ],
+)
+def test_a_fault_is_flagged_by_its_check(tmp_path, change, expected) -> None:
+    found = checked(write_scene(tmp_path / "s", change))
+    got = flagged(found)
+    for key, verdict in expected.items():
+        assert got.get(key) == verdict, found[key].finding
+        assert found[key].remedy
+    others = got.keys() - expected.keys()
+    # A gamma also disturbs the sums a little; nothing else may be called wrong for it.
+    assert all(got[key] != "wrong" for key in others), got
+    if all(key == "exposure" for key in expected):
+        assert not others
+
+
+def test_dark_and_unscaled_files_are_flagged(tmp_path) -> None:
+    found = checked(write_scene(tmp_path / "s", lambda v: v * 0.004))
+    assert found["noise"].verdict == "wrong"
+    assert "were not scaled" in found["saturation"].remedy
+
+
+def test_saturation_is_flagged_with_its_views(tmp_path) -> None:
+    root = write_scene(tmp_path / "s", lambda v: v * 0.9)
+    one_view(root, lambda v: v * 2.2)
+    check = checked(root)["saturation"]
+    assert check.verdict == "look"
+    assert check.views == ("v1",)
+    assert checked(write_scene(tmp_path / "t", lambda v: v * 4))["saturation"].verdict == "wrong"
+
+
+def test_noise_is_flagged(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    found = checked(write_scene(tmp_path / "s", lambda v: v + rng.normal(0, 0.05, v.shape)))
+    assert found["noise"].verdict == "look"
+    assert found["noise"].figures["noise_share"] == pytest.approx(0.05 / np.sqrt(3) / 0.3, rel=0.35)
+
+
+def test_unpolarized_light_is_flagged_and_its_encoding_not_judged(tmp_path) -> None:
+    found = checked(write_scene(tmp_path / "s", lambda v: v.mean(axis=0, keepdims=True).repeat(4, 0)))
+    assert found["low_dolp"].verdict == "wrong"
+    assert found["encoding"].verdict == "n/a"
+
+
+def test_one_view_with_another_exposure_is_named(tmp_path) -> None:
+    root = write_scene(tmp_path / "s", views=5)
+    one_view(root, gained(1.04, 1, 1, 1))
+    check = checked(root)["exposure"]
+    assert check.verdict == "look"
+    assert check.views == ("v1",)
+
+
+@pytest.mark.parametrize("pairing", [1, 2])
+def test_files_of_another_pairing_are_named(tmp_path, pairing: int) -> None:
+    files = PAIRINGS[pairing]
+    root = write_scene(tmp_path / "s", lambda v: v[[(0, 45, 90, 135).index(angle) for angle in files]])
+    found = checked(root)
+    assert found["pair_sums"].verdict == "wrong"
+    assert found["pair_sums"].figures["pairing"] == list(files)
+    assert found["encoding"].verdict == found["exposure"].verdict == "n/a"
+
+
+def test_light_that_changed_between_the_shots_is_flagged(tmp_path) -> None:
+    root = write_scene(tmp_path / "s")
+    shade = np.ones((4, 1, 80, 1))
+    shade[0, 0, :, 0] += 0.3 * np.linspace(-1, 1, 80)
+    one_view(root, lambda v: v * shade)
+    check = checked(root)["pair_sums"]
+    assert check.verdict == "look"
+    assert check.views == ("v1",)

@@ -1,0 +1,121 @@
+"""Epipolar geometry, one bad view among good ones, and gaps."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from captures import write_scene
+from glossy_ball import camera_at
+
+from polarguide.inspection import pose_checks
+from polarguide.inspection.epipolar import PairError, _fundamental, epipolar_errors, view_errors
+from polarguide.inspection.pictures import Capture, read_capture
+
+
+def test_projections_of_one_point_lie_on_each_others_epipolar_lines() -> None:
+    first, second = camera_at(0.1, 0.3, 0.1), camera_at(0.5, 0.5, -0.2)
+    place = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
+    pixels = []
+    for camera in (first, second):
+        x, y, z = (camera.rotation @ place + camera.translation).tolist()
+        pixels.append(np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, 1.0]))
+    line = _fundamental(first, second) @ pixels[0]
+    line = line / np.hypot(*line[:2])
+    assert abs(line @ pixels[1]) < 1e-9
+    assert abs(line @ (pixels[1] + np.array([*(3 * line[:2]), 0]))) == pytest.approx(3)
+
+
+def pairs(errors: dict[tuple[str, str], float]) -> list[PairError]:
+    return [PairError(a, b, 50, error) for (a, b), error in errors.items()]
+
+
+def ring(bad: int, count: int = 12) -> list[PairError]:
+    """Every view with its two next ones; pairs of one view are bad."""
+    found = {}
+    for i in range(count):
+        for step in (1, 2):
+            j = (i + step) % count
+            found[f"v{i:02d}", f"v{j:02d}"] = 6.0 if bad in (i, j) else 0.5
+    return pairs(found)
+
+
+def test_a_bad_view_does_not_spoil_its_neighbours() -> None:
+    errors = view_errors(ring(bad=4))
+    assert errors["v04"] == 6.0
+    assert all(error == 0.5 for name, error in errors.items() if name != "v04")
+
+
+@pytest.fixture
+def posed(tmp_path) -> Capture:
+    capture = read_capture(write_scene(tmp_path / "s", views=12, names="v{:02d}"))
+    views = tuple(
+        dataclasses.replace(view, camera=camera_at(2 * np.pi * k / 12, 0.3, 0))
+        for k, view in enumerate(capture.views)
+    )
+    return dataclasses.replace(capture, views=views, model=object())  # type: ignore[arg-type]
+
+
+def test_the_bad_view_is_named(posed, monkeypatch) -> None:
+    monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=4))
+    check = pose_checks.pose_check(posed)
+    assert check.verdict == "look"
+    assert check.views == ("v04",)
+    assert "v04 (6.0 px)" in check.finding
+    monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=-1))
+    assert pose_checks.pose_check(posed).verdict == "ok"
+    everywhere = [dataclasses.replace(pair, error=5.0) for pair in ring(bad=-1)]
+    monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: everywhere)
+    assert pose_checks.pose_check(posed).verdict == "wrong"
+
+
+def test_views_without_a_pose_are_named(posed, monkeypatch) -> None:
+    monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=-1))
+    views = (dataclasses.replace(posed.views[0], camera=None), *posed.views[1:])
+    check = pose_checks.pose_check(dataclasses.replace(posed, views=views))
+    assert check.verdict == "look"
+    assert check.views == ("v00",)
+
+
+def test_pictures_that_share_nothing_are_not_judged(posed) -> None:
+    assert pose_checks.pose_check(posed).verdict == "n/a"
+
+
+def test_without_a_model_there_is_nothing_to_judge(tmp_path) -> None:
+    capture = read_capture(write_scene(tmp_path / "s"))
+    assert pose_checks.pose_check(capture).verdict == "n/a"
+    assert pose_checks.coverage_check(capture).verdict == "n/a"
+
+
+def test_gaps_and_few_views_are_named(posed, monkeypatch) -> None:
+    check = pose_checks.coverage_check(posed)
+    assert check.verdict == "look"  # thirty degrees apart
+    assert len(check.views) == 12
+    near = tuple(
+        dataclasses.replace(view, camera=camera_at(0.2 * k, 0.3, 0)) for k, view in enumerate(posed.views)
+    )
+    monkeypatch.setattr(pose_checks, "FEW_VIEWS", 5)
+    assert pose_checks.coverage_check(dataclasses.replace(posed, views=near)).verdict == "ok"
+    far = (*near[:-1], dataclasses.replace(near[-1], camera=camera_at(3.6, 0.3, 0)))
+    check = pose_checks.coverage_check(dataclasses.replace(posed, views=far))
+    assert (check.verdict, check.views) == ("look", ("v11",))
+
+
+def test_a_turned_camera_of_the_demo_stands_out(demo_scene) -> None:
+    capture = read_capture(demo_scene)
+    errors = view_errors(epipolar_errors(capture))
+    name = min(errors, key=lambda view: errors[view])
+    angle = 0.04
+    turn = torch.tensor([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    views = []
+    for view in capture.views:
+        camera = view.camera
+        if view.name == name and camera is not None:
+            camera = dataclasses.replace(
+                camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation
+            )
+        views.append(dataclasses.replace(view, camera=camera))
+    after = view_errors(epipolar_errors(dataclasses.replace(capture, views=tuple(views))))
+    assert name not in after or after[name] > 2.5 * errors[name]
