@@ -97,7 +97,8 @@ def open_run(folder: Path, *, device: DeviceName = "auto", scene: Scene | None =
     """Open a run folder and the scene it was trained on, unless that is at hand already."""
     configuration = RunConfiguration.load(folder)
     recipe = recipe_named(configuration.recipe)
-    state = load_checkpoint(folder, recipe)
+    backend = choose_backend(device, say=console.print)
+    state = load_checkpoint(folder, recipe, backend.device)
     if scene is None:
         transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
         scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
@@ -110,7 +111,7 @@ def open_run(folder: Path, *, device: DeviceName = "auto", scene: Scene | None =
             f"[yellow]warning:[/] {folder} was trained with other values of the recipe {recipe.name} than this "
             "version has; its pictures are shaded with this version's."
         )
-    return OpenRun(folder, configuration, scene, recipe, state, choose_backend(device))
+    return OpenRun(folder, configuration, scene, recipe, state, backend)
 
 
 def select_views(scene: Scene, choice: str) -> tuple[View, ...]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
+import torch
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
@@ -18,6 +19,7 @@ from polarguide.errors import PolarguideError
 from polarguide.export import write_run_ply
 from polarguide.raster import DeviceName, choose_backend
 from polarguide.recipes import recipe_named
+from polarguide.training.losses import refuse_diverged
 from polarguide.training.run import (
     CHECKPOINT,
     CONFIGURATION,
@@ -76,7 +78,7 @@ def train(
     settings = checked_settings(steps, seed, refractive_index)
     chosen = recipe_named(recipe)
     _check_out(out, resume)
-    backend = choose_backend(device)
+    backend = choose_backend(device, say=console.print)
     loaded = read_scene(scene, downscale=downscale, transfer=transfer)
     configuration = RunConfiguration(
         scene=str(scene.resolve()),
@@ -91,7 +93,7 @@ def train(
     state = None
     if resume:
         _check_same(RunConfiguration.load(out), configuration, out)
-        state = load_checkpoint(out, chosen) if (out / CHECKPOINT).exists() else None
+        state = load_checkpoint(out, chosen, backend.device) if (out / CHECKPOINT).exists() else None
     out.mkdir(parents=True, exist_ok=True)
     configuration.save(out)
     trainer = Trainer(loaded, chosen, settings, backend, state)
@@ -187,7 +189,9 @@ def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int) -> None:
                 meter.show(trainer.step())
                 if trainer.state.step % checkpoint_every == 0:
                     with stopwatch.paused():
+                        meter.read()
                         save_checkpoint(out, trainer.state)
+            meter.read()
         save_checkpoint(out, trainer.state)
         if interrupt.asked:
             console.print(
@@ -211,34 +215,55 @@ def _progress() -> Progress:
 
 
 class _Meter:
-    """Smooths what the steps report, shows it, and writes every tenth into the log."""
+    """Smooths what the steps report, shows it, and writes every tenth into the log.
+
+    Reports are looked at ten at a time: on a GPU, looking waits for it.
+    """
 
     def __init__(self, progress: Progress, task: TaskID, log: RunLog, stopwatch: Stopwatch) -> None:
         self._progress, self._task, self._log, self._stopwatch = progress, task, log, stopwatch
         self._loss = self._psnr = math.nan
         self._began, self._first = time.perf_counter(), -1
+        self._waiting: list[StepReport] = []
 
     def show(self, report: StepReport) -> None:
         """Take one step's report."""
         if self._first < 0:
             self._first = report.step
-        keep = 0.98
-        self._loss = report.loss if math.isnan(self._loss) else keep * self._loss + (1 - keep) * report.loss
-        self._psnr = report.psnr if math.isnan(self._psnr) else keep * self._psnr + (1 - keep) * report.psnr
-        rate = (report.step + 1 - self._first) / max(1e-9, time.perf_counter() - self._began)
-        note = (
-            f"{report.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  "
-            f"{report.gaussians:,} Gaussians  {rate:.1f} it/s"
-        )
-        self._progress.update(self._task, completed=report.step + 1, note=note)
+        self._waiting.append(report)
         if (report.step + 1) % LOG_EVERY == 0:
+            loss, psnr = self.read()
             seconds, alone = self._stopwatch.read()
             self._log.append(
                 step=report.step,
                 stage=report.stage,
-                loss=round(report.loss, 6),
-                psnr=round(report.psnr, 3),
+                loss=round(loss, 6),
+                psnr=round(psnr, 3),
                 gaussians=report.gaussians,
                 seconds=round(seconds, 3),
                 alone=alone,
             )
+
+    def read(self) -> tuple[float, float]:
+        """Look at the reports that wait; loss and PSNR of the last.
+
+        Raises:
+            PolarguideError: a loss that is not finite.
+        """
+        if not self._waiting:
+            return math.nan, math.nan
+        last = self._waiting[-1]
+        measured = torch.stack([report.measured for report in self._waiting]).cpu()
+        self._waiting.clear()
+        refuse_diverged(measured[:, 2])
+        for loss, psnr, _ in measured.tolist():
+            keep = 0.0 if math.isnan(self._loss) else 0.98
+            self._loss = loss if keep == 0 else keep * self._loss + (1 - keep) * loss
+            self._psnr = psnr if keep == 0 else keep * self._psnr + (1 - keep) * psnr
+        rate = (last.step + 1 - self._first) / max(1e-9, time.perf_counter() - self._began)
+        note = (
+            f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  "
+            f"{last.gaussians:,} Gaussians  {rate:.1f} it/s"
+        )
+        self._progress.update(self._task, completed=last.step + 1, note=note)
+        return loss, psnr

@@ -6,6 +6,7 @@ On the CPU in float32 a native kernel computes the loss and its gradient in one 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -36,11 +37,17 @@ class _Clip(torch.autograd.Function):
         return grad.masked_fill(stuck, 0.0)
 
 
+@lru_cache(maxsize=4)
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The Gaussian window, [11], adding up to 1."""
+    offsets = torch.arange(_WINDOW, dtype=dtype, device=device) - _WINDOW // 2
+    window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
+    return window / window.sum()
+
+
 def _blur(planes: Tensor) -> Tensor:
     """Gaussian window over planes [K, H, W], zero beyond the border."""
-    offsets = torch.arange(_WINDOW, dtype=planes.dtype, device=planes.device) - _WINDOW // 2
-    window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
-    window = window / window.sum()
+    window = _window(planes.dtype, planes.device)
     stack = conv2d(planes[:, None], window[None, None, None], padding=(0, _WINDOW // 2))
     return conv2d(stack, window[None, None, :, None], padding=(_WINDOW // 2, 0))[:, 0]
 
