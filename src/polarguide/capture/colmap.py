@@ -8,7 +8,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-import pycolmap
 import torch
 from torch import Tensor
 
@@ -158,6 +157,8 @@ def load_model(folder: Path, kind: str) -> Any:
     Raises:
         PolarguideError: pycolmap refuses it.
     """
+    import pycolmap  # here, so that a machine which only trains on packed scenes can do without
+
     model = pycolmap.Reconstruction()
     try:
         model.read_binary(str(folder)) if kind == ".bin" else model.read_text(str(folder))

@@ -7,11 +7,31 @@ process of two.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
+
+
+class LostRank(Exception):
+    """Another rank does not take part any more."""
+
+
+@contextlib.contextmanager
+def _together() -> Iterator[None]:
+    """Inside, a failed collective raises LostRank; every backend has an exception of its own kind."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise LostRank(str(error)) from error
+
+
+def _gather(into: Tensor, own: Tensor) -> None:
+    """Everybody's ``own`` one after the other; newer versions of torch have a new name for it."""
+    gather = getattr(dist, "all_gather_single", None) or dist.all_gather_into_tensor
+    gather(into, own)
 
 
 class Ranks:
@@ -62,11 +82,13 @@ class SeveralRanks(Ranks):
         part = -(-flat.numel() // self.world)
         padded = torch.cat((flat, flat.new_zeros(part * self.world - flat.numel())))
         received = torch.empty_like(padded)
-        dist.all_to_all_single(received, padded)
+        with _together():
+            dist.all_to_all_single(received, padded)
         total, *others = received.view(self.world, part)
         for other in others:
             total = total + other
-        dist.all_gather_into_tensor(padded, total.contiguous())
+        with _together():
+            _gather(padded, total.contiguous())
         for t, values in zip(
             tensors, padded[: flat.numel()].split([t.numel() for t in tensors]), strict=True
         ):
@@ -80,17 +102,20 @@ class SeveralRanks(Ranks):
         mine = self.slots(len(sums))
         own[: len(mine)] = sums[mine.start : mine.stop]
         gathered = sums.new_empty(self.world * most, *sums.shape[1:])
-        dist.all_gather_into_tensor(gathered, own)
+        with _together():
+            _gather(gathered, own)
         for rank in range(self.world):
             theirs = self.slots(len(sums), rank)
             sums[theirs.start : theirs.stop] = gathered[rank * most : rank * most + len(theirs)]
 
     def agree(self, tensor: Tensor) -> None:
-        dist.broadcast(tensor, 0)
+        with _together():
+            dist.broadcast(tensor, 0)
 
     def any(self, flag: bool) -> bool:
         raised = torch.tensor([int(flag)])
-        dist.all_reduce(raised, dist.ReduceOp.MAX)
+        with _together():
+            dist.all_reduce(raised, dist.ReduceOp.MAX)
         return bool(raised.item())
 
     def wait(self) -> None:
