@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -94,6 +96,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
     timer.daemon = True
     timer.start()
     try:
+        _offer_headers()
         kernels = importlib.import_module("gsplat.cuda._backend")._C
     except Exception as error:  # compilers, loaders and their drivers raise all kinds
         lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
@@ -103,6 +106,22 @@ def load_gsplat(say: Callable[[str], None]) -> None:
         timer.cancel()
     if kernels is None:
         raise _no_kernels("no CUDA toolkit (nvcc)")
+
+
+def _offer_headers() -> None:
+    """Show the compiler the headers of PyTorch's CUDA packages where the toolkit comes without.
+
+    PyTorch's own headers include those of cuBLAS, cuSOLVER and cuSPARSE, which a bare compiler package lacks.
+    """
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    found = importlib.util.find_spec("nvidia")
+    if CUDA_HOME is None or found is None or (Path(CUDA_HOME) / "include" / "cusparse.h").exists():
+        return
+    roots = [Path(root) for root in found.submodule_search_locations or ()]
+    folders = sorted({str(header.parent) for root in roots for header in root.glob("*/include/*.h")})
+    known = os.environ.get("CPATH", "").split(os.pathsep)
+    os.environ["CPATH"] = os.pathsep.join(dict.fromkeys([*filter(None, known), *folders]))
 
 
 def _no_kernels(found: str) -> PolarguideError:
