@@ -78,9 +78,13 @@ class OpenRun:
         """How its layers combine."""
         return self.recipe.shading(self.configuration.settings.refractive_index)
 
-    @torch.no_grad()
     def render(self, view: View, *, normals: bool = True, depth: bool = False) -> RenderResult:
-        """All layers of a view; ``normals`` where the recipe can do without them, and ``depth``, on request."""
+        """All layers of a view, on the CPU; ``normals`` where the recipe can do without, and ``depth``, on request."""
+        return self.draw(view, normals=normals, depth=depth).to("cpu")
+
+    @torch.no_grad()
+    def draw(self, view: View, *, normals: bool = True, depth: bool = False) -> RenderResult:
+        """``render``, left on the backend's device, which may not be done with it yet."""
         environment = self.state.environment
         return render(
             self.state.rows,

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
 import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
-import torch
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from polarguide.cli.common import Transfer, console, read_scene, use_threads
 from polarguide.cli.company import backend_of, company
+from polarguide.cli.meter import LOG_EVERY, Meter, progress_bar
 from polarguide.errors import PolarguideError
 from polarguide.export import write_run_ply
 from polarguide.raster import DeviceName
 from polarguide.recipes import recipe_named
-from polarguide.training.losses import refuse_diverged
 from polarguide.training.ranks import Ranks
 from polarguide.training.run import (
     CHECKPOINT,
@@ -34,9 +30,7 @@ from polarguide.training.run import (
     save_checkpoint,
 )
 from polarguide.training.stopwatch import Stopwatch
-from polarguide.training.trainer import StepReport, Trainer, TrainSettings
-
-LOG_EVERY = 10
+from polarguide.training.trainer import Trainer, TrainSettings
 
 
 def train(
@@ -212,9 +206,9 @@ def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int) -> None:
     stopwatch = Stopwatch(*log.elapsed()) if log else Stopwatch()
     interrupt = _Interrupt()
     try:
-        with _progress() as progress:
+        with progress_bar() as progress:
             task = progress.add_task("", total=trainer.settings.steps, completed=trainer.state.step, note="")
-            meter = _Meter(progress, task, log, stopwatch)
+            meter = Meter(progress, task, log, stopwatch)
             stopped = False
             while trainer.state.step < trainer.settings.steps and not stopped:
                 meter.show(trainer.step())
@@ -244,70 +238,3 @@ def _save(trainer: Trainer, out: Path) -> None:
     trainer.exchange_statistics()
     if trainer.ranks.rank == 0:
         save_checkpoint(out, trainer.state)
-
-
-def _progress() -> Progress:
-    return Progress(
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[note]}"),
-        TimeRemainingColumn(),
-        console=console,
-    )
-
-
-class _Meter:
-    """Smooths what the steps report, shows it, and writes every tenth into the log.
-
-    Reports are looked at ten at a time: on a GPU, looking waits for it.
-    """
-
-    def __init__(self, progress: Progress, task: TaskID, log: RunLog | None, stopwatch: Stopwatch) -> None:
-        self._progress, self._task, self._log, self._stopwatch = progress, task, log, stopwatch
-        self._loss = self._psnr = math.nan
-        self._began, self._first = time.perf_counter(), -1
-        self._waiting: list[StepReport] = []
-
-    def show(self, report: StepReport) -> None:
-        """Take one step's report."""
-        if self._first < 0:
-            self._first = report.step
-        self._waiting.append(report)
-        if (report.step + 1) % LOG_EVERY == 0:
-            loss, psnr = self.read()
-            if self._log is None:
-                return
-            seconds, alone = self._stopwatch.read()
-            self._log.append(
-                step=report.step,
-                stage=report.stage,
-                loss=round(loss, 6),
-                psnr=round(psnr, 3),
-                gaussians=report.gaussians,
-                seconds=round(seconds, 3),
-                alone=alone,
-            )
-
-    def read(self) -> tuple[float, float]:
-        """Look at the reports that wait; loss and PSNR of the last.
-
-        Raises:
-            PolarguideError: a loss that is not finite.
-        """
-        if not self._waiting:
-            return math.nan, math.nan
-        last = self._waiting[-1]
-        measured = torch.stack([report.measured for report in self._waiting]).cpu()
-        self._waiting.clear()
-        refuse_diverged(measured[:, 2])
-        for loss, psnr, _ in measured.tolist():
-            keep = 0.0 if math.isnan(self._loss) else 0.98
-            self._loss = loss if keep == 0 else keep * self._loss + (1 - keep) * loss
-            self._psnr = psnr if keep == 0 else keep * self._psnr + (1 - keep) * psnr
-        rate = (last.step + 1 - self._first) / max(1e-9, time.perf_counter() - self._began)
-        note = (
-            f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  "
-            f"{last.gaussians:,} Gaussians  {rate:.1f} it/s"
-        )
-        self._progress.update(self._task, completed=last.step + 1, note=note)
-        return loss, psnr
