@@ -176,7 +176,7 @@ def run_part(part: str, arguments: argparse.Namespace, environment: dict[str, st
 
 def run_tests(arguments: argparse.Namespace, environment: dict[str, str]) -> bool:
     """The tests that need a GPU. Without one they are skipped, and say so."""
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "default"]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-W", "default"]
     # By file, since the other tests import what a bare machine does not have.
     command += sorted(map(str, (ROOT / "tests").glob("*/test_*_on_gpu.py")))
     done = subprocess.run(
