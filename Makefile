@@ -1,6 +1,8 @@
 # make demo    train, score and render the demo scene that ships with the package
 # make test    linter, formatter, types and tests, on the package as it is installed
 # make cross-check    compile the kernels for aarch64 (needs aarch64-linux-gnu-g++ and cmake)
+# make gpu-check    build, test and measure on a machine with a GPU; in parts: call it again until it says complete
+# make gpu-pack SCENE=.../spheres    what gpu-check needs on a machine without a network, into gpu-pack/
 # make clean   remove what these commands made
 #
 # Needs Python 3.10 or newer with its venv module, a C++17 compiler and make; everything else is fetched from PyPI.
@@ -15,7 +17,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
 
-.PHONY: demo test cross-check clean
+.PHONY: demo test cross-check gpu-check gpu-pack clean
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
 
@@ -30,6 +32,13 @@ test: $(VENV)/.installed-test
 
 cross-check: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/native/test_cross_compilation.py
+
+# With the interpreter that has torch, not one of our own: nothing is fetched there.
+gpu-check:
+	$(PYTHON) benchmarks/gpu/check.py $(GPU_CHECK)
+
+gpu-pack: $(VENV)/.installed
+	$(BIN)/python benchmarks/gpu/pack.py $(if $(SCENE),--scene $(SCENE)) $(GPU_PACK)
 
 $(VENV)/.installed: $(SOURCES) | $(VENV)/pyvenv.cfg
 	@echo "Building and installing polarguide into $(VENV); the first time takes minutes."

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,6 +31,18 @@ def _pixel_rays(
     )
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     return unit(torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1))
+
+
+class Pose(NamedTuple):
+    """A pose on one device, in one dtype.
+
+    Attributes:
+        rotation: world-to-camera, [3, 3]. translation: world-to-camera, [3]. centre: of the camera in the world, [3].
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    centre: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +70,14 @@ class Camera:
         """Camera centre in the world, [3] float64."""
         return -self.rotation.T @ self.translation
 
+    def pose(self, dtype: torch.dtype, device: torch.device) -> Pose:
+        """The pose on a device, not to be written to. It is kept, so that a second rendering copies nothing there."""
+        poses: dict[tuple[torch.dtype, torch.device], Pose] = self.__dict__.setdefault("_poses", {})
+        key = (dtype, device)
+        if key not in poses:
+            poses[key] = Pose(*(t.to(device, dtype) for t in (self.rotation, self.translation, self.centre)))
+        return poses[key]
+
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
         """Unit rays through the pixel centres in camera axes, [height, width, 3]; not to be written to."""
         size, focal, centre = (self.width, self.height), (self.fx, self.fy), (self.cx, self.cy)
@@ -64,15 +85,15 @@ class Camera:
 
     def world_rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
         """Unit rays through the pixel centres in world axes, [height, width, 3]."""
-        return self.rays(dtype=dtype, device=device) @ self.rotation.to(dtype=dtype, device=device)
+        return self.rays(dtype=dtype, device=device) @ self.pose(dtype, torch.device(device)).rotation
 
     def to_world(self, vectors: Tensor) -> Tensor:
         """Turn direction vectors [..., 3] from camera axes into world axes."""
-        return vectors @ self.rotation.to(dtype=vectors.dtype, device=vectors.device)
+        return vectors @ self.pose(vectors.dtype, vectors.device).rotation
 
     def to_camera(self, vectors: Tensor) -> Tensor:
         """Turn direction vectors [..., 3] from world axes into camera axes."""
-        return vectors @ self.rotation.to(dtype=vectors.dtype, device=vectors.device).T
+        return vectors @ self.pose(vectors.dtype, vectors.device).rotation.T
 
     def downscaled(self, factor: int) -> Camera:
         """The camera of the same view averaged over ``factor`` x ``factor`` pixel boxes (remainders are cut)."""

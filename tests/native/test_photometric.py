@@ -10,7 +10,11 @@ from torch.testing import assert_close
 
 from polarguide import _native
 from polarguide.shading.display import srgb_decode, srgb_encode
-from polarguide.training.photometric import photometric_loss, photometric_loss_reference
+from polarguide.training.photometric import (
+    photometric_loss,
+    photometric_loss_explicit,
+    photometric_loss_reference,
+)
 
 sizes = pytest.mark.parametrize(
     ("height", "width"), [(1, 1), (1, 40), (40, 1), (3, 5), (7, 16), (12, 11), (33, 47), (64, 53)]
@@ -58,6 +62,21 @@ def test_kernel_agrees_with_the_twin(
     )
     assert_close(found[0].double(), exact[0], rtol=1e-5, atol=1e-6)
     assert relative_error(found[1], exact[1]) < 1e-4
+
+
+@sizes
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
+def test_the_written_out_gradient_is_the_twins(
+    height: int, width: int, weighted: bool, ssim_weight: float
+) -> None:
+    """What other devices compute."""
+    prediction, target = (t.double() for t in pictures(height, width))
+    weight = some_weights(height, width).double() if weighted else None
+    found = loss_and_gradient(photometric_loss_explicit, prediction, target, weight, ssim_weight)
+    exact = loss_and_gradient(photometric_loss_reference, prediction, target, weight, ssim_weight)
+    assert_close(found[0], exact[0])
+    assert relative_error(found[1], exact[1]) < 1e-9
 
 
 def test_smooth_pictures_agree_too(simd: str) -> None:

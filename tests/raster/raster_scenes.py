@@ -117,7 +117,8 @@ def outcome(
     generator = torch.Generator().manual_seed(seed)
     to_features = torch.randn(picture.features.shape, generator=generator)
     to_alpha = torch.randn(picture.alpha.shape, generator=generator)
-    loss = (picture.features * to_features.to(dtype)).sum() + (picture.alpha * to_alpha.to(dtype)).sum()
+    loss = (picture.features * to_features.to(picture.features)).sum()
+    loss = loss + (picture.alpha * to_alpha.to(picture.alpha)).sum()
     loss.backward()
     gradients = Gaussians(*(t.grad if t.grad is not None else torch.zeros_like(t) for t in inputs))
     return Outcome(

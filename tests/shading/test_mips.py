@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide.shading.cubemap import cubemap_lookup_reference
-from polarguide.shading.mips import box_mips, mip_lookup
+from polarguide.shading.mips import box_mips, mip_lookup, mip_lookup_at_once
 
 LEVELS = 5  # of resolution 8: 8, 4, 2, 1, and the mean
 
@@ -82,3 +82,25 @@ def test_the_sharpest_level_still_says_what_blurring_would_change() -> None:
 def test_no_directions() -> None:
     levels = box_mips(texture())
     assert mip_lookup(levels, torch.zeros(0, 3).double(), torch.zeros(0).double()).shape == (0, 5)
+
+
+@pytest.mark.parametrize("count", [1, LEVELS])
+def test_all_at_once_is_level_by_level(count: int) -> None:
+    """What devices other than the CPU compute, with its gradients."""
+    rays = directions().requires_grad_()
+    levels = [t.detach().requires_grad_() for t in box_mips(texture())[:count]]
+    level = torch.linspace(-0.5, count + 0.5, len(rays), dtype=torch.float64).requires_grad_()
+    inputs = (*levels, rays, level)
+    weights = torch.randn(len(rays), 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    expected = mip_lookup(levels, rays, level)
+    clamped = level.clamp(0, count - 1)
+    lower = clamped.detach().floor().long().clamp(max=max(0, count - 2))
+    found = mip_lookup_at_once(levels, rays, lower, clamped - lower)
+    assert_close(found, expected)
+    pairs = zip(
+        torch.autograd.grad((found * weights).sum(), inputs),
+        torch.autograd.grad((expected * weights).sum(), inputs),
+        strict=True,
+    )
+    for a, b in pairs:
+        assert_close(a, b)

@@ -12,7 +12,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-import pycolmap
 import torch
 from torch import Tensor
 
@@ -184,6 +183,8 @@ def load_model(folder: Path, kind: str) -> Any:
     Raises:
         PolarguideError: pycolmap refuses it.
     """
+    import pycolmap  # here, so that a machine which only trains on packed scenes can do without
+
     model = pycolmap.Reconstruction()
     check_model_files(folder, kind)
     try:

@@ -64,6 +64,14 @@ class View:
     mask: Tensor | None = None
     truth: GroundTruth | None = None
 
+    def to(self, device: torch.device) -> View:
+        """The view with its pictures and masks on a device; itself where it is there already. Truth stays behind."""
+        if self.codes.device == device:
+            return self
+        codes, invalid, saturated = (t.to(device) for t in (self.codes, self.invalid, self.saturated))
+        mask = None if self.mask is None else self.mask.to(device)
+        return View(self.name, self.camera, codes, invalid, saturated, mask)
+
     def intensities(self) -> Tensor:
         """Linear intensities in [0, 1] at 0, 45, 90, 135 degrees: [4, H, W, 3] float32."""
         return self.codes.to(torch.float32) / FULL_CODE

@@ -78,9 +78,13 @@ class OpenRun:
         """How its layers combine."""
         return self.recipe.shading(self.configuration.settings.refractive_index)
 
-    @torch.no_grad()
     def render(self, view: View, *, normals: bool = True, depth: bool = False) -> RenderResult:
-        """All layers of a view; ``normals`` where the recipe can do without them, and ``depth``, on request."""
+        """All layers of a view, on the CPU; ``normals`` where the recipe can do without, and ``depth``, on request."""
+        return self.draw(view, normals=normals, depth=depth).to("cpu")
+
+    @torch.no_grad()
+    def draw(self, view: View, *, normals: bool = True, depth: bool = False) -> RenderResult:
+        """``render``, left on the backend's device, which may not be done with it yet."""
         environment = self.state.environment
         return render(
             self.state.rows,
@@ -97,7 +101,8 @@ def open_run(folder: Path, *, device: DeviceName = "auto", scene: Scene | None =
     """Open a run folder and the scene it was trained on, unless that is at hand already."""
     configuration = RunConfiguration.load(folder)
     recipe = recipe_named(configuration.recipe)
-    state = load_checkpoint(folder, recipe)
+    backend = choose_backend(device, say=console.print)
+    state = load_checkpoint(folder, recipe, backend.device)
     if scene is None:
         transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
         scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
@@ -110,7 +115,7 @@ def open_run(folder: Path, *, device: DeviceName = "auto", scene: Scene | None =
             f"[yellow]warning:[/] {folder} was trained with other values of the recipe {recipe.name} than this "
             "version has; its pictures are shaded with this version's."
         )
-    return OpenRun(folder, configuration, scene, recipe, state, choose_backend(device))
+    return OpenRun(folder, configuration, scene, recipe, state, backend)
 
 
 def select_views(scene: Scene, choice: str) -> tuple[View, ...]:

@@ -13,6 +13,7 @@ from rich.table import Table
 
 import polarguide
 from polarguide import _native
+from polarguide.capture import View
 from polarguide.cli.common import OpenRun, console, open_run, use_threads
 from polarguide.evaluation import score_view, write_metrics
 from polarguide.evaluation.sources import commit, scoring_digest
@@ -82,7 +83,18 @@ def evaluate_run(opened: OpenRun, *, speed: bool = True) -> dict[str, Any]:
 
 
 def _speed(opened: OpenRun, **layers: bool) -> float | None:
-    return frames_per_second(lambda view: opened.render(view, **layers), opened.scene.test_views)
+    def draw(view: View) -> None:
+        opened.draw(view, **layers)
+        if opened.backend.device.type == "cuda":
+            torch.cuda.synchronize(opened.backend.device)
+
+    return frames_per_second(draw, opened.scene.test_views)
+
+
+def _device(opened: OpenRun) -> str:
+    device = opened.backend.device
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else _native.simd()
+    return f"{device} ({name}, {_native.thread_count()} threads)"
 
 
 def _provenance(opened: OpenRun) -> dict[str, Any]:
@@ -97,7 +109,7 @@ def _provenance(opened: OpenRun) -> dict[str, Any]:
             "torch": torch.__version__,
             "python": platform.python_version(),
         },
-        "device": f"{opened.backend.device} ({_native.simd()}, {_native.thread_count()} threads)",
+        "device": _device(opened),
         "downscale": configuration.downscale,
         "scene_hash": opened.scene.digest,
         "scene": opened.scene.name,

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import json
-import math
 import signal
-import time
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from polarguide.cli.common import Transfer, console, read_scene, use_threads
+from polarguide.cli.company import backend_of, company
+from polarguide.cli.meter import LOG_EVERY, Meter, progress_bar
 from polarguide.errors import PolarguideError
 from polarguide.export import write_run_ply
-from polarguide.raster import DeviceName, choose_backend
+from polarguide.raster import DeviceName
 from polarguide.recipes import recipe_named
+from polarguide.training.ranks import Ranks
 from polarguide.training.run import (
     CHECKPOINT,
     CONFIGURATION,
@@ -29,9 +30,7 @@ from polarguide.training.run import (
     save_checkpoint,
 )
 from polarguide.training.stopwatch import Stopwatch
-from polarguide.training.trainer import StepReport, Trainer, TrainSettings
-
-LOG_EVERY = 10
+from polarguide.training.trainer import Trainer, TrainSettings
 
 
 def train(
@@ -48,11 +47,13 @@ def train(
     device: DeviceName = "auto",
     threads: int = 0,
     checkpoint_every: int = 500,
+    views_per_step: int = 0,
     resume: bool = False,
 ) -> None:
     """Train a recipe on a scene.
 
-    Can be stopped with Ctrl-C at any time: the state is saved, and --resume goes on to the same result.
+    Can be stopped with Ctrl-C at any time: the state is saved, and --resume goes on to the same result. Several
+    processes share the views of each step: torchrun --nproc-per-node N -m polarguide train ...
 
     Args:
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
@@ -69,34 +70,57 @@ def train(
         device: What to compute on.
         threads: Threads to use; 0 takes all cores.
         checkpoint_every: Steps between two checkpoints: a kill loses at most as many.
+        views_per_step: Views whose mean gradient makes a step; 0 takes one for each process (or what the run to resume
+            took). Learning rates grow with its square root; steps are steps, so more views are looked at.
         resume: Go on with the run in --out.
     """
     use_threads(threads)
     check_count("--checkpoint-every", checkpoint_every)
     settings = checked_settings(steps, seed, refractive_index)
     chosen = recipe_named(recipe)
-    _check_out(out, resume)
-    backend = choose_backend(device)
-    loaded = read_scene(scene, downscale=downscale, transfer=transfer)
-    configuration = RunConfiguration(
-        scene=str(scene.resolve()),
-        scene_digest=loaded.digest,
-        recipe=recipe,
-        recipe_data=recipe_data(chosen),
-        settings=settings,
-        downscale=downscale,
-        transfer=transfer,
-        device=str(backend.device),
-    )
-    state = None
-    if resume:
-        _check_same(RunConfiguration.load(out), configuration, out)
-        state = load_checkpoint(out, chosen) if (out / CHECKPOINT).exists() else None
-    out.mkdir(parents=True, exist_ok=True)
-    configuration.save(out)
-    trainer = Trainer(loaded, chosen, settings, backend, state)
-    train_run(trainer, out, checkpoint_every=checkpoint_every)
-    console.print(f"trained: {out}   next: polarguide eval {out}   polarguide render {out}")
+    with company(device, out) as ranks:
+        leads = ranks.rank == 0
+        if leads:
+            _check_out(out, resume)
+        ranks.wait()
+        settings = replace(settings, views_per_step=_views(views_per_step, ranks, out if resume else None))
+        backend = backend_of(ranks, device)
+        loaded = read_scene(scene, downscale=downscale, transfer=transfer)
+        configuration = RunConfiguration(
+            scene=str(scene.resolve()),
+            scene_digest=loaded.digest,
+            recipe=recipe,
+            recipe_data=recipe_data(chosen),
+            settings=settings,
+            downscale=downscale,
+            transfer=transfer,
+            device=str(backend.device),
+        )
+        state = None
+        if resume:
+            _check_same(RunConfiguration.load(out), configuration, out)
+            state = load_checkpoint(out, chosen, backend.device) if (out / CHECKPOINT).exists() else None
+        ranks.wait()
+        if leads:
+            out.mkdir(parents=True, exist_ok=True)
+            configuration.save(out)
+        trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
+        train_run(trainer, out, checkpoint_every=checkpoint_every)
+    if leads:
+        console.print(f"trained: {out}   next: polarguide eval {out}   polarguide render {out}")
+
+
+def _views(asked: int, ranks: Ranks, resumed: Path | None) -> int:
+    """Views a step: as asked, or of the run to resume, or one for each process."""
+    if asked:
+        check_count("--views-per-step", asked)
+    old = RunConfiguration.load(resumed).settings.views_per_step if resumed else 0
+    views = asked or old or ranks.world
+    if views < ranks.world:
+        console.print(
+            f"[yellow]warning:[/] {ranks.world - views} of {ranks.world} processes have no view to look at"
+        )
+    return views
 
 
 def check_count(name: str, value: int) -> None:
@@ -174,71 +198,43 @@ class _Interrupt:
 
 
 def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int) -> None:
-    """Train to the end with progress, checkpoints and a log; then write the PLY."""
-    log = RunLog(out)
-    log.cut(trainer.state.step)
-    stopwatch = Stopwatch(*log.elapsed())
+    """Train to the end with progress, checkpoints and a log; then write the PLY. Rank 0 alone writes."""
+    ranks, leads = trainer.ranks, trainer.ranks.rank == 0
+    log = RunLog(out) if leads else None
+    if log is not None:
+        log.cut(trainer.state.step)
+    stopwatch = Stopwatch(*log.elapsed()) if log else Stopwatch()
     interrupt = _Interrupt()
     try:
-        with _progress() as progress:
+        with progress_bar() as progress:
             task = progress.add_task("", total=trainer.settings.steps, completed=trainer.state.step, note="")
-            meter = _Meter(progress, task, log, stopwatch)
-            while trainer.state.step < trainer.settings.steps and not interrupt.asked:
+            meter = Meter(progress, task, log, stopwatch)
+            stopped = False
+            while trainer.state.step < trainer.settings.steps and not stopped:
                 meter.show(trainer.step())
                 if trainer.state.step % checkpoint_every == 0:
                     with stopwatch.paused():
-                        save_checkpoint(out, trainer.state)
-        save_checkpoint(out, trainer.state)
-        if interrupt.asked:
+                        meter.read()
+                        _save(trainer, out)
+                # Several ranks stop after the same step, so they have to ask each other, which takes time.
+                if ranks.world == 1 or trainer.state.step % LOG_EVERY == 0:
+                    stopped = ranks.any(interrupt.asked)
+            meter.read()
+        _save(trainer, out)
+        if stopped:
             console.print(
                 f"stopped after step {trainer.state.step}; go on with the same command and --resume"
             )
             raise KeyboardInterrupt
     finally:
         interrupt.restore()
-    shading = trainer.recipe.shading(trainer.settings.refractive_index)
-    write_run_ply(out / PLY, trainer.state, shading)
+    if leads:
+        shading = trainer.recipe.shading(trainer.settings.refractive_index)
+        write_run_ply(out / PLY, trainer.state, shading)
 
 
-def _progress() -> Progress:
-    return Progress(
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[note]}"),
-        TimeRemainingColumn(),
-        console=console,
-    )
-
-
-class _Meter:
-    """Smooths what the steps report, shows it, and writes every tenth into the log."""
-
-    def __init__(self, progress: Progress, task: TaskID, log: RunLog, stopwatch: Stopwatch) -> None:
-        self._progress, self._task, self._log, self._stopwatch = progress, task, log, stopwatch
-        self._loss = self._psnr = math.nan
-        self._began, self._first = time.perf_counter(), -1
-
-    def show(self, report: StepReport) -> None:
-        """Take one step's report."""
-        if self._first < 0:
-            self._first = report.step
-        keep = 0.98
-        self._loss = report.loss if math.isnan(self._loss) else keep * self._loss + (1 - keep) * report.loss
-        self._psnr = report.psnr if math.isnan(self._psnr) else keep * self._psnr + (1 - keep) * report.psnr
-        rate = (report.step + 1 - self._first) / max(1e-9, time.perf_counter() - self._began)
-        note = (
-            f"{report.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  "
-            f"{report.gaussians:,} Gaussians  {rate:.1f} it/s"
-        )
-        self._progress.update(self._task, completed=report.step + 1, note=note)
-        if (report.step + 1) % LOG_EVERY == 0:
-            seconds, alone = self._stopwatch.read()
-            self._log.append(
-                step=report.step,
-                stage=report.stage,
-                loss=round(report.loss, 6),
-                psnr=round(report.psnr, 3),
-                gaussians=report.gaussians,
-                seconds=round(seconds, 3),
-                alone=alone,
-            )
+def _save(trainer: Trainer, out: Path) -> None:
+    """A checkpoint of what all ranks have seen, by rank 0."""
+    trainer.exchange_statistics()
+    if trainer.ranks.rank == 0:
+        save_checkpoint(out, trainer.state)

@@ -14,7 +14,7 @@ MINIMUM_SECONDS = 1.5
 
 
 def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> float | None:
-    """Median over views of 1 / seconds for ``draw``, after one warm-up of each; the CPU path is synchronous.
+    """Median over views of 1 / seconds for ``draw``, after one warm-up of each; nothing is waited for but the call.
 
     Args:
         draw: renders one view and returns when it is done.

@@ -29,7 +29,7 @@ def shown_colours(state: TrainingState, shading: ShadingModel, directions: Tenso
     rows = state.rows
     columns = []
     normals = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], torch.zeros(3))
-    for direction in directions:
+    for direction in directions.to(rows["means"].device):
         # A camera far behind each Gaussian sees it along one direction.
         rays = direction.expand(len(rows), 3)
         if state.environment is None:
@@ -45,15 +45,20 @@ def shown_colours(state: TrainingState, shading: ShadingModel, directions: Tenso
 def write_run_ply(path: Path, state: TrainingState, shading: ShadingModel) -> None:
     """Write the trained Gaussians; see the module's text."""
     rows = state.rows
-    dc, rest = refit_sh_to_display(lambda directions: shown_colours(state, shading, directions), len(rows))
+    dc, rest = refit_sh_to_display(
+        lambda directions: shown_colours(state, shading, directions).cpu(), len(rows)
+    )
+    plain = {
+        name: rows[name].detach().cpu() for name in ("means", "log_scales", "quaternions", "opacity_logits")
+    }
     with atomic(path) as temporary:
         write_ply(
             temporary,
-            means=rows["means"].detach(),
-            log_scales=rows["log_scales"].detach(),
-            quaternions=torch.nn.functional.normalize(rows["quaternions"].detach(), dim=-1),
-            opacity_logits=rows["opacity_logits"].detach(),
+            means=plain["means"],
+            log_scales=plain["log_scales"],
+            quaternions=torch.nn.functional.normalize(plain["quaternions"], dim=-1),
+            opacity_logits=plain["opacity_logits"],
             sh_dc=dc,
             sh_rest=rest,
-            extra={name: field.detach() for name, field in shading.fields(rows).items()},
+            extra={name: field.detach().cpu() for name, field in shading.fields(rows).items()},
         )

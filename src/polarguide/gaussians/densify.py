@@ -37,26 +37,57 @@ class Densification:
 
 
 class DensityStatistics:
-    """Sums of the screen-space gradient norms over the steps in which each Gaussian was seen."""
+    """Sums of the screen-space gradient norms over the pictures in which each Gaussian was seen.
 
-    def __init__(self, count: int) -> None:
-        self.gradient = torch.zeros(count)
-        self.seen = torch.zeros(count)
+    With several views a step, the first view of each step adds to the first of several sums, and so on; they are
+    added up in this order when they are asked for. So processes that share a step's views need to exchange sums only
+    then, and the result does not depend on how many processes there were.
 
-    def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
+    Args:
+        count: N, of the Gaussians. slots: S, views a step. device: of the Gaussians.
+
+    Attributes:
+        gradient, seen: sums, [N], or [S, N] for more than one slot.
+    """
+
+    def __init__(self, count: int, slots: int = 1, device: torch.device | None = None) -> None:
+        self._slots, self._device = slots, device
+        self.clear(count)
+
+    @classmethod
+    def of(cls, gradient: Tensor, seen: Tensor) -> DensityStatistics:
+        """From sums as of the attributes."""
+        statistics = cls(0, gradient.shape[0] if gradient.ndim == 2 else 1, gradient.device)
+        statistics.gradient, statistics.seen = gradient, seen
+        return statistics
+
+    def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int, slot: int = 0) -> None:
         """Count one picture. screen_gradient: [N, 2] per pixel; it is taken to units of half a picture."""
-        half_picture = torch.tensor([width / 2, height / 2])
-        self.gradient += (screen_gradient * half_picture).norm(dim=1)
-        self.seen += (radii > 0).to(self.seen)
+        x, y = screen_gradient.unbind(1)
+        norm = torch.stack((x * (width / 2), y * (height / 2)), dim=1).norm(dim=1)
+        gradient, seen = (t[slot] if t.ndim == 2 else t for t in (self.gradient, self.seen))
+        gradient += norm
+        seen += (radii > 0).to(seen)
 
     def mean(self) -> Tensor:
         """Mean gradient norm, [N]; 0 where never seen."""
-        return self.gradient / self.seen.clamp(min=1)
+        gradient, seen = (_in_order(t) for t in (self.gradient, self.seen))
+        return gradient / seen.clamp(min=1)
 
     def clear(self, count: int) -> None:
         """Start again with ``count`` Gaussians."""
-        self.gradient = torch.zeros(count)
-        self.seen = torch.zeros(count)
+        shape = (count,) if self._slots == 1 else (self._slots, count)
+        self.gradient, self.seen = (torch.zeros(shape, device=self._device) for _ in range(2))
+
+
+def _in_order(sums: Tensor) -> Tensor:
+    """Sums [S, N] added up from the first on; [N] as they are."""
+    if sums.ndim == 1:
+        return sums
+    total = sums[0]
+    for further in sums[1:]:
+        total = total + further
+    return total
 
 
 @torch.no_grad()
@@ -85,7 +116,7 @@ def densify(
     wide = rows["log_scales"].exp().amax(dim=1) > settings.dense_share * extent
     room = max(0, limit - len(rows))
     if int(pulled.sum()) > room:
-        strongest = statistics.mean().argsort(descending=True)[:room]
+        strongest = statistics.mean().argsort(descending=True, stable=True)[:room]
         pulled = torch.zeros_like(pulled)
         pulled[strongest] = True
     clone, split = pulled & ~wide, pulled & wide
@@ -93,14 +124,14 @@ def densify(
     clones = {name: rows[name].detach()[clone] for name in rows.names}
     rows.append({name: torch.cat((clones[name], children[name])) for name in rows.names})
     added = len(rows) - len(split)
-    rows.keep(torch.cat((~split, torch.ones(added, dtype=torch.bool))))
+    rows.keep(torch.cat((~split, split.new_ones(added))))
     opacity = torch.sigmoid(rows["opacity_logits"])
     doomed = opacity < settings.minimum_opacity
     if empty is not None:
         doomed |= empty.holds(rows["means"].detach())
     if prune_large:
         distance = (rows["means"] - middle).norm(dim=1)
-        allowed = settings.maximum_scale_share * torch.maximum(distance, torch.tensor(extent))
+        allowed = settings.maximum_scale_share * distance.clamp(min=extent)
         doomed |= rows["log_scales"].exp().amax(dim=1) > allowed
     if bool(doomed.all()):
         doomed[opacity.argmax()] = False
@@ -111,7 +142,9 @@ def densify(
 def _children(rows: GaussianRows, split: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
     """Two children for each split Gaussian: drawn from it, 1.6 times smaller."""
     values = {name: rows[name].detach()[split].repeat(2, *[1] * (rows[name].ndim - 1)) for name in rows.names}
-    offsets = torch.randn(values["means"].shape, generator=generator) * values["log_scales"].exp()
+    # Drawn on the CPU, so that every device gets the same children.
+    drawn = torch.randn(values["means"].shape, generator=generator).to(values["means"].device)
+    offsets = drawn * values["log_scales"].exp()
     rotations = quaternions_to_rotations(values["quaternions"])
     values["means"] = values["means"] + (rotations @ offsets[..., None])[..., 0]
     values["log_scales"] = values["log_scales"] - torch.log(torch.tensor(1.6))

@@ -30,6 +30,10 @@ class FreeSpace:
     centres: Tensor
     radii: Tensor
 
+    def to(self, device: torch.device) -> FreeSpace:
+        """The same on a device."""
+        return FreeSpace(self.centres.to(device), self.radii.to(device))
+
     def holds(self, means: Tensor) -> Tensor:
         """Which of the positions [N, 3] lie in it, [N] bool."""
         return (torch.cdist(means, self.centres) < self.radii).any(dim=1)

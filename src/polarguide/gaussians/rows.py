@@ -72,6 +72,15 @@ class GaussianRows:
         """Detached copies of all rows."""
         return {name: t.detach().clone() for name, t in self._tensors.items()}
 
+    def trained(self) -> list[Tensor]:
+        """The tensors that are trained, in the order of their rates."""
+        return [group["params"][0] for group in self._optimiser.param_groups]
+
+    def set_betas(self, betas: tuple[float, float]) -> None:
+        """Set the decay of Adam's moments; torch's default otherwise."""
+        for group in self._optimiser.param_groups:
+            group["betas"] = betas
+
     def set_rate(self, name: str, rate: float) -> None:
         """Set the learning rate of one tensor."""
         for group in self._optimiser.param_groups:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import torch
 
 from polarguide.errors import PolarguideError
 from polarguide.raster.cpu import rasterise_cpu
+from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterise_cuda
 from polarguide.raster.interface import Rasterise
 
 DeviceName = Literal["auto", "cpu", "cuda"]
@@ -20,17 +22,32 @@ class Backend(NamedTuple):
     rasterise: Rasterise
 
 
-def choose_backend(name: DeviceName) -> Backend:
-    """The backend for ``--device``: ``auto`` takes the best one that this version has for this machine.
+def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = print) -> Backend:
+    """The backend for ``--device``: ``auto`` takes the GPU where there is one and gsplat is installed.
+
+    Args:
+        name: as given.
+        local_rank: which of the machine's GPUs, for the processes of one training.
+        say: takes lines for the user, such as that kernels are being compiled.
 
     Raises:
-        PolarguideError: CUDA was asked for, which this version does not drive yet.
+        PolarguideError: CUDA was asked for and there is no GPU, or gsplat or its kernels cannot be had.
     """
-    if name == "cuda":
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return Backend(torch.device("cpu"), rasterise_cpu)
+    if name == "auto" and not has_gsplat():
+        say("there is a GPU, but the package gsplat is not installed: computing on the CPU")
+        return Backend(torch.device("cpu"), rasterise_cpu)
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if local_rank >= count:
+        built = torch.version.cuda or "none"
         raise PolarguideError(
             "--device cuda",
-            expected="a backend of this version",
-            found="that the CUDA rasteriser is not part of it yet",
-            remedy="Use --device cpu (or auto).",
+            expected="a GPU for each process",
+            found=f"{count} that PyTorch {torch.__version__} can use (its CUDA: {built})",
+            remedy="Install a PyTorch with CUDA and a driver for it, start fewer processes, or use --device cpu.",
         )
-    return Backend(torch.device("cpu"), rasterise_cpu)
+    device = torch.device("cuda", local_rank)
+    torch.cuda.set_device(device)
+    load_gsplat(say)
+    return Backend(device, rasterise_cuda)

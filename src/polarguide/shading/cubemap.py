@@ -101,35 +101,66 @@ def _ring(resolution: int, device: torch.device) -> _Ring:
     return _Ring(source.flatten().to(device), corners.to(device), around.to(device))
 
 
-def _face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+@lru_cache(maxsize=4)
+def _face_table(device: torch.device) -> Tensor:
+    """``_FACES`` on a device, [6, 6]."""
+    return torch.tensor(_FACES, device=device)
+
+
+def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Face [P], and s and t [P] in [-1, 1], of directions [P, 3]; ties go to the earlier axis, zero to +x's centre."""
     x, y, z = directions.abs().unbind(-1)
     axis = torch.where((x >= y) & (x >= z), 0, torch.where(y >= z, 1, 2))
     major = directions.gather(-1, axis[:, None])[:, 0]
     face = 2 * axis + (major < 0)
-    table = torch.tensor(_FACES, device=directions.device)[face]
+    table = _face_table(directions.device)[face]
     inverse = 1 / major.abs().masked_fill(major.abs() <= 1e-20, torch.inf)
     s = table[:, 3] * directions.gather(-1, table[:, 2:3])[:, 0] * inverse
     t = table[:, 5] * directions.gather(-1, table[:, 4:5])[:, 0] * inverse
     return face, s, t
 
 
-def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
-    """The slow twin of ``cubemap_lookup``: plain torch, any dtype and device."""
-    resolution, channels = texture.shape[1], texture.shape[-1]
-    ring = _ring(resolution, texture.device)
-    texels = texture.reshape(-1, channels)
-    ringed = texels[ring.source].index_put((ring.corners,), texels[ring.around].mean(dim=1))
-    face, s, t = _face_coordinates(directions)
+def ringed_texels(texture: Tensor) -> Tensor:
+    """Texels [6, R, R, C] with a ring of their neighbours around each face, [6 (R + 2)^2, C]."""
+    ring = _ring(texture.shape[1], texture.device)
+    texels = texture.reshape(-1, texture.shape[-1])
+    return texels[ring.source].index_put((ring.corners,), texels[ring.around].mean(dim=1))
+
+
+def bilinear(
+    ringed: Tensor,
+    place: tuple[Tensor, Tensor, Tensor],
+    resolution: int | Tensor,
+    begin: int | Tensor = 0,
+) -> Tensor:
+    """Bilinear look-up of ringed texels at ``face_coordinates``, [P, C].
+
+    Args:
+        ringed: [T, C], one cubemap's or several one after the other.
+        place: face, s and t, each [P].
+        resolution: R, of all or of each, [P] int64. begin: where in ``ringed`` the cubemap begins, likewise.
+    """
+    channels = ringed.shape[-1]
+    face, s, t = place
     # Texel centres are at half-integers; one is added for the ring. A NaN reads cell 0 and stays in the fraction.
     u, v = (s + 1) * (resolution / 2) + 0.5, (t + 1) * (resolution / 2) + 0.5
-    column, row = (x.detach().nan_to_num(0).clamp(0, resolution).floor().long() for x in (u, v))
+    column, row = (x.detach().nan_to_num(0).clamp(min=0).floor().long() for x in (u, v))
+    if isinstance(resolution, Tensor):
+        column, row = column.minimum(resolution), row.minimum(resolution)
+    else:
+        column, row = column.clamp(max=resolution), row.clamp(max=resolution)
     fu, fv = (u - column)[:, None], (v - row)[:, None]
-    first = (face * (resolution + 2) + row) * (resolution + 2) + column
-    top = torch.lerp(ringed[first], ringed[first + 1], fu.expand(-1, channels))
+    first = (face * (resolution + 2) + row) * (resolution + 2) + column + begin
     second = first + resolution + 2
-    bottom = torch.lerp(ringed[second], ringed[second + 1], fu.expand(-1, channels))
+    # index_select, not an index: its gradient adds atomically on a GPU, where that of an index sorts first.
+    taps = [ringed.index_select(0, tap) for tap in (first, first + 1, second, second + 1)]
+    top, bottom = (torch.lerp(a, b, fu.expand(-1, channels)) for a, b in (taps[:2], taps[2:]))
     return torch.lerp(top, bottom, fv.expand(-1, channels))
+
+
+def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
+    """The slow twin of ``cubemap_lookup``: plain torch, any dtype and device."""
+    return bilinear(ringed_texels(texture), face_coordinates(directions), texture.shape[1])
 
 
 class _Lookup(torch.autograd.Function):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from polarguide.shading.cubemap import cubemap_lookup
+from polarguide.shading.cubemap import bilinear, cubemap_lookup, face_coordinates, ringed_texels
 
 
 def box_mips(texture: Tensor) -> list[Tensor]:
@@ -43,8 +44,9 @@ def box_mips(texture: Tensor) -> list[Tensor]:
 def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> Tensor:
     """Look-up between mip levels: seamless bilinear on the two nearest, linear between them.
 
-    Only the two levels that a direction needs are read. The gradient with respect to ``level`` is the difference of
-    those two, and 0 beyond the ends.
+    Only the two levels that a direction needs are read: on the CPU level by level, with the native look-up;
+    elsewhere all directions at once, since counting those of a level would wait for the device. The gradient with
+    respect to ``level`` is the difference of those two, and 0 beyond the ends.
 
     Args:
         levels: L textures as of ``box_mips``, [6, R_l, R_l, C].
@@ -59,6 +61,8 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
     # The last level is reached as the upper one of a pair, so that there is always a pair.
     lower = level.detach().nan_to_num(0).floor().long().clamp(max=max(0, last - 1))
     fraction = level - lower
+    if directions.device.type != "cpu":
+        return mip_lookup_at_once(levels, directions, lower, fraction)
     out = directions.new_zeros(directions.shape[0], levels[0].shape[-1])
     for index, texture in enumerate(levels):
         own = lower == index
@@ -67,3 +71,29 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
             weight = torch.where(own, 1 - fraction, fraction)[chosen, None]
             out.index_add_(0, chosen, weight * cubemap_lookup(texture, directions[chosen]))
     return out
+
+
+@lru_cache(maxsize=8)
+def _sizes(resolutions: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Resolutions of levels, and where each begins among their ringed texels, [L] int64 both."""
+    counts = [6 * (resolution + 2) ** 2 for resolution in resolutions]
+    begins = [sum(counts[:level]) for level in range(len(counts))]
+    return torch.tensor(resolutions, device=device), torch.tensor(begins, device=device)
+
+
+def mip_lookup_at_once(
+    levels: Sequence[Tensor], directions: Tensor, lower: Tensor, fraction: Tensor
+) -> Tensor:
+    """``mip_lookup`` in plain torch without a loop over what is found, for any device.
+
+    Args:
+        levels, directions: as of ``mip_lookup``.
+        lower: [P] int64, the lower level of the pair, at most L - 2 (0 for a single level).
+        fraction: [P], of the way to the upper one.
+    """
+    resolutions, begins = _sizes(tuple(texture.shape[1] for texture in levels), directions.device)
+    ringed = torch.cat([ringed_texels(texture) for texture in levels])
+    place = face_coordinates(directions)
+    upper = (lower + 1).clamp(max=len(levels) - 1)
+    below, above = (bilinear(ringed, place, resolutions[k], begins[k]) for k in (lower, upper))
+    return torch.lerp(below, above, fraction[:, None].expand_as(below))

@@ -32,7 +32,7 @@ def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
 
 def harmonic_colours(rows: Rows, rays: Tensor) -> Tensor:
     """Linear base colours [N, 3] along unit rays [N, 3], of degree 3, not negative."""
-    origin = torch.zeros(3)
+    origin = torch.zeros_like(rays[0])
     return (evaluate_sh(rays, origin, rows["sh_dc"], rows["sh_rest"], 3) + 0.5).clamp(min=0)
 
 
@@ -190,7 +190,8 @@ def render(
         depth: also splat camera depth.
         statistic: see ``ScreenStatistic``; the colour channels come first.
     """
-    centre = camera.centre.to(rows["means"])
+    pose = camera.pose(rows["means"].dtype, rows["means"].device)
+    centre = pose.centre
     channels = [] if environment is not None else [base_colours(rows, centre, sh_degree)]
     if normals or environment is not None:
         outward = rows["outward"] if "outward" in rows else None  # noqa: SIM401
@@ -199,8 +200,7 @@ def render(
             channels = shading.channels(rows, axes, centre, sh_degree)
         channels.insert(1, axes)
     if depth:
-        axis = camera.rotation[2].to(rows["means"])
-        channels.append(((rows["means"] - centre) @ axis)[:, None])
+        channels.append(((rows["means"] - centre) @ pose.rotation[2])[:, None])
     picture = rasterise(
         rows["means"],
         rows["quaternions"],

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
+import torch
 from torch import Tensor
 
 
@@ -34,3 +36,9 @@ class RenderResult:
     depth: Tensor | None
     alpha: Tensor
     radii: Tensor
+
+    def to(self, device: torch.device | str) -> RenderResult:
+        """The same on a device; nothing is copied that is there already."""
+        layers = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {name: t.to(device) for name, t in layers.items() if t is not None}
+        return replace(self, **moved)

@@ -39,7 +39,9 @@ def propagate_normals(
     rows = state.rows
     strength = torch.sigmoid(rows["strength_logits"])
     rows.overwrite("opacity_logits", rows["opacity_logits"].clamp(min=_logit(settings.opacity)))
+    # Drawn on the CPU, so that every device gets the same noise.
     noise = (torch.rand(rows["sh_dc"].shape, generator=generator) * 2 - 1) * settings.colour_noise
+    noise = noise.to(rows["sh_dc"].device)
     matt = (strength <= settings.matt)[:, None]
     # The release adds the noise to the SH coefficient itself; so do we.
     rows.overwrite("sh_dc", rows["sh_dc"] + torch.where(matt, noise, torch.zeros_like(noise)))

@@ -75,7 +75,7 @@ def stokes_loss(result: RenderResult, priors: ViewPriors, index: float) -> Tenso
         2 * result.specular,
         2 * result.diffuse,
         priors.camera.to_camera(result.normal),
-        priors.camera.rays(),
+        priors.camera.rays(device=result.normal.device),
         index,
     )
     distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))
@@ -132,14 +132,23 @@ def step_loss(
         total = total + weights.consistency * consistency_loss(
             result, camera, None if priors is None else priors.weight
         )
-    if not torch.isfinite(total):
+    if total.device.type == "cpu":
+        refuse_diverged(total.detach())
+    return total, photometric
+
+
+def refuse_diverged(total: Tensor) -> None:
+    """Raise PolarguideError unless all of ``total`` is finite.
+
+    On a GPU this waits for the device, so the loop asks it about many steps at once.
+    """
+    if not bool(torch.isfinite(total).all()):
         raise PolarguideError(
             "training",
             expected="a finite loss",
-            found=str(float(total.detach())),
+            found=str(float(total.sum())),
             remedy="Lower the learning rates, or resume from an earlier checkpoint.",
         )
-    return total, photometric
 
 
 def _prior_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssim_weight: float) -> Tensor:

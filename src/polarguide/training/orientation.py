@@ -34,7 +34,7 @@ def outward_directions(rows: Rows, views: Iterable[View], rasterise: Rasterise) 
         camera = view.camera
         depth = render(rows, camera, rasterise, sh_degree=0, normals=False, depth=True).depth
         assert depth is not None
-        centre = camera.centre.to(means)
+        centre = camera.pose(means.dtype, means.device).centre
         x, y, z = camera.to_camera(means - centre).unbind(-1)
         safe = z.clamp(min=1e-6)
         column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()

@@ -1,11 +1,13 @@
 """The photometric loss of Gaussian splatting on shown pictures: (1 - l) L1 + l (1 - SSIM).
 
-On the CPU in float32 a native kernel computes the loss and its gradient in one call;
-``photometric_loss_reference`` is its twin in plain torch.
+On the CPU in float32 a native kernel computes the loss and its gradient in one call. Elsewhere the same gradient is
+written out in plain torch, which blurs nine planes each way where autograd would blur fifteen and keep what lies
+between. ``photometric_loss_reference`` is the twin of both.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -36,11 +38,17 @@ class _Clip(torch.autograd.Function):
         return grad.masked_fill(stuck, 0.0)
 
 
+@lru_cache(maxsize=4)
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The Gaussian window, [11], adding up to 1."""
+    offsets = torch.arange(_WINDOW, dtype=dtype, device=device) - _WINDOW // 2
+    window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
+    return window / window.sum()
+
+
 def _blur(planes: Tensor) -> Tensor:
     """Gaussian window over planes [K, H, W], zero beyond the border."""
-    offsets = torch.arange(_WINDOW, dtype=planes.dtype, device=planes.device) - _WINDOW // 2
-    window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
-    window = window / window.sum()
+    window = _window(planes.dtype, planes.device)
     stack = conv2d(planes[:, None], window[None, None, None], padding=(0, _WINDOW // 2))
     return conv2d(stack, window[None, None, :, None], padding=(_WINDOW // 2, 0))[:, 0]
 
@@ -79,6 +87,59 @@ class _Photometric(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None, None]:
         (gradient,) = ctx.saved_tensors
         return gradient * grad, None, None, None
+
+
+class _Explicit(torch.autograd.Function):
+    """The loss with its gradient, computed in the forward pass; for any device."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float
+    ) -> Tensor:
+        clipped = prediction.detach().clamp(0, 1)
+        x, y = srgb_encode(clipped).permute(2, 0, 1), target.permute(2, 0, 1)
+        count = x.new_full((), x[0].numel()) if weight is None else weight.sum()
+        share = 1 / (3 * torch.where(count > 0, count, torch.ones_like(count)))
+        share = share if weight is None else share * weight
+        mx, xx, xy = _blur(torch.cat((x, x * x, x * y))).split(3)
+        my, yy = _blur(torch.cat((y, y * y))).split(3)
+        # SSIM is a1 a2 / (b1 b2).
+        a1, a2 = 2 * mx * my + _C1, 2 * (xy - mx * my) + _C2
+        b1, b2 = mx * mx + my * my + _C1, (xx - mx * mx) + (yy - my * my) + _C2
+        inverse = 1 / (b1 * b2)
+        ssim = a1 * a2 * inverse
+        difference = x - y
+        loss = (share * ((1 - ssim_weight) * difference.abs() + ssim_weight * (1 - ssim))).sum()
+        if ctx.needs_input_grad[0]:
+            pull = -ssim_weight * share
+            to_mx = pull * 2 * (my * (a2 - a1) * inverse - mx * ssim * (1 / b1 - 1 / b2))
+            # The window is symmetric and pads with zeros, so its adjoint is itself.
+            by_mx, by_xx, by_xy = _blur(torch.cat((to_mx, -pull * ssim / b2, pull * 2 * a1 * inverse))).split(
+                3
+            )
+            to_x = by_mx + 2 * x * by_xx + y * by_xy + (1 - ssim_weight) * share * difference.sign()
+            to_x = to_x.permute(1, 2, 0)
+            slope = torch.where(
+                clipped <= 0.0031308, 12.92, 1.055 / 2.4 * clipped.clamp(min=0.0031308) ** (1 / 2.4 - 1)
+            )
+            gradient = to_x * slope
+            stuck = ((prediction < 0) & (gradient > 0)) | ((prediction > 1) & (gradient < 0))
+            ctx.save_for_backward(gradient.masked_fill(stuck, 0.0))
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * grad, None, None, None
+
+
+def photometric_loss_explicit(
+    prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
+) -> Tensor:
+    """``photometric_loss`` as other devices than the CPU compute it."""
+    result: Tensor = _Explicit.apply(prediction, target, weight, ssim_weight)
+    return result
 
 
 def _check(prediction: Tensor, target: Tensor, weight: Tensor | None) -> None:
@@ -121,4 +182,6 @@ def photometric_loss(
     if prediction.device.type == "cpu" and prediction.dtype == torch.float32:
         result: Tensor = _Photometric.apply(prediction, target_shown, weight, ssim_weight)
         return result
-    return photometric_loss_reference(prediction, target_shown, weight, ssim_weight)
+    if prediction.device.type == "cpu":
+        return photometric_loss_reference(prediction, target_shown, weight, ssim_weight)
+    return photometric_loss_explicit(prediction, target_shown, weight, ssim_weight)

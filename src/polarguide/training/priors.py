@@ -73,11 +73,12 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
 
     Args:
         view: the capture.
-        normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length.
+        normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
         index: refractive index.
     """
-    rays = view.camera.rays()
+    view = view.to(normal.device)
+    rays = view.camera.rays(device=normal.device)
     intensities = view.intensities()
     stokes = optics.stokes(intensities)
     luminance = optics.luminance(stokes)

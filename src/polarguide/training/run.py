@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -126,8 +127,8 @@ def save_checkpoint(run: Path, state: TrainingState) -> None:
         save_file(state.tensors(), path, metadata={"step": str(state.step), "version": __version__})
 
 
-def load_checkpoint(run: Path, recipe: Recipe) -> TrainingState:
-    """Read the state of a run.
+def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState:
+    """Read the state of a run, whatever it was trained on, to a device.
 
     Raises:
         PolarguideError: there is none, or it is damaged.
@@ -142,7 +143,8 @@ def load_checkpoint(run: Path, recipe: Recipe) -> TrainingState:
         )
     try:
         with safe_open(path, framework="pt") as file:
-            tensors: dict[str, Tensor] = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            names = list(file.keys())
+            tensors: dict[str, Tensor] = {key: file.get_tensor(key).to(device) for key in names}
         return TrainingState.from_tensors(tensors, recipe.rates, recipe.environment_rates)
     except (SafetensorError, KeyError, ValueError) as error:
         raise PolarguideError(

@@ -30,6 +30,11 @@ class Environment:
         groups = [{"params": [t], "lr": rates[name]} for name, t in self.parameters.items()]
         self._optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
+    def retune(self, rates: Mapping[str, float], betas: tuple[float, float]) -> None:
+        """Set the learning rate of each parameter, and the decay of all moments."""
+        for name, group in zip(self.parameters, self._optimiser.param_groups, strict=True):
+            group["lr"], group["betas"] = rates[name], betas
+
     def step(self) -> None:
         """One Adam step on what has a gradient."""
         if any(t.grad is not None for t in self.parameters.values()):
@@ -106,8 +111,7 @@ class TrainingState:
         environment = None
         if "environment.texels" in tensors:
             environment = Environment.from_state(tensors, environment_rates)
-        statistics = DensityStatistics(len(rows))
-        statistics.gradient, statistics.seen = tensors["statistics.gradient"], tensors["statistics.seen"]
+        statistics = DensityStatistics.of(tensors["statistics.gradient"], tensors["statistics.seen"])
         frozen = {key[7:]: value for key, value in tensors.items() if key.startswith("frozen.")}
         step, frozen_until, was_reset = (int(x) for x in tensors["scalars"])
         return cls(step, rows, environment, statistics, frozen or None, frozen_until, bool(was_reset))

@@ -1,101 +1,55 @@
-"""The loop: walks a recipe's stages over a scene. It knows no method and compares no step with a constant."""
+"""The loop: walks a recipe's stages over a scene. It knows no method and compares no step with a constant.
+
+Everything that a step reads lies on the backend's device before: a step that does nothing but train copies nothing
+there and asks nothing back.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.gaussians.densify import DensityStatistics, densify
+from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
-from polarguide.gaussians.initialise import SH_C0, initial_rows, scene_extent
-from polarguide.gaussians.rows import GaussianRows
+from polarguide.gaussians.initialise import scene_extent
 from polarguide.raster import Backend, ScreenStatistic
-from polarguide.shading.display import srgb_decode, srgb_encode
+from polarguide.shading.display import srgb_encode
 from polarguide.shading.render import COLOUR_CHANNELS, render
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.losses import step_loss
 from polarguide.training.orientation import outward_directions
 from polarguide.training.priors import ViewPriors, view_priors
+from polarguide.training.ranks import ALONE, Ranks
+from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.stages import Action, Recipe, Schedule, Stage
-from polarguide.training.state import Environment, TrainingState
+from polarguide.training.start import first_state, seeded
+from polarguide.training.state import TrainingState
+
+__all__ = ["StepReport", "TrainSettings", "Trainer", "first_state"]
 
 
-@dataclass(frozen=True)
-class TrainSettings:
-    """What the user chooses about a training.
+class _Shown(NamedTuple):
+    """A training view's photograph [H, W, 3] as shown, and 1 where it counts [H, W] (None: everywhere)."""
 
-    Attributes:
-        steps: total number of optimiser steps.
-        seed: of every random draw.
-        refractive_index: of all surfaces.
-    """
-
-    steps: int
-    seed: int
-    refractive_index: float = 1.5
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """What a step tells the progress display."""
-
-    step: int
-    stage: str
-    loss: float
-    psnr: float
-    gaussians: int
-
-
-def _seeded(*numbers: int) -> torch.Generator:
-    """A generator that depends on all the numbers: draws do not depend on what was drawn before."""
-    value = 0
-    for number in numbers:
-        value = (value * 1_000_003 + number + 1) % (2**63 - 1)
-    return torch.Generator().manual_seed(value)
-
-
-def first_state(scene: Scene, recipe: Recipe, settings: TrainSettings) -> TrainingState:
-    """The state before the first step."""
-    colours = srgb_decode(scene.point_colours.float() / 255)
-    centres = torch.stack([view.camera.centre for view in scene.train_views])
-    tensors = initial_rows(scene.points, colours, centres, recipe.initialisation, seed=settings.seed)
-    count = tensors["means"].shape[0]
-    environment = None
-    if recipe.oriented:
-        tensors["outward"] = torch.zeros(count, 3)
-    if recipe.directional is not None:
-        generator = _seeded(settings.seed, 5)
-        tensors.update(recipe.directional.first_rows(tensors["sh_dc"] * SH_C0 + 0.5, generator))
-        light = recipe.directional.first_light_values(
-            recipe.environment_resolution, recipe.environment_spread, generator
-        )
-        environment = Environment(light, recipe.environment_rates)
-    elif recipe.reflects:
-        logit = torch.logit(torch.tensor(recipe.first_strength))
-        tensors["strength_logits"] = logit.expand(count).clone()
-        if recipe.local:
-            tensors["local_dc"] = torch.zeros(count, 3)
-            tensors["local_rest"] = torch.zeros(count, 15, 3)
-        size = (6, recipe.environment_resolution, recipe.environment_resolution, 3)
-        uniform = torch.rand(size, generator=_seeded(settings.seed, 1)) * 2 - 1
-        environment = Environment({"texels": uniform * recipe.environment_spread}, recipe.environment_rates)
-    rows = GaussianRows(tensors, recipe.rates)
-    return TrainingState(0, rows, environment, DensityStatistics(count))
+    picture: Tensor
+    valid: Tensor | None
 
 
 class Trainer:
-    """Trains one recipe on one scene, one view a step.
+    """Trains one recipe on one scene.
 
     Args:
         scene: the capture.
         recipe: the method.
         settings: the user's choices.
         backend: device and rasteriser.
-        state: where to go on from; None: from the beginning.
+        state: where to go on from, on the backend's device; None: from the beginning.
+        ranks: the processes that share the views of each step.
     """
 
     def __init__(
@@ -105,17 +59,22 @@ class Trainer:
         settings: TrainSettings,
         backend: Backend,
         state: TrainingState | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
+        self.ranks, self._device = ranks, backend.device
         self.schedule = Schedule(recipe, settings.steps)
-        self.state = state or first_state(scene, recipe, settings)
+        self.state = state or first_state(scene, recipe, settings, backend.device)
+        self._rate = math.sqrt(settings.views_per_step)
+        self._use_batch_rates()
         centres = torch.stack([view.camera.centre for view in scene.train_views])
         self._extent = scene_extent(centres)
-        self._middle = centres.mean(dim=0).float()
+        self._middle = centres.mean(dim=0).float().to(self._device)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self._limit = int(pixels / recipe.densification.pixels_each)
-        self._empty = free_space(scene.points, [view.camera for view in scene.train_views])
-        self._shown: dict[str, Tensor] = {}
+        empty = free_space(scene.points, [view.camera for view in scene.train_views])
+        self._empty = empty.to(self._device)
+        self._shown: dict[str, _Shown] = {}
         self._priors: dict[str, ViewPriors] = {}
 
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
@@ -124,13 +83,43 @@ class Trainer:
             on_step(self.step())
 
     def step(self) -> StepReport:
-        """One optimiser step on one view."""
-        state, recipe = self.state, self.recipe
+        """One optimiser step."""
+        state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
         for action in position.actions:
             self._act(action)
-        stage = position.stage
-        view = self._view_of(state.step)
+        mine = self.ranks.slots(views)
+        # A rank without a view looks at the first one, so that it knows what has gradients, and adds nothing.
+        measured = [self._look(slot, position.stage, bool(mine)) for slot in mine or range(1)]
+        self._join_gradients(idle=not mine)
+        self._optimise()
+        told = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
+        report = StepReport(state.step, position.stage.name, len(state.rows), told)
+        state.step += 1
+        if position.stage.densify and state.step % recipe.densification.every == 0:
+            self.exchange_statistics()
+            densify(
+                state.rows,
+                state.statistics,
+                recipe.densification,
+                extent=self._extent,
+                middle=self._middle,
+                prune_large=state.opacity_was_reset,
+                empty=self._empty,
+                limit=self._limit,
+                generator=seeded(self.settings.seed, 2, state.step),
+            )
+        return report
+
+    def exchange_statistics(self) -> None:
+        """Let every rank know what all have seen since the last densification. All ranks have to call it."""
+        self.ranks.exchange_slots(self.state.statistics.gradient)
+        self.ranks.exchange_slots(self.state.statistics.seen)
+
+    def _look(self, slot: int, stage: Stage, counts: bool) -> Tensor:
+        """Render the view of a slot and add its gradients; [3] as of ``StepReport.measured``."""
+        state, recipe = self.state, self.recipe
+        view = self._view_of(state.step * self.settings.views_per_step + slot)
         statistic = ScreenStatistic(COLOUR_CHANNELS) if stage.densify else None
         result = render(
             state.rows,
@@ -144,11 +133,10 @@ class Trainer:
             statistic=statistic,
         )
         shown = self._shown_photograph(view)
-        valid = None if not bool(view.invalid.any()) else (~view.invalid).float()
         loss, photometric = step_loss(
             result,
-            shown,
-            valid,
+            shown.picture,
+            shown.valid,
             stage.weights,
             self._priors_of(view, stage),
             ssim_weight=recipe.ssim_weight,
@@ -158,31 +146,42 @@ class Trainer:
             camera=view.camera,
         )
         loss.backward()
-        if statistic is not None and statistic.gradient is not None:
-            state.statistics.add(statistic.gradient, result.radii, view.camera.width, view.camera.height)
-        self._optimise()
-        psnr = _psnr(result.final, shown)
-        report = StepReport(state.step, stage.name, float(photometric.detach()), psnr, len(state.rows))
-        state.step += 1
-        if stage.densify and state.step % recipe.densification.every == 0:
-            densify(
-                state.rows,
-                state.statistics,
-                recipe.densification,
-                extent=self._extent,
-                middle=self._middle,
-                prune_large=state.opacity_was_reset,
-                empty=self._empty,
-                limit=self._limit,
-                generator=_seeded(self.settings.seed, 2, state.step),
-            )
-        return report
+        if counts and statistic is not None and statistic.gradient is not None:
+            size = view.camera.width, view.camera.height
+            state.statistics.add(statistic.gradient, result.radii, *size, slot)
+        return torch.stack((photometric.detach(), _psnr(result.final, shown.picture), loss.detach()))
+
+    def _join_gradients(self, *, idle: bool) -> None:
+        """From the gradients of this rank's views to the mean over the views of all."""
+        views = self.settings.views_per_step
+        if views == 1 and self.ranks.world == 1:
+            return
+        light = self.state.environment.parameters.values() if self.state.environment else ()
+        gradients = [t.grad for t in (*self.state.rows.trained(), *light) if t.grad is not None]
+        if idle:
+            torch._foreach_zero_(gradients)
+        self.ranks.add_up(gradients)
+        if views > 1:
+            torch._foreach_div_(gradients, float(views))
+
+    def _use_batch_rates(self) -> None:
+        """Learning rates and decays for more than one view a step; see ``TrainSettings``."""
+        views = self.settings.views_per_step
+        if views == 1:
+            return
+        betas = (0.9**views, 0.999**views)
+        self.state.rows.set_betas(betas)
+        for name, rate in self.recipe.rates.items():
+            self.state.rows.set_rate(name, rate * self._rate)
+        if self.state.environment is not None:
+            rates = {name: rate * self._rate for name, rate in self.recipe.environment_rates.items()}
+            self.state.environment.retune(rates, betas)
 
     def _optimise(self) -> None:
         state, rates = self.state, self.recipe.rates
-        state.rows.set_rate("means", self.schedule.means_rate(state.step) * self._extent)
+        state.rows.set_rate("means", self.schedule.means_rate(state.step) * self._extent * self._rate)
         resting = state.step < state.opacity_frozen_until
-        state.rows.set_rate("opacity_logits", 0.0 if resting else rates["opacity_logits"])
+        state.rows.set_rate("opacity_logits", 0.0 if resting else rates["opacity_logits"] * self._rate)
         state.rows.step()
         if state.environment is not None:
             state.environment.step()
@@ -191,26 +190,33 @@ class Trainer:
         if action == "reset_opacity":
             reset_opacity(self.state)
         elif action == "propagate_normals":
-            generator = _seeded(self.settings.seed, 3, self.state.step)
+            generator = seeded(self.settings.seed, 3, self.state.step)
             rest = min(OPACITY_REST, self.settings.steps // 50)
             propagate_normals(self.state, self.recipe.propagation, generator, rest)
         elif action == "orient_normals":
             rows, rasterise = self.state.rows, self.backend.rasterise
-            rows.overwrite("outward", outward_directions(rows, self.scene.train_views, rasterise))
+            outward = outward_directions(rows, self.scene.train_views, rasterise)
+            self.ranks.agree(outward)
+            rows.overwrite("outward", outward)
         else:
             self.state.frozen = self.state.rows.snapshot()
             self._priors.clear()
 
-    def _view_of(self, step: int) -> View:
-        """Every epoch visits every training view once, in an order of its own."""
+    def _view_of(self, place: int) -> View:
+        """The view at a place in the sequence of all views ever looked at.
+
+        Every epoch visits every training view once, in an order of its own.
+        """
         views = self.scene.train_views
-        epoch, place = divmod(step, len(views))
-        order = torch.randperm(len(views), generator=_seeded(self.settings.seed, 4, epoch))
+        epoch, place = divmod(place, len(views))
+        order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
         return views[int(order[place])]
 
-    def _shown_photograph(self, view: View) -> Tensor:
+    def _shown_photograph(self, view: View) -> _Shown:
         if view.name not in self._shown:
-            self._shown[view.name] = srgb_encode(view.photograph().clamp(0, 1))
+            picture = srgb_encode(view.photograph().clamp(0, 1)).to(self._device)
+            valid = (~view.invalid).float().to(self._device) if bool(view.invalid.any()) else None
+            self._shown[view.name] = _Shown(picture, valid)
         return self._shown[view.name]
 
     def _priors_of(self, view: View, stage: Stage) -> ViewPriors | None:
@@ -230,6 +236,6 @@ class Trainer:
 
 
 @torch.no_grad()
-def _psnr(final: Tensor, shown: Tensor) -> float:
+def _psnr(final: Tensor, shown: Tensor) -> Tensor:
     error = (srgb_encode(final.clamp(0, 1)) - shown).square().mean()
-    return float(-10 * torch.log10(error.clamp(min=1e-10)))
+    return -10 * torch.log10(error.clamp(min=1e-10))

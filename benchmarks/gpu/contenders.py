@@ -1,0 +1,191 @@
+"""The same Gaussians, pictures, SSIM and Adam in a ``polarguide`` step and in a plain gsplat step."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene
+from polarguide.gaussians.rows import CORE_ROWS, GaussianRows
+from polarguide.raster import Backend
+from polarguide.recipes import RECIPES
+from polarguide.shading.display import srgb_encode
+from polarguide.shading.render import render
+from polarguide.training.photometric import photometric_loss
+from polarguide.training.stages import Recipe
+from polarguide.training.state import TrainingState
+from polarguide.training.trainer import Trainer, TrainSettings
+
+STEPS, BEGIN = 1_000_000, 300_000  # in stage 2 of polarguide, with all harmonics
+
+
+def steady(name: str) -> Recipe:
+    """A recipe in which nothing happens between steps: no density control, resets or refreshes."""
+    recipe = RECIPES[name]
+    stages = tuple(replace(stage, repeats=()) for stage in recipe.stages)
+    return replace(recipe, stages=stages, densification=replace(recipe.densification, every=STEPS))
+
+
+def split_to(state: TrainingState, count: int, seed: int = 0) -> dict[str, Tensor]:
+    """Rows of ``count`` Gaussians: each of a trained state many times, drawn from itself and smaller by as much."""
+    rows, generator = state.rows.snapshot(), torch.Generator().manual_seed(seed)
+    present = len(rows["means"])
+    pick = torch.arange(count) % present
+    copies = count / present
+    chosen = {name: t[pick.to(t.device)] for name, t in rows.items()}
+    drawn = torch.randn(count, 3, generator=generator).to(chosen["means"])
+    # On flat Gaussians, so that a surface stays one: less far along the shortest axis would be no different.
+    chosen["means"] = chosen["means"] + 0.5 * drawn * chosen["log_scales"].exp()
+    chosen["log_scales"] = chosen["log_scales"] - torch.log(torch.tensor(copies**0.5))
+    return chosen
+
+
+class Ours:
+    """Steps of the recipe ``polarguide`` in its second stage, through the trainer."""
+
+    def __init__(self, scene: Scene, state: TrainingState, backend: Backend) -> None:
+        recipe = steady("polarguide")
+        state.step = BEGIN
+        self.trainer = Trainer(scene, recipe, TrainSettings(STEPS, 0), backend, state)
+        self.stage = self.trainer.schedule.at(BEGIN).stage
+        assert self.stage.reflection
+        assert self.stage.densify
+        self._shading = recipe.shading(1.5)
+        self._turn = 0
+
+    def forward(self) -> None:
+        """What a step renders."""
+        trainer, state = self.trainer, self.trainer.state
+        assert state.environment is not None
+        render(
+            state.rows,
+            trainer._view_of(state.step + self._next()).camera,
+            trainer.backend.rasterise,
+            environment=state.environment.parameters,
+            shading=self._shading,
+            depth=True,
+        )
+
+    def look(self) -> None:
+        """Forward and backward, with all losses."""
+        self.trainer._look(self._next(), self.stage, True)
+
+    def step(self) -> None:
+        """A whole step."""
+        self.trainer.step()
+
+    @torch.no_grad()
+    def frame(self, *, layers: bool) -> None:
+        """A picture of a trained scene: the final one, or all layers."""
+        trainer, state = self.trainer, self.trainer.state
+        view = trainer._view_of(state.step + self._next())
+        environment = state.environment.parameters if state.environment else None
+        rasterise, shading = trainer.backend.rasterise, self._shading
+        render(
+            state.rows,
+            view.camera,
+            rasterise,
+            environment=environment,
+            shading=shading,
+            normals=layers,
+            depth=layers,
+        )
+
+    def parts(self) -> dict[str, Any]:
+        """The rasteriser, SSIM and the optimiser of a step by themselves, as calls."""
+        trainer, rows = self.trainer, self.trainer.state.rows
+        view = trainer._view_of(trainer.state.step)
+        leaves = [
+            rows["means"],
+            rows["quaternions"],
+            rows["log_scales"].exp(),
+            torch.sigmoid(rows["opacity_logits"]),
+        ]
+        leaves = [t.detach().requires_grad_() for t in leaves]
+        features = torch.rand(len(rows), 8, device=leaves[0].device).requires_grad_()
+        shown = trainer._shown_photograph(view).picture
+        prediction = shown.clone().requires_grad_()
+
+        def raster() -> None:
+            from polarguide.raster import ScreenStatistic
+
+            picture = trainer.backend.rasterise(
+                *leaves, features, view.camera, statistic=ScreenStatistic((0, 1, 2))
+            )
+            torch.autograd.grad((picture.features.sum() + picture.alpha.sum()), (*leaves, features))
+
+        def ssim() -> None:
+            weights = self.stage.weights
+            for _ in range(1 + (weights.specular > 0) + (weights.diffuse > 0)):
+                torch.autograd.grad(photometric_loss(prediction, shown), prediction)
+
+        def optimiser() -> None:
+            for t in rows.trained():
+                t.grad = torch.zeros_like(t)
+            trainer._optimise()
+
+        return {"rasteriser": raster, "ssim": ssim, "optimiser": optimiser}
+
+    def _next(self) -> int:
+        self._turn = (self._turn + 1) % len(self.trainer.scene.train_views)
+        return self._turn
+
+
+class Plain:
+    """Plain 3D Gaussian splatting by gsplat's own ``rasterization``, harmonics included."""
+
+    def __init__(self, scene: Scene, rows: dict[str, Tensor], device: torch.device) -> None:
+        self._gsplat = importlib.import_module("gsplat")
+        rates = RECIPES["3dgs"].rates
+        self.rows = GaussianRows({name: rows[name] for name in CORE_ROWS}, rates)
+        self._views = []
+        for view in scene.train_views:
+            camera, matrix = view.camera, torch.eye(4, dtype=torch.float64)
+            matrix[:3, :3], matrix[:3, 3] = camera.rotation, camera.translation
+            intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+            shown = srgb_encode(view.photograph().clamp(0, 1)).to(device)
+            poses = (t[None].to(device, torch.float32) for t in (matrix, intrinsics))
+            self._views.append((*poses, camera.width, camera.height, shown))
+        self._pull = torch.zeros(len(self.rows), device=device)
+        self._turn = 0
+
+    def forward(self) -> tuple[Tensor, dict[str, Any], Tensor]:
+        """A picture, what gsplat tells of it, and the photograph."""
+        self._turn = (self._turn + 1) % len(self._views)
+        viewmat, intrinsics, width, height, shown = self._views[self._turn]
+        rows = self.rows
+        picture, _, told = self._gsplat.rasterization(
+            rows["means"],
+            rows["quaternions"],
+            rows["log_scales"].exp(),
+            torch.sigmoid(rows["opacity_logits"]),
+            torch.cat((rows["sh_dc"][:, None], rows["sh_rest"]), dim=1),
+            viewmat,
+            intrinsics,
+            width,
+            height,
+            sh_degree=3,
+            packed=False,
+        )
+        return picture[0], told, shown
+
+    def look(self) -> None:
+        """Forward and backward, and the statistic of the density control."""
+        picture, told, shown = self.forward()
+        told["means2d"].retain_grad()
+        photometric_loss(picture, shown).backward()
+        self._pull += told["means2d"].grad[0].norm(dim=-1)
+
+    def step(self) -> None:
+        """A whole step."""
+        self.look()
+        self.rows.step()
+
+    @torch.no_grad()
+    def frame(self) -> None:
+        """A picture."""
+        self.forward()

@@ -1,0 +1,280 @@
+"""The CUDA backend: gsplat's projection, tiling and blending behind the interface. The only file that knows gsplat.
+
+gsplat is found, and its kernels are compiled, by ``load_gsplat``; nothing of it is imported before. Of its interface
+only what 1.5.3 and 1.6.0 share is used, by keyword; what differs between them is in ``load_gsplat`` and ``COMPILED``.
+
+Where its definition departs from ours (docs/gpu.md has the table): alpha is at most 0.999, not 0.99; a pixel ends at a
+transmittance of 1e-4 exactly, too; the radius is that of the wider side of the box that is drawn, whole pixels, and at
+most 3.33 standard deviations; exponentials are fast ones. Inputs are not searched for NaN, since the answer would have
+to be waited for.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from polarguide.camera import Camera
+from polarguide.errors import PolarguideError
+from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterised, ScreenStatistic, check_shapes
+
+TILE = 16
+# A load that takes longer than this is compiling.
+NOTICE_SECONDS = 5.0
+# Channel counts up to 33 that both versions compile; 1.5.3 pads others itself, 1.6.0 refuses them.
+COMPILED = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33)
+
+
+class _View(NamedTuple):
+    """A camera as gsplat takes it, on its device: [1, 4, 4] world-to-camera, [1, 3, 3] intrinsics."""
+
+    viewmats: Tensor
+    intrinsics: Tensor
+
+
+class _Splats(NamedTuple):
+    """Projected Gaussians, sorted into tiles. The first axis is that of pictures, of which there is one."""
+
+    means2d: Tensor  # [1, N, 2] pixels
+    conics: Tensor  # [1, N, 3]
+    opacities: Tensor  # [1, N]
+    offsets: Tensor  # [1, rows, columns] of tiles
+    order: Tensor  # [intersections]
+    radii: Tensor  # [1, N, 2] pixels, 0 where culled
+
+
+_views: WeakKeyDictionary[Camera, dict[torch.device, _View]] = WeakKeyDictionary()
+
+
+def _view(camera: Camera, device: torch.device) -> _View:
+    """Kept for each camera, so that a second rendering copies nothing to the device."""
+    kept = _views.setdefault(camera, {})
+    if device not in kept:
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3], matrix[:3, 3] = camera.rotation, camera.translation
+        intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        kept[device] = _View(*(t[None].to(device, torch.float32) for t in (matrix, intrinsics)))
+    return kept[device]
+
+
+def has_gsplat() -> bool:
+    """Whether gsplat is installed; nothing of it is imported."""
+    return importlib.util.find_spec("gsplat") is not None
+
+
+def load_gsplat(say: Callable[[str], None]) -> None:
+    """Import gsplat and its kernels, which compiles them where that has not been done yet.
+
+    Both versions compile when ``gsplat.cuda._backend`` is first imported, and leave ``None`` there where they find no
+    CUDA toolkit; a failed compilation is whatever exception the compiler's driver raises.
+
+    Args:
+        say: takes a line for the user once it is clear that this will take a while.
+
+    Raises:
+        PolarguideError: it is not installed, or its kernels cannot be had.
+    """
+    if not has_gsplat():
+        raise PolarguideError(
+            "--device cuda",
+            expected="the package gsplat",
+            found="that it is not installed",
+            remedy="pip install 'polarguide[cuda]', or use --device cpu.",
+        )
+    notice = "compiling gsplat's CUDA kernels; this takes minutes, once for each machine and PyTorch ..."
+    timer = threading.Timer(NOTICE_SECONDS, say, (notice,))
+    timer.daemon = True
+    timer.start()
+    try:
+        _offer_headers()
+        kernels = importlib.import_module("gsplat.cuda._backend")._C
+    except Exception as error:  # compilers, loaders and their drivers raise all kinds
+        lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+        told = next((line for line in lines if "error" in line.lower()), lines[0])
+        raise _no_kernels(told.strip()[:200]) from error
+    finally:
+        timer.cancel()
+    if kernels is None:
+        raise _no_kernels("no CUDA toolkit (nvcc)")
+
+
+def _offer_headers() -> None:
+    """Show the compiler the headers of PyTorch's CUDA packages where the toolkit comes without.
+
+    PyTorch's own headers include those of cuBLAS, cuSOLVER and cuSPARSE, which a bare compiler package lacks.
+    """
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    found = importlib.util.find_spec("nvidia")
+    if CUDA_HOME is None or found is None or (Path(CUDA_HOME) / "include" / "cusparse.h").exists():
+        return
+    roots = [Path(root) for root in found.submodule_search_locations or ()]
+    folders = sorted({str(header.parent) for root in roots for header in root.glob("*/include/*.h")})
+    known = os.environ.get("CPATH", "").split(os.pathsep)
+    os.environ["CPATH"] = os.pathsep.join(dict.fromkeys([*filter(None, known), *folders]))
+
+
+def _no_kernels(found: str) -> PolarguideError:
+    return PolarguideError(
+        "gsplat",
+        expected="its CUDA kernels, compiled at first use",
+        found=found,
+        remedy="Install the CUDA toolkit (nvcc) of the version that torch.version.cuda names, ninja and a C++ "
+        "compiler, or a gsplat wheel with kernels for your PyTorch; or use --device cpu.",
+    )
+
+
+def _gsplat() -> Any:
+    return importlib.import_module("gsplat")
+
+
+def _project(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, view: _View
+) -> _Splats:
+    gsplat, size = _gsplat(), (camera.width, camera.height)
+    radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
+        means,
+        None,
+        quats,
+        scales,
+        view.viewmats,
+        view.intrinsics,
+        *size,
+        eps2d=BLUR,
+        near_plane=NEAR_PLANE,
+        opacities=opacities.detach(),  # for the size of the box, and to cull what is too faint
+    )
+    columns, rows = (-(-side // TILE) for side in size)
+    _, keys, order = gsplat.isect_tiles(
+        means2d.detach(), radii, depths.detach(), TILE, columns, rows, n_images=1
+    )
+    offsets = gsplat.isect_offset_encode(keys, 1, columns, rows).reshape(1, rows, columns)
+    return _Splats(means2d, conics, opacities[None], offsets, order, radii)
+
+
+def _blend(splats: _Splats, features: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pictures [H, W, D] and alpha [H, W] of features [N, D]."""
+    channels = features.shape[1]
+    padding = next(count for count in COMPILED if count >= channels) - channels
+    if padding:
+        features = torch.cat((features, features.new_zeros(features.shape[0], padding)), dim=1)
+    picture, alpha = _gsplat().rasterize_to_pixels(
+        splats.means2d,
+        splats.conics,
+        features[None],
+        splats.opacities,
+        camera.width,
+        camera.height,
+        TILE,
+        splats.offsets,
+        splats.order,
+    )
+    return picture[0, ..., :channels], alpha[0, ..., 0]
+
+
+class _AlphaAlone(torch.autograd.Function):
+    """Alpha that is known already; its gradient is found by blending nothing a second time, if it is asked for.
+
+    So a statistic over all channels costs nothing, as long as no loss looks at alpha.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means2d: Tensor,
+        conics: Tensor,
+        opacities: Tensor,
+        alpha: Tensor,
+        splats: _Splats,
+        camera: Camera,
+    ) -> Tensor:
+        ctx.save_for_backward(means2d, conics, opacities)
+        ctx.splats, ctx.camera = _Splats(*(t.detach() for t in splats)), camera
+        return alpha.detach().clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        with torch.enable_grad():
+            leaves = [t.detach().requires_grad_() for t in ctx.saved_tensors]
+            splats = ctx.splats._replace(means2d=leaves[0], conics=leaves[1], opacities=leaves[2])
+            nothing = leaves[0].new_zeros(leaves[0].shape[1], 1)
+            _, alpha = _blend(splats, nothing, ctx.camera)
+            gradients = torch.autograd.grad(alpha, leaves, grad)
+        return (*gradients, None, None, None)
+
+
+def _watched(
+    splats: _Splats, features: Tensor, camera: Camera, statistic: ScreenStatistic
+) -> tuple[Tensor, Tensor]:
+    """``_blend``, with the statistic filled by the backward pass.
+
+    gsplat's gradient of the projected means sums over all channels. But channels blend independently of each other, so
+    those that count are blended in a call of their own, with projected means of their own: their gradient is the
+    statistic, exactly, and both add up to the whole. It costs the alphas of every Gaussian and pixel twice; where all
+    channels count, nothing.
+    """
+    chosen = list(statistic.channels)
+    others = [channel for channel in range(features.shape[1]) if channel not in chosen]
+    if not chosen:
+        statistic.gradient = torch.zeros_like(splats.means2d[0])
+        return _blend(splats, features, camera)
+
+    def fill(gradient: Tensor) -> None:
+        statistic.gradient = gradient[0]
+
+    own = splats.means2d.clone()
+    own.register_hook(fill)
+    picture, alpha = _blend(splats._replace(means2d=own), _columns(features, chosen), camera)
+    if others:
+        rest, alpha = _blend(splats, _columns(features, others), camera)
+        picture = torch.cat((picture, rest), dim=-1)
+    else:
+        inputs = (splats.means2d, splats.conics, splats.opacities)
+        alpha = _AlphaAlone.apply(*inputs, alpha, splats, camera)
+    return _in_place(picture, chosen + others), alpha
+
+
+def _columns(features: Tensor, chosen: list[int]) -> Tensor:
+    """Some channels of [N, D], without an index that would be copied to the device."""
+    first, last = chosen[0], chosen[-1] + 1
+    if chosen == list(range(first, last)):
+        return features[:, first:last]
+    return torch.stack([features[:, channel] for channel in chosen], dim=1)
+
+
+def _in_place(picture: Tensor, channels: list[int]) -> Tensor:
+    """A picture whose channels came in another order, in the order of their numbers."""
+    if channels == sorted(channels):
+        return picture
+    return torch.stack([picture[..., channels.index(k)] for k in range(len(channels))], dim=-1)
+
+
+def rasterise_cuda(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+    *,
+    statistic: ScreenStatistic | None = None,
+) -> Rasterised:
+    """See ``polarguide.raster.interface``, and the module for the differences. CUDA tensors, float32."""
+    check_shapes(means, quats, scales, opacities, features, statistic)
+    splats = _project(means, quats, scales, opacities, camera, _view(camera, means.device))
+    if statistic is not None and torch.is_grad_enabled() and splats.means2d.requires_grad:
+        picture, alpha = _watched(splats, features, camera, statistic)
+    else:
+        picture, alpha = _blend(splats, features, camera)
+    return Rasterised(picture, alpha, splats.radii[0].amax(dim=-1).to(means.dtype))

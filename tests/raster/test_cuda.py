@@ -1,0 +1,164 @@
+"""What the CUDA backend does around gsplat, with gsplat's functions in plain torch; and how it fails without them."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+import types
+
+import gsplat_stand_in
+import pytest
+import torch
+from raster_scenes import differences, in_view, outcome, posed
+
+from polarguide.errors import PolarguideError
+from polarguide.raster import ScreenStatistic, backends, choose_backend, cuda, rasterise_reference
+from polarguide.raster.cuda import load_gsplat, rasterise_cuda
+
+TOLERANCE = 2e-5
+
+
+@pytest.fixture(autouse=True)
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", gsplat_stand_in)
+    gsplat_stand_in.calls.clear()
+
+
+CASES = [
+    (channels, statistic)
+    for channels in (1, 3, 6, 7, 8, 10, 11, 31, 32)
+    for statistic in (None, (), (0, 1, 2), (1, 4), (4, 1), (2,), tuple(range(channels)))
+    if not statistic or max(statistic) < channels
+]
+
+
+@pytest.mark.parametrize(("channels", "statistic"), CASES)
+def test_pictures_gradients_and_statistics_are_those_of_the_twin(
+    channels: int, statistic: tuple[int, ...] | None
+) -> None:
+    camera = posed(23, 21)
+    gaussians = in_view(camera, 40, channels, seed=channels)
+    found = outcome(rasterise_cuda, gaussians, camera, statistic)
+    expected = outcome(rasterise_reference, gaussians, camera, statistic, dtype=torch.float64)
+    worst = differences(found, expected)
+    worst.pop("radii")  # gsplat's are of another kind
+    assert max(worst.values()) < TOLERANCE, worst
+    assert bool((found.radii[expected.radii > 0] > 0).all())
+
+
+@pytest.mark.parametrize(("channels", "blended"), [(3, [3]), (8, [3, 5]), (7, [3, 4]), (11, [3, 8])])
+def test_a_statistic_costs_one_more_call_where_other_channels_are_there(
+    channels: int, blended: list[int]
+) -> None:
+    camera = posed(16, 16)
+    inputs = [t.requires_grad_() for t in in_view(camera, 10, channels, seed=1)]
+    statistic = ScreenStatistic((0, 1, 2))
+    rasterise_cuda(*inputs, camera, statistic=statistic).features.sum().backward()
+    assert gsplat_stand_in.calls == blended
+    assert statistic.gradient is not None
+    with torch.no_grad():
+        rasterise_cuda(*inputs, camera, statistic=statistic)
+    assert len(gsplat_stand_in.calls) == len(blended) + 1
+
+
+def test_a_camera_is_copied_once() -> None:
+    camera, other = posed(16, 16), posed(16, 16)
+    first = cuda._view(camera, torch.device("cpu"))
+    assert cuda._view(camera, torch.device("cpu")) is first
+    assert cuda._view(other, torch.device("cpu")) is not first
+
+
+def kernels(monkeypatch: pytest.MonkeyPatch, content: object) -> None:
+    """What importing gsplat's kernels gives: a value of ``_C``, or an exception."""
+    real = importlib.import_module
+
+    def fake(name: str) -> object:
+        if name != "gsplat.cuda._backend":
+            return real(name)
+        if isinstance(content, Exception):
+            raise content
+        return types.SimpleNamespace(_C=content)
+
+    monkeypatch.setattr(importlib, "import_module", fake)
+    monkeypatch.setattr(cuda, "has_gsplat", lambda: True)
+
+
+def test_kernels_that_are_there_are_loaded_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernels(monkeypatch, object())
+    said: list[str] = []
+    load_gsplat(said.append)
+    assert said == []
+
+
+def test_compiling_is_announced_while_it_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(cuda, "NOTICE_SECONDS", 0.01)
+    real = importlib.import_module
+
+    def compiles(name: str) -> object:
+        if name != "gsplat.cuda._backend":
+            return real(name)
+        for _ in range(1000):
+            if not said:
+                time.sleep(0.01)
+        return types.SimpleNamespace(_C=object())
+
+    monkeypatch.setattr(importlib, "import_module", compiles)
+    monkeypatch.setattr(cuda, "has_gsplat", lambda: True)
+    load_gsplat(said.append)
+    assert len(said) == 1
+    assert "compiling" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (None, "no CUDA toolkit"),
+        (RuntimeError("Error building extension 'gsplat_cuda':\nlong\nlog"), "Error building extension"),
+        (OSError("libcudart.so.13: cannot open shared object file"), "libcudart"),
+        (ImportError(""), "ImportError"),
+    ],
+)
+def test_a_failed_build_is_one_message_with_the_way_out(
+    monkeypatch: pytest.MonkeyPatch, content: object, told: str
+) -> None:
+    kernels(monkeypatch, content)
+    with pytest.raises(PolarguideError, match=told) as raised:
+        load_gsplat(print)
+    assert "--device cpu" in raised.value.remedy
+    assert "\n" not in str(raised.value)
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch, *, gpus: int, gsplat: bool) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda device: None)
+    for module in (backends, cuda):
+        monkeypatch.setattr(module, "has_gsplat", lambda: gsplat)
+    monkeypatch.setattr(backends, "load_gsplat", lambda say: load_gsplat(say) if not gsplat else None)
+
+
+def test_auto_takes_the_gpu_that_can_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, gpus=2, gsplat=True)
+    assert choose_backend("auto").device == torch.device("cuda", 0)
+    assert choose_backend("cuda", local_rank=1) == (torch.device("cuda", 1), rasterise_cuda)
+    assert choose_backend("cpu").device == torch.device("cpu")
+    with pytest.raises(PolarguideError, match="a GPU for each process, found 2"):
+        choose_backend("cuda", local_rank=2)
+
+
+def test_auto_says_why_it_leaves_a_gpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, gpus=1, gsplat=False)
+    said: list[str] = []
+    assert choose_backend("auto", say=said.append).device == torch.device("cpu")
+    assert "gsplat" in said[0]
+    with pytest.raises(PolarguideError, match=r"polarguide\[cuda\]"):
+        choose_backend("cuda")
+
+
+def test_auto_is_the_cpu_without_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, gpus=0, gsplat=True)
+    assert choose_backend("auto").device == torch.device("cpu")
+    with pytest.raises(PolarguideError, match="found 0 that PyTorch"):
+        choose_backend("cuda")

@@ -1,0 +1,97 @@
+"""gsplat itself against the twin, on a GPU. Elsewhere ``test_cuda.py`` has what can be said without one."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from raster_scenes import (
+    Gaussians,
+    Outcome,
+    differences,
+    in_view,
+    looking_ahead,
+    outcome,
+    posed,
+    round_gaussian,
+)
+
+from polarguide.raster import choose_backend, rasterise_reference
+from polarguide.raster.cpu import rasterise_cpu
+from polarguide.raster.cuda import has_gsplat, rasterise_cuda
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA GPU"),
+    pytest.mark.skipif(not has_gsplat(), reason="gsplat is not installed"),
+]
+
+# Norm of the difference over the norm, float32 with fast exponentials against float64.
+TOLERANCES = {
+    "features": 2e-5,
+    "alpha": 2e-5,
+    "gradient of means": 1e-3,
+    "gradient of quats": 1e-3,
+    "gradient of scales": 1e-3,
+    "gradient of opacities": 2e-4,
+    "gradient of features": 1e-4,
+    "statistic": 1e-3,
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def kernels() -> None:
+    choose_backend("cuda")
+
+
+def there(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(*(t.cuda() for t in gaussians))
+
+
+def here(found: Outcome) -> Outcome:
+    gradients = Gaussians(*(t.cpu() for t in found.gradients))
+    statistic = None if found.statistic is None else found.statistic.cpu()
+    return Outcome(found.features.cpu(), found.alpha.cpu(), found.radii.cpu(), gradients, statistic)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 6, 7, 8, 11, 32])
+@pytest.mark.parametrize("statistic", [None, (0,), (0, 1, 2), (1, 4)])
+def test_gsplat_agrees_with_the_twin(channels: int, statistic: tuple[int, ...] | None) -> None:
+    if statistic and max(statistic) >= channels:
+        statistic = tuple(range(channels))
+    camera = posed(50, 37)
+    gaussians = in_view(camera, 60, channels, seed=channels)
+    found = here(outcome(rasterise_cuda, there(gaussians), camera, statistic))
+    expected = outcome(rasterise_reference, gaussians, camera, statistic, dtype=torch.float64)
+    worst = differences(found, expected)
+    worst.pop("radii")  # of another kind
+    assert {name: d for name, d in worst.items() if not d < TOLERANCES[name]} == {}
+    assert bool((found.radii[expected.radii > 0] > 0).all())
+
+
+def test_a_large_picture_agrees_with_the_cpu() -> None:
+    camera = posed(640, 480)
+    small = in_view(posed(64, 48), 40, 8, seed=4)
+    jitter = torch.randn(50 * 40, 3, generator=torch.Generator().manual_seed(0))
+    many = Gaussians(*(torch.cat([t] * 50) for t in small))
+    many = many._replace(means=many.means + 0.3 * jitter, opacities=many.opacities * 0.3)
+    found = here(outcome(rasterise_cuda, there(many), camera, (0, 1, 2)))
+    expected = outcome(rasterise_cpu, many, camera, (0, 1, 2))
+    # Pixels near a cut-off may fall on either side: few, so the whole is close.
+    assert differences(found, expected)["features"] < 1e-3
+    assert differences(found, expected)["statistic"] < 1e-2
+
+
+def test_alpha_is_capped_later_than_ours() -> None:
+    """0.999 in gsplat, 0.99 here: an opaque Gaussian hides more."""
+    camera, opaque = looking_ahead(9, 9), round_gaussian(5.0, 0.9999)
+    assert float(rasterise_reference(*opaque, camera).alpha.max()) == pytest.approx(0.99, abs=1e-4)
+    found = rasterise_cuda(*there(opaque), camera).alpha
+    assert float(found.max()) == pytest.approx(0.999, abs=1e-4)
+
+
+def test_nothing_in_view_is_an_empty_picture() -> None:
+    camera, behind = looking_ahead(9, 9), round_gaussian(0.1, 0.5, depth=-3.0)
+    found = outcome(rasterise_cuda, there(behind), camera, (0,))
+    assert not bool(found.features.any())
+    assert not bool(found.radii.any())
+    assert all(bool(torch.isfinite(t).all()) for t in found.gradients)

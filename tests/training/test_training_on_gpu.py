@@ -1,0 +1,92 @@
+"""Training on a GPU: it learns what the CPU learns, waits for nothing of its own, and its checkpoints move about."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from polarguide.capture import Scene
+from polarguide.raster import Backend, Rasterised, choose_backend
+from polarguide.raster.cuda import has_gsplat
+from polarguide.recipes import RECIPES
+from polarguide.training.run import load_checkpoint, save_checkpoint
+from polarguide.training.stages import Recipe
+from polarguide.training.trainer import Trainer, TrainSettings
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA GPU"),
+    pytest.mark.skipif(not has_gsplat(), reason="gsplat is not installed"),
+]
+
+
+def final_psnr(scene: Scene, recipe: Recipe, backend: Backend, steps: int = 200) -> float:
+    reports: list[float] = []
+    trainer = Trainer(scene, recipe, TrainSettings(steps, 3), backend)
+    trainer.run(lambda report: reports.append(report.psnr))
+    return sum(reports[-20:]) / 20
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_recipe_learns_what_the_cpu_learns(tiny_scene: Scene, name: str) -> None:
+    cpu, cuda = (final_psnr(tiny_scene, RECIPES[name], choose_backend(d)) for d in ("cpu", "cuda"))
+    assert abs(cpu - cuda) < 1.0
+
+
+def test_all_that_can_happen_happens(tiny_scene: Scene, busy_recipe: Recipe) -> None:
+    counts: list[int] = []
+    trainer = Trainer(tiny_scene, busy_recipe, TrainSettings(60, 3), choose_backend("cuda"))
+    trainer.run(lambda report: counts.append(report.gaussians))
+    assert len(set(counts)) > 3
+    state = trainer.state.tensors()
+    assert all(t.device.type == "cuda" for name, t in state.items() if name != "scalars")
+    assert all(bool(torch.isfinite(t).all()) for t in state.values() if t.is_floating_point())
+
+
+@pytest.mark.parametrize(("first", "second"), [("cuda", "cpu"), ("cpu", "cuda")])
+def test_a_checkpoint_goes_on_elsewhere(
+    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, first: Any, second: Any
+) -> None:
+    settings = TrainSettings(60, 3)
+    begun = Trainer(tiny_scene, busy_recipe, settings, choose_backend(first))
+    begun.run(lambda _: None, until=30)
+    save_checkpoint(tmp_path, begun.state)
+    backend = choose_backend(second)
+    state = load_checkpoint(tmp_path, busy_recipe, backend.device)
+    Trainer(tiny_scene, busy_recipe, settings, backend, state).run(lambda _: None)
+    assert state.step == 60
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str) -> None:
+    """gsplat waits once a picture, for the number of intersections; we do not."""
+    backend = choose_backend("cuda")
+    strict = False
+
+    def rasterise(*inputs: Any, **named: Any) -> Rasterised:
+        torch.cuda.set_sync_debug_mode("default")
+        try:
+            return backend.rasterise(*inputs, **named)
+        finally:
+            torch.cuda.set_sync_debug_mode("error" if strict else "default")
+
+    settings = TrainSettings(10_000, 0)
+    trainer = Trainer(tiny_scene, RECIPES[name], settings, backend._replace(rasterise=rasterise))
+    views, begin = len(tiny_scene.train_views), 1
+    for stage in RECIPES[name].stages:
+        trainer.state.step = begin
+        for _ in range(2 * views):  # all pictures, and their priors, reach the device
+            trainer.step()
+        torch.cuda.set_sync_debug_mode("error")
+        strict = True
+        try:
+            for slot in range(views):
+                trainer._look(slot, stage, True)
+                trainer._optimise()
+        finally:
+            strict = False
+            torch.cuda.set_sync_debug_mode("default")
+        begin += round(stage.fraction * settings.steps)
