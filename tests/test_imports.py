@@ -13,6 +13,7 @@ ROOMS = (
     "errors",
     "vectors",
     "camera",
+    "surroundings",
     "_native",
     "optics",
     "capture",

@@ -17,6 +17,7 @@ from polarguide.cli.evaluate import evaluate
 from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
+from polarguide.cli.share import share
 from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
 
@@ -26,6 +27,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "train": train,
     "eval": evaluate,
     "render": render_views,
+    "share": share,
     "priors": priors,
     "compare": compare,
     "ablate": ablate,

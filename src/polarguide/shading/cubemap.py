@@ -114,21 +114,28 @@ def _face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return face, s, t
 
 
-def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
-    """The slow twin of ``cubemap_lookup``: plain torch, any dtype and device."""
+def ringed(texture: Tensor) -> Tensor:
+    """The faces [6, R, R, C] with the ring of texels [6, R + 2, R + 2, C] that makes a look-up of four taps seamless."""
     resolution, channels = texture.shape[1], texture.shape[-1]
     ring = _ring(resolution, texture.device)
     texels = texture.reshape(-1, channels)
-    ringed = texels[ring.source].index_put((ring.corners,), texels[ring.around].mean(dim=1))
+    around = texels[ring.source].index_put((ring.corners,), texels[ring.around].mean(dim=1))
+    return around.reshape(6, resolution + 2, resolution + 2, channels)
+
+
+def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
+    """The slow twin of ``cubemap_lookup``: plain torch, any dtype and device."""
+    resolution, channels = texture.shape[1], texture.shape[-1]
+    texels = ringed(texture).reshape(-1, channels)
     face, s, t = _face_coordinates(directions)
     # Texel centres are at half-integers; one is added for the ring. A NaN reads cell 0 and stays in the fraction.
     u, v = (s + 1) * (resolution / 2) + 0.5, (t + 1) * (resolution / 2) + 0.5
     column, row = (x.detach().nan_to_num(0).clamp(0, resolution).floor().long() for x in (u, v))
     fu, fv = (u - column)[:, None], (v - row)[:, None]
     first = (face * (resolution + 2) + row) * (resolution + 2) + column
-    top = torch.lerp(ringed[first], ringed[first + 1], fu.expand(-1, channels))
+    top = torch.lerp(texels[first], texels[first + 1], fu.expand(-1, channels))
     second = first + resolution + 2
-    bottom = torch.lerp(ringed[second], ringed[second + 1], fu.expand(-1, channels))
+    bottom = torch.lerp(texels[second], texels[second + 1], fu.expand(-1, channels))
     return torch.lerp(top, bottom, fv.expand(-1, channels))
 
 
