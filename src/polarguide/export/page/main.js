@@ -1,3 +1,5 @@
+// In the order that shade.frag counts them.
+const LAYERS = ["final", "diffuse", "specular", "base", "strength", "normal"];
 const byId = (id) => document.getElementById(id);
 
 async function unpacked(id) {
@@ -114,7 +116,7 @@ class Page {
   }
 
   choose(name) {
-    this.looks.layer = ["final", "diffuse", "specular", "base", "strength", "normal"].indexOf(name);
+    this.looks.layer = LAYERS.indexOf(name);
     for (const button of byId("layers").children)
       button.setAttribute("aria-pressed", String(button.dataset.layer === name));
     this.redraw();
@@ -215,18 +217,21 @@ class Page {
     }
   }
 
-  /** A layer at a photograph's pose and size, as the address of a PNG. */
-  async picture(view, layer) {
+  /** Layers at a photograph's pose and size, as the addresses of PNG pictures. */
+  async pictures(view, layers) {
     const place = this.scene.cameras.findIndex((camera) => camera.name === view);
-    if (place < 0 || !this.scene.layers.includes(layer)) throw new Error("no such view or layer");
+    if (place < 0 || !layers.every((name) => this.scene.layers.includes(name))) throw new Error("no such view or layer");
     while (this.drawing || this.waiting) await new Promise((resolve) => setTimeout(resolve, 5));
-    const looks = this.looks;
-    this.looks = { ...looks, layer: ["final", "diffuse", "specular", "base", "strength", "normal"].indexOf(layer) };
-    await this.draw(this.scene.cameras[place]);
-    const address = this.canvas.toDataURL("image/png");
-    this.looks = looks;
+    const { looks, comparing } = this, addresses = [];
+    this.comparing = false;
+    for (const name of layers) {
+      this.looks = { ...looks, layer: LAYERS.indexOf(name) };
+      await this.draw(this.scene.cameras[place]);
+      addresses.push(this.canvas.toDataURL("image/png"));
+    }
+    Object.assign(this, { looks, comparing });
     this.redraw();
-    return address;
+    return addresses;
   }
 }
 

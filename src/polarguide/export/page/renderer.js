@@ -38,7 +38,8 @@ class Renderer {
     this.nothing = gl.createVertexArray();
     this.shown = 0;
     this.blended = null;
-    this.derivedFor = null;
+    this.derivedFor = null; // the eye
+    this.blendedFor = null; // the camera: other looks need only be shaded again
   }
 
   program(vertex, fragment) {
@@ -118,10 +119,14 @@ class Renderer {
     gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
     this.shown = order.length;
+    this.blendedFor = null;
   }
 
   /** Blend the layers for a camera of the size of the picture. */
   splat(camera) {
+    const wanted = JSON.stringify(camera);
+    if (wanted === this.blendedFor) return;
+    this.blendedFor = wanted;
     const gl = this.gl, { width, height } = camera, eye = scaled(apply(transposed(camera.rotation), camera.translation), -1);
     if (!this.blended || this.blended.width !== width || this.blended.height !== height) {
       if (this.blended) {
