@@ -38,6 +38,16 @@ class Surroundings:
         eye = torch.eye(3, dtype=torch.float64)
         return eye + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
+    def panorama_axes(self) -> Tensor:
+        """Axes of an upright panorama, [3, 3] float64: columns are its right, its up, and the back (middle is ahead).
+
+        Ahead is the world axis that is most level, the first of equals, made level.
+        """
+        level = torch.zeros(3, dtype=torch.float64)
+        level[int(self.up.abs().round(decimals=6).argmin())] = 1.0
+        ahead = unit(level - (level @ self.up) * self.up, 1e-9)
+        return torch.stack((torch.linalg.cross(ahead, self.up), self.up, -ahead), dim=1)
+
 
 def surroundings(cameras: Sequence[Camera]) -> Surroundings:
     """The frame of some cameras, at least one.

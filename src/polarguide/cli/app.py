@@ -14,6 +14,7 @@ from polarguide.cli.ablate import ablate
 from polarguide.cli.compare import compare
 from polarguide.cli.demo import demo
 from polarguide.cli.evaluate import evaluate
+from polarguide.cli.export import export
 from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
@@ -28,6 +29,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "eval": evaluate,
     "render": render_views,
     "share": share,
+    "export": export,
     "priors": priors,
     "compare": compare,
     "ablate": ablate,

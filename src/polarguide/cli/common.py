@@ -9,8 +9,10 @@ from typing import Literal
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
 
 from polarguide import _native
+from polarguide.camera import Camera
 from polarguide.capture import Scene, View, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, DeviceName, choose_backend
@@ -78,15 +80,28 @@ class OpenRun:
         """How its layers combine."""
         return self.recipe.shading(self.configuration.settings.refractive_index)
 
-    @torch.no_grad()
+    @property
+    def environment(self) -> dict[str, Tensor] | None:
+        """Parameters of the learned environment; None for a recipe without."""
+        return self.state.environment.parameters if self.state.environment else None
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras of the scene's views by name."""
+        return {view.name: view.camera for view in self.scene.views}
+
     def render(self, view: View, *, normals: bool = True, depth: bool = False) -> RenderResult:
         """All layers of a view; ``normals`` where the recipe can do without them, and ``depth``, on request."""
-        environment = self.state.environment
+        return self.render_camera(view.camera, normals=normals, depth=depth)
+
+    @torch.no_grad()
+    def render_camera(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
+        """The same for any camera."""
         return render(
             self.state.rows,
-            view.camera,
+            camera,
             self.backend.rasterise,
-            environment=environment.parameters if environment else None,
+            environment=self.environment,
             shading=self.shading,
             normals=normals,
             depth=depth,

@@ -97,7 +97,10 @@ def shown_metrics(run: Path) -> list[tuple[str, str]]:
         record = json.loads(path.read_text())
     except ValueError as error:
         raise PolarguideError(
-            path, expected="the scores of a run", found=f"no JSON ({error})", remedy="Run polarguide eval again."
+            path,
+            expected="the scores of a run",
+            found=f"no JSON ({error})",
+            remedy="Run polarguide eval again.",
         ) from None
     validate_metrics(record, where=path)
     return [

@@ -47,10 +47,10 @@ def share(
 def page_of(opened: OpenRun, *, title: str = "", caption: str = "") -> str:
     """The page of a run; the photographs' poses are its views, the first test view is where it begins."""
     views = opened.scene.test_views + opened.scene.train_views
-    configuration, environment = opened.configuration, opened.state.environment
+    configuration = opened.configuration
     return share_page(
         opened.state.rows,
-        environment.parameters if environment else None,
+        opened.environment,
         opened.shading,
         {view.name: view.camera for view in views},
         first=views[0].name,

@@ -103,7 +103,10 @@ def records(rows: Rows, kind: Kind) -> Records:
     if kind != "plain":
         put(14, _fraction(torch.sigmoid(row("strength_logits")), 65535, "<u2"))
     put(32, _half(row("sh_dc")))
-    for name, scale_at, at in (("sh_rest", 30, 48), *((("local_rest", 102, 112),) if kind == "local" else ())):
+    for name, scale_at, at in (
+        ("sh_rest", 30, 48),
+        *((("local_rest", 102, 112),) if kind == "local" else ()),
+    ):
         steps, scale = harmonics_steps(row(name))
         put(scale_at, scale)
         put(at, steps)

@@ -88,7 +88,9 @@ def share_page(
         scene |= {"resolution": int(levels[0].shape[1]), "levels": len(levels)}
     if isinstance(shading, Shading):
         scene |= {"blend": shading.blend, "index": shading.index}
-    script = "\n".join(f'"use strict";\n{_page(name)}' if not i else _page(name) for i, name in enumerate(SCRIPTS))
+    script = "\n".join(
+        f'"use strict";\n{_page(name)}' if not i else _page(name) for i, name in enumerate(SCRIPTS)
+    )
     return Template(_page("page.html")).substitute(
         policy=_policy(script),
         version=html.escape(__version__),
@@ -135,7 +137,9 @@ def _frame(cameras: Mapping[str, Camera], first: str) -> dict[str, Any]:
 def _policy(script: str) -> str:
     """Only this script may run, and nothing may be asked for; the sorting worker is made of the script's own text."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return f"default-src 'none'; script-src 'sha256-{digest}' blob:; worker-src blob:; style-src 'unsafe-inline'"
+    return (
+        f"default-src 'none'; script-src 'sha256-{digest}' blob:; worker-src blob:; style-src 'unsafe-inline'"
+    )
 
 
 def _page(name: str) -> str:
