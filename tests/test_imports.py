@@ -14,6 +14,7 @@ ROOMS = (
     "vectors",
     "camera",
     "surroundings",
+    "trajectory",
     "_native",
     "optics",
     "capture",

@@ -81,6 +81,14 @@ def texels_of(picture: Tensor, shading: Shading, around: Surroundings, resolutio
     return torch.log(light.clamp(min=_NO_LIGHT)).clamp(max=MAXIMUM_LOG_LIGHT).float()
 
 
+@torch.no_grad()
+def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
+    """Raw texels [6, R, R, C] after turning what they show by a rotation [3, 3] of the world."""
+    directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
+    found = cubemap_lookup(texels, directions.to(texels.dtype))
+    return found.reshape(6, resolution, resolution, -1)
+
+
 def write_exr(path: Path, picture: Tensor) -> None:
     """Write linear radiance [H, W, 3] as 32-bit floats.
 

@@ -33,7 +33,7 @@ def directional_levels(light: Mapping[str, Tensor]) -> list[Tensor]:
 
 @torch.no_grad()
 def network_numbers(light: Mapping[str, Tensor]) -> NDArray[np.float32]:
-    """The MLP: for each layer its weights [inputs, outputs], then its biases; outputs filled up to a multiple of four."""
+    """The MLP: for each layer weights [inputs, outputs], then biases; outputs filled up to a multiple of four."""
     rows = []
     for layer in range(3):
         for values in (light[f"mlp_weight_{layer}"].detach(), light[f"mlp_bias_{layer}"].detach()[None]):

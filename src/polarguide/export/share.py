@@ -75,7 +75,12 @@ def share_page(
     notes = [LEFT_OUT] if kind is None else [TURNED_LOCALLY] if kind == "local" else []
     kind = kind or "plain"
     quantised = records(rows, kind)
-    scene = {"kind": kind, "texels": TEXELS[kind], "count": len(quantised.data), "layers": LAYERS[kind]}
+    scene: dict[str, Any] = {
+        "kind": kind,
+        "texels": TEXELS[kind],
+        "count": len(quantised.data),
+        "layers": LAYERS[kind],
+    }
     scene |= _frame(cameras, first) | {"index": 1.5, "resolution": 1, "levels": 1}
     arrays: dict[str, NDArray[np.generic] | None] = {"light": None, "network": None, "viridis": viridis()}
     if kind != "plain" and environment is not None:

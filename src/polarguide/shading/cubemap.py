@@ -115,7 +115,7 @@ def _face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def ringed(texture: Tensor) -> Tensor:
-    """The faces [6, R, R, C] with the ring of texels [6, R + 2, R + 2, C] that makes a look-up of four taps seamless."""
+    """Faces [6, R, R, C] with the ring of texels around each, [6, R + 2, R + 2, C], that makes four taps seamless."""
     resolution, channels = texture.shape[1], texture.shape[-1]
     ring = _ring(resolution, texture.device)
     texels = texture.reshape(-1, channels)
