@@ -51,12 +51,12 @@ def film(
             )
         video.parent.mkdir(parents=True, exist_ok=True)
         count = write_video(video, pictures, frames_per_second=speed)
-        console.print(f"video: {video} ({count} pictures, {count / speed:.1f} s)")
+        console.print(f"video: {video} ({count} pictures, {count / speed:.1f} s)", markup=False)
         return
     out.mkdir(parents=True, exist_ok=True)
     for number, picture in enumerate(pictures):
         figures.write_png(out / f"path_{number:05d}.png", picture)
-    console.print(f"pictures: {out}/path_*.png")
+    console.print(f"pictures: {out}/path_*.png", markup=False)
 
 
 def _pictures(opened: OpenRun, layers: list[str], cameras: list[Camera]) -> Iterator[Picture]:

@@ -41,7 +41,10 @@ def share(
     page = page_of(opened, title=title, caption=caption)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_page(path, page)
-    console.print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB, {len(opened.state.rows):,} Gaussians)")
+    console.print(
+        f"page: {path} ({path.stat().st_size / 1e6:.1f} MB, {len(opened.state.rows):,} Gaussians)",
+        markup=False,
+    )
 
 
 def page_of(opened: OpenRun, *, title: str = "", caption: str = "") -> str:
