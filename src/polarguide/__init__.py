@@ -8,16 +8,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from polarguide.api import load
+    from polarguide.api import Model, PolarguideError, load
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load"]
+__all__ = ["Model", "PolarguideError", "__version__", "load"]
 
 
 def __getattr__(name: str) -> Any:
     # Only when it is asked for: the command line has to say how threads wait before torch is imported.
-    if name == "load":
-        from polarguide.api import load
+    if name in ("Model", "PolarguideError", "load"):
+        from polarguide import api
 
-        return load
+        return getattr(api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -19,6 +19,8 @@ from polarguide.raster import DeviceName
 from polarguide.shading.result import RenderResult
 from polarguide.trained import TrainedRun, open_trained
 
+__all__ = ["LAYERS", "Model", "PolarguideError", "load"]
+
 LAYERS = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth", "alpha")
 """What ``Model.render`` gives, by the names of ``polarguide.shading.result.RenderResult``."""
 

@@ -118,15 +118,16 @@ def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, small
     ).marching_cubes
     known = (weight >= least).numpy()
     try:
-        vertices, faces, normals, _ = marching_cubes(
-            field.numpy(), 0.0, mask=known, gradient_direction="ascent"
+        # Its normals point to smaller values, into the surface; with "descent" its faces turn outward.
+        vertices, faces, inward, _ = marching_cubes(
+            field.numpy(), 0.0, mask=known, gradient_direction="descent"
         )
     except (RuntimeError, ValueError):
         raise PolarguideError(
             "mesh", expected="a surface that several views see", found="none", remedy="Train for more steps."
         ) from None
     world = vertices.astype(np.float64) * box.size + box.low.numpy() + 0.5 * box.size
-    return largest_pieces(Surface(world, faces.astype(np.int64), normals.astype(np.float64)), smallest)
+    return largest_pieces(Surface(world, faces.astype(np.int64), -inward.astype(np.float64)), smallest)
 
 
 def largest_pieces(surface: Surface, smallest: float) -> Surface:
