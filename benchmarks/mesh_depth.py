@@ -11,11 +11,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 import trimesh
 
 from polarguide.cli.common import open_run
+from polarguide.evaluation import figures
 from polarguide.gaussians.initialise import scene_extent
 
 
@@ -30,16 +32,34 @@ def mesh_depth(mesh: trimesh.Trimesh, camera, step: int) -> np.ndarray:
     return depth.reshape(rays.shape[:2])
 
 
+def pictures(mesh: trimesh.Trimesh, camera) -> np.ndarray:
+    """The mesh from a camera, colours and normals side by side, uint8 RGB."""
+    ways = camera.to_world(camera.rays(dtype=torch.float64)).reshape(-1, 3).numpy()
+    start = np.broadcast_to(camera.centre.numpy(), ways.shape)
+    places, which, faces = mesh.ray.intersects_location(start, ways, multiple_hits=False)
+    shares = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], places)[..., None]
+    colours, normals = np.zeros((len(ways), 3)), np.zeros((len(ways), 3))
+    colours[which] = (mesh.visual.vertex_colors[mesh.faces[faces], :3] * shares).sum(axis=1)
+    normals[which] = (mesh.vertex_normals[mesh.faces[faces]] * shares).sum(axis=1)
+    shape = (camera.height, camera.width, 3)
+    shown = figures.normal_to_rgb(torch.from_numpy(normals.reshape(shape)), camera)
+    return np.concatenate((colours.reshape(shape).round().astype(np.uint8), shown), axis=1)
+
+
 def main() -> None:
     """Print the median errors of each test view and of all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("mesh", type=Path)
     parser.add_argument("--step", type=int, default=2)
+    parser.add_argument("--picture", type=Path, help="JPEG or PNG to write of the first test view")
     arguments = parser.parse_args()
     opened = open_run(arguments.run)
     extent = scene_extent(torch.stack([camera.centre for camera in opened.cameras.values()]))
     mesh = trimesh.load(arguments.mesh, process=False)
+    if arguments.picture:
+        shown = pictures(mesh, opened.scene.test_views[0].camera)
+        cv2.imwrite(str(arguments.picture), cv2.resize(shown, None, fx=2, fy=2)[..., ::-1])
     errors: dict[str, list[np.ndarray]] = {"mesh": [], "rendered": []}
     missing = []
     for view in opened.scene.test_views:

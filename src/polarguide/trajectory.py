@@ -119,7 +119,7 @@ def read_path(path: Path) -> tuple[list[Camera], float]:
         return cameras, speed
     except FileNotFoundError:
         found = "no such file"
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
         found = f"something else ({error!r:.120})"
     raise PolarguideError(
         path,

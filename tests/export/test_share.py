@@ -51,6 +51,9 @@ class Reader(HTMLParser):
         self.attributes += attrs
         self._script = dict(attrs).get("id") or "program" if tag == "script" else ""
 
+    def handle_endtag(self, tag: str) -> None:
+        self._script = ""
+
     def handle_data(self, data: str) -> None:
         if self._script:
             self.scripts[self._script] = self.scripts.get(self._script, "") + data
@@ -76,7 +79,8 @@ def test_nothing_comes_from_outside_and_only_the_page_s_own_script_may_run() -> 
     digest = base64.b64encode(hashlib.sha256(reader.scripts["program"].encode()).digest()).decode()
     assert "default-src 'none'" in policy
     assert f"script-src 'sha256-{digest}' blob:" in policy
-    assert "$" not in re.sub(r"(?s)<script.*?</script>", "", text), "a place that was not filled"
+    rest = re.sub(r"(?s)<script.*?</script>", "", text)
+    assert not re.search(r"\$[a-z{]", rest), "a place that was not filled"
 
 
 @pytest.mark.parametrize("recipe", KINDS)

@@ -49,8 +49,8 @@ def browser() -> Iterator[Any]:
 class Opened:
     """A page in the browser, with what it asked for and complained about."""
 
-    def __init__(self, browser: Any, path: Path) -> None:
-        self.page = browser.new_page(viewport={"width": 640, "height": 420}, has_touch=True)
+    def __init__(self, browser: Any, path: Path, width: int = 640, height: int = 420) -> None:
+        self.page = browser.new_page(viewport={"width": width, "height": height}, has_touch=True)
         self.page.set_default_timeout(1000 * PATIENCE)
         self.requests: list[str] = []
         self.complaints: list[str] = []
@@ -74,6 +74,7 @@ class Opened:
         self.until("!polarguide.waiting && !polarguide.drawing && !polarguide.moving")
 
     def shot(self) -> np.ndarray:
+        self.page.evaluate("document.activeElement.blur()")  # no frame around the picture
         self.settled()
         return decoded(self.page.locator("#stage").screenshot())
 
@@ -118,7 +119,7 @@ def ours(recipe: str, layer: str, camera: Camera) -> np.ndarray:
 
 @pytest.mark.parametrize("recipe", KINDS)
 def test_layers_agree_with_the_rasteriser(recipe: str, browser: Any, tmp_path: Path) -> None:
-    opened = Opened(browser, written(recipe, tmp_path))
+    opened = Opened(browser, written(recipe, tmp_path), 200, 300)
     cameras = ring()
     layers = opened.page.evaluate("polarguide.scene.layers")
     for view in ("v0", "v2"):

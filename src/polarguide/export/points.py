@@ -11,6 +11,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from polarguide.capture import View
+from polarguide.errors import PolarguideError
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.raster import Rasterise
 from polarguide.shading.directional import albedo_of
@@ -28,10 +29,21 @@ FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
 
 @torch.no_grad()
 def surface_points(rows: Rows, views: Iterable[View], rasterise: Rasterise) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions, outward unit normals and display colours, each [M, 3], of opaque Gaussians that a view sees."""
+    """Positions, outward unit normals and display colours, each [M, 3], of opaque Gaussians that a view sees.
+
+    Raises:
+        PolarguideError: there are none.
+    """
     outward = outward_directions(rows, views, rasterise)
     opaque = torch.sigmoid(rows["opacity_logits"]) >= OPAQUE
     kept = (opaque & (outward.norm(dim=1) > 0)).nonzero()[:, 0]
+    if not len(kept):
+        raise PolarguideError(
+            "--format points",
+            expected="opaque Gaussians that a view sees",
+            found="none",
+            remedy="Train for more steps.",
+        )
     means, side = rows["means"][kept], outward[kept]
     normals = shortest_axis_normals(
         means, rows["quaternions"][kept], rows["log_scales"][kept], torch.zeros(3)
