@@ -1,3 +1,23 @@
-"""polarguide: polarization photographs to a Gaussian splatting scene with its reflections separated."""
+"""polarguide: polarization photographs to a Gaussian splatting scene with its reflections separated.
+
+``polarguide.load(RUN)`` opens a trained run; see ``polarguide.api``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from polarguide.api import Model, PolarguideError, load
 
 __version__ = "0.1.0"
+__all__ = ["Model", "PolarguideError", "__version__", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    # Only when it is asked for: the command line has to say how threads wait before torch is imported.
+    if name in ("Model", "PolarguideError", "load"):
+        from polarguide import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

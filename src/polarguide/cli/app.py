@@ -15,9 +15,11 @@ from polarguide.cli.compare import compare
 from polarguide.cli.demo import demo
 from polarguide.cli.evaluate import evaluate
 from polarguide.cli.inspect import inspect
+from polarguide.cli.export import export
 from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
+from polarguide.cli.share import share
 from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
 
@@ -28,6 +30,8 @@ VERBS: dict[str, Callable[..., Any]] = {
     "train": train,
     "eval": evaluate,
     "render": render_views,
+    "share": share,
+    "export": export,
     "priors": priors,
     "compare": compare,
     "ablate": ablate,

@@ -11,16 +11,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from polarguide import _native
+from polarguide.camera import Camera
 from polarguide.capture import Scene, View, load_scene
 from polarguide.errors import PolarguideError
-from polarguide.raster import Backend, DeviceName, choose_backend
-from polarguide.recipes import recipe_named
-from polarguide.shading.model import ShadingModel
-from polarguide.shading.render import render
+from polarguide.raster import DeviceName
 from polarguide.shading.result import RenderResult
-from polarguide.training.run import RunConfiguration, load_checkpoint, recipe_data
-from polarguide.training.stages import Recipe
-from polarguide.training.state import TrainingState
+from polarguide.trained import TrainedRun, open_trained
+from polarguide.training.run import recipe_data
 
 Transfer = Literal["linear", "srgb"]
 
@@ -57,65 +54,51 @@ def read_scene(path: Path, *, downscale: int, transfer: Transfer) -> Scene:
 
         scene = load_scene(path, downscale=downscale, transfer=transfer, progress=report)
     for warning in scene.warnings:
-        console.print("[yellow]warning:[/] ", end="")
-        console.print(warning, markup=False)
+        _warn(warning)
     return scene
 
 
 @dataclass(frozen=True, eq=False)
-class OpenRun:
+class OpenRun(TrainedRun):
     """A trained run with its scene."""
 
-    folder: Path
-    configuration: RunConfiguration
     scene: Scene
-    recipe: Recipe
-    state: TrainingState
-    backend: Backend
 
     @property
-    def shading(self) -> ShadingModel:
-        """How its layers combine."""
-        return self.recipe.shading(self.configuration.settings.refractive_index)
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras of the scene's views by name."""
+        return {view.name: view.camera for view in self.scene.views}
 
     def render(self, view: View, *, normals: bool = True, depth: bool = False) -> RenderResult:
         """All layers of a view, on the CPU; ``normals`` where the recipe can do without, and ``depth``, on request."""
         return self.draw(view, normals=normals, depth=depth).to("cpu")
 
-    @torch.no_grad()
     def draw(self, view: View, *, normals: bool = True, depth: bool = False) -> RenderResult:
         """``render``, left on the backend's device, which may not be done with it yet."""
-        environment = self.state.environment
-        return render(
-            self.state.rows,
-            view.camera,
-            self.backend.rasterise,
-            environment=environment.parameters if environment else None,
-            shading=self.shading,
-            normals=normals,
-            depth=depth,
-        )
+        return self.render_camera(view.camera, normals=normals, depth=depth)
 
 
 def open_run(folder: Path, *, device: DeviceName = "auto", scene: Scene | None = None) -> OpenRun:
     """Open a run folder and the scene it was trained on, unless that is at hand already."""
-    configuration = RunConfiguration.load(folder)
-    recipe = recipe_named(configuration.recipe)
-    backend = choose_backend(device, say=console.print)
-    state = load_checkpoint(folder, recipe, backend.device)
+    run = open_trained(folder, device=device, say=console.print)
+    configuration, recipe = run.configuration, run.recipe
     if scene is None:
         transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
         scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
     if scene.digest != configuration.scene_digest:
-        console.print(
-            f"[yellow]warning:[/] {configuration.scene} has changed since {folder} was trained on it."
-        )
+        _warn(f"{configuration.scene} has changed since {folder} was trained on it.")
     if recipe_data(recipe) != configuration.recipe_data:
-        console.print(
-            f"[yellow]warning:[/] {folder} was trained with other values of the recipe {recipe.name} than this "
-            "version has; its pictures are shaded with this version's."
+        _warn(
+            f"{folder} was trained with other values of the recipe {recipe.name} than this version has; its pictures "
+            "are shaded with this version's."
         )
-    return OpenRun(folder, configuration, scene, recipe, state, backend)
+    return OpenRun(folder, configuration, recipe, run.state, run.backend, scene)
+
+
+def _warn(text: str) -> None:
+    """Print a warning; names in it are shown as they are."""
+    console.print("[yellow]warning:[/] ", end="")
+    console.print(text, markup=False)
 
 
 def select_views(scene: Scene, choice: str) -> tuple[View, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import resource
 from pathlib import Path
@@ -15,7 +16,9 @@ import polarguide
 from polarguide import _native
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, console, open_run, use_threads
+from polarguide.errors import PolarguideError
 from polarguide.evaluation import score_view, write_metrics
+from polarguide.evaluation.record import RUN_KEYS, validate_metrics
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.speed import frames_per_second
 from polarguide.raster import DeviceName
@@ -80,6 +83,32 @@ def evaluate_run(opened: OpenRun, *, speed: bool = True) -> dict[str, Any]:
     )
     _print(record, opened)
     return record
+
+
+def shown_metrics(run: Path) -> list[tuple[str, str]]:
+    """Labels and values of a run's scores, for people; nothing where it has not been scored.
+
+    Raises:
+        PolarguideError: ``metrics.json`` is not what ``eval`` writes.
+    """
+    path = run / METRICS
+    if not path.exists():
+        return []
+    try:
+        record = json.loads(path.read_text())
+    except ValueError as error:
+        raise PolarguideError(
+            path,
+            expected="the scores of a run",
+            found=f"no JSON ({error})",
+            remedy="Run polarguide eval again.",
+        ) from None
+    validate_metrics(record, where=path)
+    return [
+        (f"{label}, test views", f"{record[key]:.3f} {unit}".rstrip())
+        for key, label, unit in SHOWN_KEYS
+        if key not in RUN_KEYS and record[key] is not None
+    ]
 
 
 def _speed(opened: OpenRun, **layers: bool) -> float | None:

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
-from numpy.typing import NDArray
-from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, console, open_run, select_views, use_threads
+from polarguide.cli.film import film
+from polarguide.cli.pictures import Picture, layer_picture, true_depth_range, truth_pictures
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import figures
+from polarguide.export.environment import needs_radiance, read_panorama, texels_of, turned_cubemap
 from polarguide.raster import DeviceName
-from polarguide.shading.result import RenderResult
+from polarguide.surroundings import surroundings
 
-Picture = NDArray[np.uint8]
 LAYERS = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth", "alpha")
 SHEET_VIEWS = 8
+RELIT_RESOLUTION = 128
 
 
 def render_views(
@@ -30,11 +29,16 @@ def render_views(
     *,
     views: str = "test",
     layers: str = "final,base,reflection,specular,diffuse,strength,normal,depth",
+    path: str = "",
+    frames: int = 120,
+    video: Path | None = None,
+    environment: Path | None = None,
+    rotate_environment: float = 0.0,
     out: Path | None = None,
     device: DeviceName = "auto",
     threads: int = 0,
 ) -> None:
-    """Render a run's layers to PNG, with a contact sheet beside the ground truth.
+    """Render a run's layers to PNG, with a contact sheet beside the ground truth; or along a path, as a video.
 
     specular and diffuse are the contributions that add up to final; normals are in camera space, blue facing the
     camera.
@@ -43,6 +47,11 @@ def render_views(
         run: Run folder.
         views: test, train, all, or names separated by commas.
         layers: Any of final, base, reflection, specular, diffuse, strength, normal, depth, alpha.
+        path: In place of views: orbit, spiral, interpolate (through the photographs), or a JSON file of cameras.
+        frames: Pictures along the path (a file has its own).
+        video: MP4 file to write of the path, layers side by side; PNG files if not given.
+        environment: Panorama of linear radiance (.hdr, .exr) to be reflected in place of the learned environment.
+        rotate_environment: Degrees by which to turn the environment, counter-clockwise seen from above.
         out: Folder to write; RUN/render by default.
         device: What to compute on.
         threads: Threads to use; 0 takes all cores.
@@ -58,8 +67,36 @@ def render_views(
         raise PolarguideError(
             "--layers", expected="any of " + ", ".join(LAYERS), found="none", remedy="Name a layer."
         )
+    if video is not None and not path:
+        raise PolarguideError("--video", expected="a --path", found="none", remedy="Add --path orbit.")
     opened = open_run(run, device=device)
-    render_run(opened, select_views(opened.scene, views), names, out or run / "render")
+    relight(opened, environment, rotate_environment)
+    if path:
+        film(opened, names, path=path, frames=frames, video=video, out=out or run / "render")
+    else:
+        render_run(opened, select_views(opened.scene, views), names, out or run / "render")
+
+
+def relight(opened: OpenRun, panorama: Path | None, degrees: float) -> None:
+    """Put a panorama in the learned environment's place, or turn it, in the run as it is in memory."""
+    if panorama is None and degrees % 360 == 0:
+        return
+    if not math.isfinite(degrees):
+        raise PolarguideError(
+            "--rotate-environment", expected="degrees", found=str(degrees), remedy="Give a number."
+        )
+    learned = opened.environment
+    what = "--environment" if panorama else "--rotate-environment"
+    shading = needs_radiance(opened.shading, lit=learned is not None, what=what)
+    assert learned is not None
+    around = surroundings(list(opened.cameras.values()))
+    if panorama is not None:
+        learned["texels"] = texels_of(read_panorama(panorama), shading, around, RELIT_RESOLUTION)
+    learned["texels"] = turned_cubemap(learned["texels"].detach(), around.turn(degrees), RELIT_RESOLUTION)
+    if shading.local:
+        console.print(
+            "note: what stands near is reflected by light of the Gaussians' own, which stays as it was learned"
+        )
 
 
 def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out: Path) -> Path:
@@ -70,7 +107,7 @@ def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out:
     missing: set[str] = set()
     for view in views:
         result = opened.render(view, depth=True)
-        depths = _true_depth_range(view)
+        depths = true_depth_range(view)
         pictures = {name: layer_picture(result, name, view.camera, depths) for name in layers}
         for name, picture in pictures.items():
             if picture is None:
@@ -88,56 +125,3 @@ def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out:
         console.print(f"this recipe has no layer {', '.join(sorted(missing))}")
     console.print(f"pictures: {out}   contact sheet: {sheet}")
     return sheet
-
-
-def layer_picture(
-    result: RenderResult, name: str, camera: Camera, depths: tuple[float, float] | None = None
-) -> Picture | None:
-    """One layer as an 8-bit picture, or None where the recipe has no such layer; ``depths`` sets depth's colours."""
-    values: Tensor | None = getattr(result, name)
-    if values is None:
-        return None
-    near, far = depths or (0.0, 1.0)
-    if name == "depth" and depths is None:
-        near, far = _depth_range(values, result.alpha > 0.5)
-    draw: dict[str, Callable[[Tensor], Picture]] = {
-        "normal": lambda v: figures.normal_to_rgb(v, camera),
-        "depth": lambda v: figures.scalar_to_rgb(v, near, far),
-        "strength": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
-        "alpha": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
-    }
-    return draw.get(name, figures.radiance_to_rgb)(values)
-
-
-def _depth_range(depth: Tensor, seen: Tensor) -> tuple[float, float]:
-    """Nearest and farthest depth [H, W] worth a colour where ``seen`` [H, W]."""
-    values = depth[seen]
-    if values.numel() == 0:
-        return 0.0, 1.0
-    near, far = float(values.quantile(0.02)), float(values.quantile(0.9))
-    return near, max(far, near + 1e-6)
-
-
-def _true_depth_range(view: View) -> tuple[float, float] | None:
-    """The range of the true depths, so that rendered and true pictures share their colours; None without truth."""
-    truth = view.truth
-    if truth is None or truth.depth is None or truth.mask is None:
-        return None
-    return _depth_range(truth.depth, truth.mask)
-
-
-def truth_pictures(view: View) -> dict[str, Picture]:
-    """The photograph as ``final``, and what is known of the other layers, as 8-bit pictures."""
-    pictures = {"final": figures.radiance_to_rgb(view.photograph())}
-    truth = view.truth
-    if truth is None:
-        return pictures
-    if truth.normal is not None:
-        pictures["normal"] = figures.normal_to_rgb(truth.normal, view.camera)
-    for name, layer in (("specular", truth.specular), ("diffuse", truth.diffuse)):
-        if layer is not None:
-            pictures[name] = figures.radiance_to_rgb(layer / 2)
-    depths = _true_depth_range(view)
-    if truth.depth is not None and depths is not None:
-        pictures["depth"] = figures.scalar_to_rgb(truth.depth, *depths)
-    return pictures

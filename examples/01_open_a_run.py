@@ -1,0 +1,26 @@
+"""Open a trained run, look at what it holds, and render a held-out view.
+
+python examples/01_open_a_run.py runs/demo
+"""
+
+import sys
+
+import polarguide
+
+model = polarguide.load(sys.argv[1])
+print(model)
+
+# Rows of the Gaussians, by name; one row a Gaussian.
+for name, rows in model.gaussians.items():
+    print(f"  {name:16} {list(rows.shape)}")
+
+# Linear radiance and world normals of a view, by its name.
+view = model.scene.test_names[0]
+layers = model.render(view, layers=["final", "normal", "depth"])
+print(f"view {view}: mean radiance {layers['final'].mean():.4f}, median depth {layers['depth'].median():.3f}")
+
+# What polarguide eval has measured, if it has.
+try:
+    print(f"PSNR of the test views: {model.metrics()['psnr']:.2f} dB")
+except polarguide.PolarguideError as error:
+    print(error)

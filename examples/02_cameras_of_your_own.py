@@ -1,0 +1,19 @@
+"""Render from cameras that no photograph was taken from: a turn around the scene, written as PNG files.
+
+python examples/02_cameras_of_your_own.py runs/demo turn
+"""
+
+import sys
+from pathlib import Path
+
+import polarguide
+from polarguide.evaluation.figures import normal_to_rgb, radiance_to_rgb, write_png
+from polarguide.trajectory import orbit
+
+model, out = polarguide.load(sys.argv[1]), Path(sys.argv[2])
+out.mkdir(parents=True, exist_ok=True)
+for number, camera in enumerate(orbit(list(model.cameras.values()), frames=8)):
+    layers = model.render(camera, layers=["final", "normal"])
+    write_png(out / f"final_{number}.png", radiance_to_rgb(layers["final"]))
+    write_png(out / f"normal_{number}.png", normal_to_rgb(layers["normal"], camera))
+print(f"8 pictures of each layer in {out}")

@@ -1,0 +1,117 @@
+"""``polarguide export``."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import tyro
+
+from polarguide.cli.common import OpenRun, console, open_run, use_threads
+from polarguide.errors import PolarguideError
+from polarguide.evaluation import figures
+from polarguide.export.cameras import write_colmap, write_transforms
+from polarguide.export.compressed import Compressed, write_compressed
+from polarguide.export.environment import needs_radiance, panorama, write_exr
+from polarguide.export.mesh import scene_mesh, write_mesh
+from polarguide.export.points import surface_points, write_points
+from polarguide.export.splats import write_run_ply
+from polarguide.surroundings import surroundings
+
+Format = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
+PANORAMA_HEIGHT = 512
+
+
+def export(
+    run: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    format: Format,
+    out: Path | None = None,
+    resolution: int = 192,
+    threads: int = 0,
+) -> None:
+    """Write a run as the files of other programs.
+
+    ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB and PLY) is
+    fused from rendered depth, with diffuse colours and learned normals; points are opaque Gaussians with normals;
+    environment is the learned light as a panorama (EXR and PNG); cameras are a COLMAP model and transforms.json.
+
+    Args:
+        run: Run folder.
+        format: ply, spz, sog, mesh, points, environment or cameras.
+        out: Folder to write; RUN/export by default.
+        resolution: Voxels of the mesh along its longest side.
+        threads: Threads to use; 0 takes all cores.
+    """
+    use_threads(threads)
+    if not 16 <= resolution <= 1024:
+        raise PolarguideError(
+            "--resolution", expected="16 to 1024", found=str(resolution), remedy="Choose such a number."
+        )
+    opened = open_run(run)
+    folder = out or run / "export"
+    folder.mkdir(parents=True, exist_ok=True)
+    writers: dict[str, Callable[[], list[Path]]] = {
+        "ply": lambda: [_ply(opened, folder / "splats.ply")],
+        **{kind: _compressed_writer(opened, folder, kind) for kind in get_args(Compressed)},
+        "mesh": lambda: _mesh(opened, folder, resolution),
+        "points": lambda: _points(opened, folder),
+        "environment": lambda: _environment(opened, folder),
+        "cameras": lambda: _cameras(opened, folder),
+    }
+    for path in writers[format]():
+        size = f" ({path.stat().st_size / 1e6:.1f} MB)" if path.is_file() else ""
+        console.print(f"{format}: {path}{size}", markup=False)
+
+
+def _ply(opened: OpenRun, path: Path) -> Path:
+    write_run_ply(path, opened.state, opened.shading)
+    return path
+
+
+def _compressed_writer(opened: OpenRun, folder: Path, kind: Compressed) -> Callable[[], list[Path]]:
+    def write() -> list[Path]:
+        path = folder / f"splats.{kind}"
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".ply-") as place:
+            write_compressed(path, _ply(opened, Path(place) / "splats.ply"), kind)
+        return [path]
+
+    return write
+
+
+def _mesh(opened: OpenRun, folder: Path, resolution: int) -> list[Path]:
+    cameras = opened.cameras
+    mesh = scene_mesh(cameras, lambda camera: opened.render_camera(camera, depth=True), resolution=resolution)
+    paths = [folder / "mesh.glb", folder / "mesh.ply"]
+    for path in paths:
+        write_mesh(path, mesh, surroundings(list(cameras.values())))
+    console.print(f"{len(mesh.surface.vertices):,} vertices, {len(mesh.surface.faces):,} triangles")
+    return paths
+
+
+def _points(opened: OpenRun, folder: Path) -> list[Path]:
+    path = folder / "points.ply"
+    write_points(path, *surface_points(opened.state.rows, opened.scene.views, opened.backend.rasterise))
+    return [path]
+
+
+def _environment(opened: OpenRun, folder: Path) -> list[Path]:
+    environment = opened.environment
+    shading = needs_radiance(opened.shading, lit=environment is not None, what="--format environment")
+    assert environment is not None
+    around = surroundings(list(opened.cameras.values()))
+    picture = panorama(environment["texels"], shading, around, PANORAMA_HEIGHT)
+    paths = [folder / "environment.exr", folder / "environment.png"]
+    write_exr(paths[0], picture)
+    figures.write_png(paths[1], figures.radiance_to_rgb(picture))
+    return paths
+
+
+def _cameras(opened: OpenRun, folder: Path) -> list[Path]:
+    scene = opened.scene
+    write_colmap(folder / "sparse" / "0", opened.cameras, scene.points, scene.point_colours)
+    write_transforms(folder / "transforms.json", opened.cameras)
+    return [folder / "sparse" / "0", folder / "transforms.json"]

@@ -1,0 +1,147 @@
+"""The learned environment as a panorama, and panoramas as environments.
+
+A panorama [H, 2 H, 3] is upright in the scene: row i, column j look at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
+cameras' common level and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle, to the right. Files hold linear
+radiance on the scale of the photographs (S0 / 2).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, pad
+
+from polarguide.errors import PolarguideError
+from polarguide.export.extras import needed
+from polarguide.shading.cubemap import cubemap_lookup, texel_directions
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, ShadingModel
+from polarguide.shading.render import Shading
+from polarguide.surroundings import Surroundings
+
+LARGEST = 8192 * 4096
+_NO_LIGHT = 1e-4  # radiance of black, so that its logarithm is finite
+
+
+def needs_radiance(shading: ShadingModel, *, lit: bool, what: str) -> Shading:
+    """The shading model if its environment is radiance; ``what`` asks for it.
+
+    Raises:
+        PolarguideError: the recipe has no environment, or one of features that only its network can read.
+    """
+    if lit and isinstance(shading, Shading):
+        return shading
+    raise PolarguideError(
+        what,
+        expected="a recipe that learns the radiance of its surroundings",
+        found="one whose environment holds features for a network" if lit else "a run without reflection",
+        remedy="Take a run of 3dgs-dr, polarguide or polarguide-stokes.",
+    )
+
+
+@torch.no_grad()
+def panorama(texels: Tensor, shading: Shading, around: Surroundings, height: int) -> Tensor:
+    """Radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
+    steps = torch.arange(2 * height, dtype=torch.float64) + 0.5
+    latitude, longitude = (
+        math.pi * (0.5 - steps[:height, None] / height),
+        math.pi * (steps[None] / height - 1),
+    )
+    x, y, z = torch.broadcast_tensors(
+        latitude.cos() * longitude.sin(), latitude.sin(), -latitude.cos() * longitude.cos()
+    )
+    directions = torch.stack((x, y, z), dim=-1).reshape(-1, 3) @ around.panorama_axes().T
+    found = cubemap_lookup(texels.detach(), directions.to(texels.dtype))
+    return shading.light(found).reshape(height, 2 * height, 3)
+
+
+@torch.no_grad()
+def texels_of(picture: Tensor, shading: Shading, around: Surroundings, resolution: int) -> Tensor:
+    """Raw texels [6, R, R, 3] that a panorama [H, W, 3] of radiance is the light of, as far as the blend can hold it.
+
+    ``lerp`` holds radiance below 1, ``fresnel`` below e^5.
+    """
+    directions = texel_directions(resolution).double() @ around.panorama_axes()
+    x, y, z = directions.unbind(-1)
+    across, down = torch.atan2(x, -z) / math.pi, -2 / math.pi * torch.asin(y.clamp(-1, 1))
+    # One column more on each side: the panorama goes round.
+    wide = pad(picture.double().movedim(-1, 0)[None], (1, 1, 0, 0), mode="circular")
+    width = picture.shape[1]
+    places = torch.stack((across * width / (width + 2), down), dim=-1).reshape(
+        1, 6 * resolution, resolution, 2
+    )
+    found = grid_sample(wide, places, mode="bilinear", padding_mode="border", align_corners=False)
+    light = found[0].movedim(0, -1).reshape(6, resolution, resolution, 3)
+    if shading.blend == "lerp":
+        return torch.logit(light.clamp(_NO_LIGHT, 1 - _NO_LIGHT)).float()
+    return torch.log(light.clamp(min=_NO_LIGHT)).clamp(max=MAXIMUM_LOG_LIGHT).float()
+
+
+@torch.no_grad()
+def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
+    """Raw texels [6, R, R, C] after turning what they show by a rotation [3, 3] of the world."""
+    directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
+    found = cubemap_lookup(texels, directions.to(texels.dtype))
+    return found.reshape(6, resolution, resolution, -1)
+
+
+def write_exr(path: Path, picture: Tensor) -> None:
+    """Write linear radiance [H, W, 3] as 32-bit floats.
+
+    Raises:
+        PolarguideError: OpenEXR is not installed.
+    """
+    exr = needed("OpenEXR", "an EXR file")
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32))
+    with exr.File(header, {"RGB": pixels}) as file:
+        file.write(str(path))
+
+
+def read_panorama(path: Path) -> Tensor:
+    """Read a panorama of linear radiance, Radiance HDR or OpenEXR: [H, W, 3] float32, not negative.
+
+    Raises:
+        PolarguideError: no such file, not twice as wide as high, or not such a picture.
+    """
+    expected = "a panorama of linear radiance, .hdr or .exr, twice as wide as high"
+    remedy = "Give an equirectangular picture."
+    if not path.is_file() or path.suffix.lower() not in (".hdr", ".exr"):
+        found = "no such file" if not path.is_file() else f"a name that ends in {path.suffix or 'nothing'}"
+        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+    pixels = _exr_pixels(path) if path.suffix.lower() == ".exr" else _hdr_pixels(path)
+    if (
+        pixels is None
+        or pixels.ndim != 3
+        or pixels.shape[1] != 2 * pixels.shape[0]
+        or pixels.size > 3 * LARGEST
+    ):
+        found = "something else" if pixels is None else f"a picture of shape {list(pixels.shape)}"
+        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+    values = torch.from_numpy(np.ascontiguousarray(pixels[..., :3], dtype=np.float32))
+    return values.nan_to_num(0.0, 6e4, 0.0).clamp(0, 6e4)
+
+
+def _exr_pixels(path: Path) -> np.ndarray | None:
+    exr = needed("OpenEXR", str(path))
+    try:
+        with exr.File(str(path)) as file:
+            channels = file.channels()
+            if "RGB" in channels or "RGBA" in channels:
+                return np.array(channels.get("RGB", channels.get("RGBA")).pixels)
+            return np.stack([np.array(channels[name].pixels) for name in "RGB"], axis=-1)
+    except (RuntimeError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _hdr_pixels(path: Path) -> np.ndarray | None:
+    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    try:
+        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    except cv2.error:
+        return None
+    return None if decoded is None or decoded.ndim != 3 else decoded[..., ::-1]

@@ -1,0 +1,132 @@
+"""A trained scene as a triangle mesh with the normals and the diffuse colours that were learned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.export.extras import needed
+from polarguide.export.fusion import TRUNCATION, Box, Surface, box_around, fuse, seen_points, surface_of
+from polarguide.shading.display import srgb_encode
+from polarguide.shading.result import RenderResult
+from polarguide.surroundings import Surroundings, surroundings
+from polarguide.training.run import atomic
+from polarguide.vectors import dot, unit
+
+OPAQUE = 0.8
+# Pixels whose surface is seen at a flatter angle than this cosine do not give depth.
+_STEEPEST = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class ColouredMesh:
+    """A mesh with linear diffuse colours [V, 3] in [0, 1]."""
+
+    surface: Surface
+    colours: NDArray[np.float64]
+
+
+@torch.no_grad()
+def scene_mesh(
+    cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
+) -> ColouredMesh:
+    """Fuse the depth that a scene's cameras see.
+
+    Args:
+        cameras: at least two. render: gives a view with depth and normals.
+        resolution: voxels along the longest side of what the cameras look at.
+
+    Raises:
+        PolarguideError: there is no surface, or a library is missing.
+    """
+    needed("skimage.measure", "--format mesh")
+    views = [(camera, _kept(render(camera), camera)) for camera in cameras.values()]
+    around = surroundings(list(cameras.values()))
+    points = [seen_points(camera, seen.depth, seen.mask) for camera, seen in views]
+    box = box_around(points, around.centre, around.distance, resolution)
+    field, weight = fuse(box, ((camera, seen.depth, seen.mask) for camera, seen in views))
+    return painted(surface_of(box, field, weight), views, box)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Of one view: depth [H, W], where it counts [H, W], diffuse colour and world normal [H, W, 3]."""
+
+    depth: Tensor
+    mask: Tensor
+    diffuse: Tensor
+    normal: Tensor
+
+
+def _kept(result: RenderResult, camera: Camera) -> Seen:
+    assert result.depth is not None
+    assert result.normal is not None
+    normal = unit(result.normal, 1e-3)
+    cosine = -dot(camera.world_rays(), normal)
+    diffuse = result.base if result.diffuse is None else result.diffuse
+    return Seen(result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse, normal)
+
+
+def painted(surface: Surface, views: list[tuple[Camera, Seen]], box: Box) -> ColouredMesh:
+    """Colours and normals of the views that see each vertex, weighted by how squarely they do."""
+    vertices = torch.from_numpy(surface.vertices)
+    own = torch.from_numpy(surface.normals)
+    colour, normal = torch.zeros_like(vertices), torch.zeros_like(vertices)
+    total = torch.zeros(len(vertices), dtype=torch.float64)
+    for camera, seen in views:
+        x, y, z = camera.to_camera(vertices - camera.centre).unbind(-1)
+        safe = z.clamp(min=1e-6)
+        column, row = (camera.fx * x / safe + camera.cx).floor(), (camera.fy * y / safe + camera.cy).floor()
+        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        column, row = column.clamp(0, camera.width - 1).long(), row.clamp(0, camera.height - 1).long()
+        near = (seen.depth[row, column] - z).abs() < TRUNCATION * box.size
+        squarely = dot(unit(camera.centre - vertices), own).clamp(min=0)
+        weight = (inside & near & seen.mask[row, column]) * squarely
+        colour += weight[:, None] * seen.diffuse[row, column]
+        normal += weight[:, None] * seen.normal[row, column]
+        total += weight
+    # What no view sees squarely keeps the normal of its surface, and the colour grey.
+    learned = unit(normal, 1e-9)
+    agrees = (total > 0) & (dot(learned, own) > 0)
+    normals = torch.where(agrees[:, None], learned, own)
+    colours = torch.where((total > 0)[:, None], colour / total.clamp(min=1e-9)[:, None], 0.2)
+    return ColouredMesh(
+        Surface(surface.vertices, surface.faces, normals.numpy()), colours.clamp(0, 1).numpy()
+    )
+
+
+def write_mesh(path: Path, mesh: ColouredMesh, around: Surroundings) -> None:
+    """Write a mesh: PLY in world axes with display colours, or GLB, upright (+y), with linear colours as glTF has them.
+
+    Raises:
+        PolarguideError: trimesh is not installed.
+    """
+    trimesh = needed("trimesh", "--format mesh")
+    binary = path.suffix.lower() == ".glb"
+    shown = torch.from_numpy(mesh.colours)
+    values = (shown if binary else srgb_encode(shown)).mul(255).round().to(torch.uint8).numpy()
+    made = trimesh.Trimesh(
+        vertices=mesh.surface.vertices,
+        faces=mesh.surface.faces,
+        vertex_normals=mesh.surface.normals,
+        vertex_colors=np.concatenate((values, np.full((len(values), 1), 255, np.uint8)), axis=1),
+        process=False,
+        validate=False,
+    )
+    if binary:
+        pose = np.eye(4)
+        pose[:3, :3] = around.panorama_axes().T.numpy()
+        scene = trimesh.Scene()
+        scene.add_geometry(made, node_name="mesh", geom_name="mesh", transform=pose)
+        data = scene.export(file_type="glb", include_normals=True)
+    else:
+        data = made.export(file_type="ply", vertex_normal=True)
+    with atomic(path) as temporary:
+        temporary.write_bytes(data)

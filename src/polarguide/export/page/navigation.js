@@ -1,0 +1,53 @@
+/** Where the reader stands: a pose with the lens of a photograph, moved about a pivot. */
+class Navigation {
+  constructor(scene) {
+    this.scene = scene;
+    this.stand(scene.cameras[scene.first]);
+  }
+
+  /** Stand where a photograph was taken. */
+  stand(camera) {
+    this.lens = camera;
+    this.rotation = camera.rotation;
+    this.eye = scaled(apply(transposed(camera.rotation), camera.translation), -1);
+    const ahead = dot(add(this.scene.centre, this.eye, -1), this.rotation.slice(6));
+    this.pivot = add(this.eye, this.rotation.slice(6), Math.max(ahead, 0.1 * this.scene.distance));
+  }
+
+  /** Turn about the pivot by angles around the upward and the rightward axis. */
+  orbit(around, over) {
+    const right = this.rotation.slice(0, 3), up = this.scene.up;
+    let turn = product(turning(up, around), turning(right, over));
+    const forward = apply(turn, this.rotation.slice(6));
+    if (Math.abs(dot(forward, up)) > 0.98) turn = turning(up, around);
+    this.rotation = product(this.rotation, transposed(turn));
+    this.rotation = [0, 1, 2].flatMap((k) => unit(this.rotation.slice(3 * k, 3 * k + 3)));
+    this.eye = add(this.pivot, apply(turn, add(this.eye, this.pivot, -1)));
+  }
+
+  zoom(factor) {
+    const away = add(this.eye, this.pivot, -1), far = Math.hypot(...away) * factor;
+    if (far < 0.02 * this.scene.distance || far > 50 * this.scene.distance) return;
+    this.eye = add(this.pivot, away, factor);
+  }
+
+  /** Shift eye and pivot by a share of the picture's height. */
+  pan(right, down) {
+    const far = Math.hypot(...add(this.eye, this.pivot, -1)) * this.lens.height / this.lens.fy;
+    const shift = add(scaled(this.rotation.slice(0, 3), -right * far), this.rotation.slice(3, 6), -down * far);
+    this.eye = add(this.eye, shift);
+    this.pivot = add(this.pivot, shift);
+  }
+
+  /** The camera for a picture of some size: the photograph's lens, its whole picture in it. */
+  camera(width, height) {
+    const { lens, rotation } = this, factor = Math.min(width / lens.width, height / lens.height);
+    return {
+      width, height, rotation,
+      translation: scaled(apply(rotation, this.eye), -1),
+      fx: lens.fx * factor, fy: lens.fy * factor,
+      cx: (lens.cx - lens.width / 2) * factor + width / 2,
+      cy: (lens.cy - lens.height / 2) * factor + height / 2,
+    };
+  }
+}

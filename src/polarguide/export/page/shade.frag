@@ -1,0 +1,105 @@
+// From the blended layers to the picture: deferred reflection per pixel, as shading/render.py and directional.py.
+uniform sampler2D target0, target1, target2, target3;
+uniform mat3 rotation; // world to camera
+uniform mat3 turn;     // of the environment, world to learned axes
+uniform vec4 lens;
+uniform vec2 size;
+uniform int layer;     // 0 final, 1 diffuse, 2 specular, 3 base, 4 strength, 5 normal
+uniform float split;   // left of this column stands the diffuse layer
+uniform float gain;    // on the specular layer
+uniform float exposure;
+uniform float index;   // refractive
+out vec4 shown;
+
+const float MAXIMUM_LOG = 5.0;
+
+vec3 encode(vec3 linear) {
+  vec3 v = clamp(linear * exposure, 0.0, 1.0);
+  return mix(12.92 * v, 1.055 * pow(max(v, 0.0031308), vec3(1.0 / 2.4)) - 0.055, greaterThan(v, vec3(0.0031308)));
+}
+
+#ifdef DIRECTIONAL
+uniform sampler2D network; // weights by input, then biases, four outputs a texel; three layers
+vec4 weight(int at) { return texelFetch(network, ivec2(at & 4095, at >> 12), 0); }
+
+vec3 radiance(vec3 direction, float roughness, vec4 feature) {
+  float level = clamp(float(levels) * roughness, 0.0, float(levels - 1));
+  int lower = min(int(level), levels - 2), first = 0, n = resolution;
+  for (int k = 0; k < lower; ++k) {
+    first += 6 * (n + 2) * (n + 2) * 4;
+    n = max(n / 2, 1);
+  }
+  int second = first + 6 * (n + 2) * (n + 2) * 4, m = max(n / 2, 1);
+  vec4 factors = feature * inversesqrt(max(dot(feature, feature), 1e-6));
+  float values[80];
+  for (int group = 0; group < 4; ++group) {
+    vec4 found = mix(lookUp(first, n, 4, group, direction), lookUp(second, m, 4, group, direction), level - float(lower));
+    for (int k = 0; k < 4; ++k) {
+      values[4 * group + k] = found[k];
+      for (int j = 0; j < 4; ++j) values[16 + 16 * group + 4 * k + j] = found[k] * factors[j];
+    }
+  }
+  float hidden[WIDTH];
+  for (int k = 0; k < WIDTH / 4; ++k) {
+    vec4 sum = weight(80 * (WIDTH / 4) + k);
+    for (int i = 0; i < 80; ++i) sum += values[i] * weight(i * (WIDTH / 4) + k);
+    for (int j = 0; j < 4; ++j) hidden[4 * k + j] = max(sum[j], 0.0);
+  }
+  int at = 81 * (WIDTH / 4);
+  vec4 last = weight(at + (WIDTH + 1) * (WIDTH / 4) + WIDTH);
+  for (int k = 0; k < WIDTH / 4; ++k) {
+    vec4 sum = weight(at + WIDTH * (WIDTH / 4) + k);
+    for (int i = 0; i < WIDTH; ++i) sum += hidden[i] * weight(at + i * (WIDTH / 4) + k);
+    for (int j = 0; j < 4; ++j)
+      last += max(sum[j], 0.0) * weight(at + (WIDTH + 1) * (WIDTH / 4) + 4 * k + j);
+  }
+  return exp(min(last.rgb, MAXIMUM_LOG));
+}
+#endif
+
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  vec4 base = texelFetch(target0, at, 0);
+  vec3 normal = texelFetch(target1, at, 0).xyz;
+  float squared = dot(normal, normal);
+  vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+  vec3 ray = transpose(rotation) * normalize(vec3((pixel - lens.zw) / lens.xy, 1.0));
+  vec3 diffuse = base.rgb, specular = vec3(0.0);
+  float strength = 0.0;
+#ifdef LIT
+  vec3 facing = normal * inversesqrt(max(squared, 1e-6));
+  vec3 direction = turn * (ray - 2.0 * dot(ray, facing) * facing);
+  vec3 further = texelFetch(target2, at, 0).rgb;
+  strength = further.x;
+#ifdef DIRECTIONAL
+  if (base.a > 0.05) specular = radiance(direction, further.x, vec4(further.yz, texelFetch(target3, at, 0).xy));
+#else
+  vec3 raw = lookUp(0, resolution, 1, 0, direction).rgb;
+#ifdef FRESNEL
+  vec3 lit = exp(min(raw, MAXIMUM_LOG));
+#else
+  vec3 lit = 1.0 / (1.0 + exp(-raw));
+#endif
+#ifdef LOCAL
+  lit = max(lit + texelFetch(target3, at, 0).rgb, 0.0);
+#endif
+#ifdef FRESNEL
+  float c = clamp(-dot(ray, facing), 0.0, 1.0), t = sqrt(index * index - 1.0 + c * c), p = index * index * c;
+  float s2 = (c - t) / (c + t), p2 = (p - t) / (p + t);
+  specular = strength * 0.5 * (s2 * s2 + p2 * p2) * lit;
+#else
+  specular = strength * lit;
+  diffuse = (1.0 - strength) * base.rgb;
+#endif
+#endif
+#endif
+  specular *= gain;
+  int which = pixel.x < split ? 1 : layer;
+  vec3 seen = encode(which == 0 ? diffuse + specular : which == 1 ? diffuse : which == 2 ? specular : base.rgb);
+  if (which == 4) seen = texelFetch(viridis, ivec2(int(clamp(strength, 0.0, 1.0) * 255.0 + 0.5), 0), 0).rgb;
+  if (which == 5) {
+    float size_ = sqrt(squared);
+    seen = 0.5 * (size_ > 1e-8 ? rotation * normal * vec3(1.0, -1.0, -1.0) / size_ : vec3(0.0)) + 0.5;
+  }
+  shown = vec4(seen, 1.0);
+}

@@ -1,0 +1,71 @@
+"""The Gaussians on a scene's surfaces as a plain point cloud with normals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.errors import PolarguideError
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.raster import Rasterise
+from polarguide.shading.directional import albedo_of
+from polarguide.shading.display import srgb_encode
+from polarguide.shading.model import Rows
+from polarguide.shading.render import harmonic_colours
+from polarguide.training.orientation import outward_directions
+from polarguide.training.run import atomic
+
+OPAQUE = 0.5
+FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
+    (name, "u1") for name in ("red", "green", "blue")
+]
+
+
+@torch.no_grad()
+def surface_points(rows: Rows, views: Iterable[View], rasterise: Rasterise) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions, outward unit normals and display colours, each [M, 3], of opaque Gaussians that a view sees.
+
+    Raises:
+        PolarguideError: there are none.
+    """
+    outward = outward_directions(rows, views, rasterise)
+    opaque = torch.sigmoid(rows["opacity_logits"]) >= OPAQUE
+    kept = (opaque & (outward.norm(dim=1) > 0)).nonzero()[:, 0]
+    if not len(kept):
+        raise PolarguideError(
+            "--format points",
+            expected="opaque Gaussians that a view sees",
+            found="none",
+            remedy="Train for more steps.",
+        )
+    means, side = rows["means"][kept], outward[kept]
+    normals = shortest_axis_normals(
+        means, rows["quaternions"][kept], rows["log_scales"][kept], torch.zeros(3)
+    )
+    normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
+    if "log_albedo" in rows:
+        linear = albedo_of(rows)[kept]
+    else:
+        few = {name: rows[name][kept] for name in ("sh_dc", "sh_rest")}
+        linear = harmonic_colours(few, -normals.contiguous())
+    colours = srgb_encode(linear.clamp(0, 1))
+    return means, normals, colours
+
+
+def write_points(path: Path, points: Tensor, normals: Tensor, colours: Tensor) -> None:
+    """Write a PLY of points."""
+    table = np.empty(len(points), dtype=FIELDS)
+    values = np.concatenate((points.numpy(), normals.numpy()), axis=1)
+    for index, (name, _) in enumerate(FIELDS[:6]):
+        table[name] = values[:, index]
+    shades = np.rint(colours.numpy() * 255).astype(np.uint8)
+    for index, name in enumerate(("red", "green", "blue")):
+        table[name] = shades[:, index]
+    with atomic(path) as temporary:
+        PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary)

@@ -1,0 +1,144 @@
+"""Camera paths: around a scene, through its photographs' poses, or from a file.
+
+A file is JSON, ``{"cameras": [...], "frames_per_second": 30}``, each camera with ``width``, ``height``, ``fx``, ``fy``,
+``cx``, ``cy``, ``rotation`` (world to camera, 9 numbers row by row) and ``translation`` (3 numbers), in OpenCV's axes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.errors import PolarguideError
+from polarguide.surroundings import Surroundings, surroundings
+from polarguide.vectors import dot, unit
+
+LARGEST_SIDE = 8192
+MOST_FRAMES = 100_000
+
+
+def looking(lens: Camera, eye: Tensor, target: Tensor, up: Tensor) -> Camera:
+    """A camera with the lens and size of another at ``eye`` [3], looking at ``target`` [3], upright towards ``up``."""
+    forward = unit(target - eye, 1e-12)
+    right = unit(torch.linalg.cross(forward, up), 1e-12)
+    rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
+    return replace(lens, rotation=rotation, translation=-rotation @ eye)
+
+
+def orbit(cameras: Sequence[Camera], frames: int, *, swing: float = 0.0) -> list[Camera]:
+    """Once around the scene at the cameras' median height and distance, beginning at the first camera's side.
+
+    Args:
+        cameras: of the scene, at least one; the first one's lens is used.
+        frames: pictures, the last a step before the first. swing: up and down by this share of the distance, twice.
+    """
+    around = surroundings(cameras)
+    ahead, side = _level_axes(around, cameras[0].centre)
+    offsets = torch.stack([camera.centre for camera in cameras]) - around.centre
+    height = float((offsets @ around.up).median())
+    level = offsets - (offsets @ around.up)[:, None] * around.up
+    radius = max(float(level.norm(dim=1).median()), 1e-6 * around.distance)
+    path = []
+    for k in range(frames):
+        angle = 2 * math.pi * k / frames
+        lift = height + swing * around.distance * math.sin(2 * angle)
+        eye = around.centre + radius * (math.cos(angle) * ahead + math.sin(angle) * side) + lift * around.up
+        path.append(looking(cameras[0], eye, around.centre, around.up))
+    return path
+
+
+def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """An orbit that goes up and down by a quarter of the distance, twice."""
+    return orbit(cameras, frames, swing=0.25)
+
+
+def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A smooth path through cameras in their order: cubic splines of place and rotation (SciPy's ``RotationSpline``).
+
+    Cameras that stand in the same place as the one before are left out.
+    """
+    kept = list(cameras[:1])
+    for camera in cameras[1:]:
+        if float((camera.centre - kept[-1].centre).norm()) > 1e-9:
+            kept.append(camera)
+    if len(kept) == 1:
+        return kept * frames
+    times, wanted = np.arange(len(kept)), np.linspace(0, len(kept) - 1, frames)
+    centres = CubicSpline(times, torch.stack([camera.centre for camera in kept]).numpy())(wanted)
+    turns = Rotation.from_matrix(torch.stack([camera.rotation for camera in kept]).numpy())
+    rotations = RotationSpline(times, turns)(wanted).as_matrix()
+    path = []
+    for centre, matrix in zip(centres, rotations, strict=True):
+        rotation = torch.from_numpy(np.ascontiguousarray(matrix))
+        path.append(replace(kept[0], rotation=rotation, translation=-rotation @ torch.from_numpy(centre)))
+    return path
+
+
+def _level_axes(around: Surroundings, begin: Tensor) -> tuple[Tensor, Tensor]:
+    """Level directions from the centre towards ``begin`` [3], and a quarter turn from it, counter-clockwise."""
+    offset = begin - around.centre
+    level = offset - dot(offset, around.up) * around.up
+    if float(level.norm()) < 1e-6 * around.distance:
+        level = -around.panorama_axes()[:, 2]
+    ahead = unit(level, 1e-12)
+    return ahead, torch.linalg.cross(around.up, ahead)
+
+
+def camera_record(camera: Camera) -> dict[str, Any]:
+    """A camera as the file holds it."""
+    return {
+        **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+        "rotation": camera.rotation.flatten().tolist(),
+        "translation": camera.translation.tolist(),
+    }
+
+
+def read_path(path: Path) -> tuple[list[Camera], float]:
+    """Cameras of a file, and its frames a second (30 if it does not say).
+
+    Raises:
+        PolarguideError: no such file, or one that is not as the module says.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        cameras = [_camera_of(record) for record in data["cameras"]]
+        speed = float(data.get("frames_per_second", 30))
+        if not 1 <= len(cameras) <= MOST_FRAMES or not 0 < speed <= 1000:
+            raise ValueError("no cameras, too many, or no such frames_per_second")
+        return cameras, speed
+    except FileNotFoundError:
+        found = "no such file"
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
+        found = f"something else ({error!r:.120})"
+    raise PolarguideError(
+        path,
+        expected="a camera path (orbit, spiral, interpolate, or JSON with cameras)",
+        found=found,
+        remedy="docs/exporting.md shows such a file.",
+    )
+
+
+def _camera_of(record: dict[str, Any]) -> Camera:
+    numbers = [float(record[key]) for key in ("fx", "fy", "cx", "cy")]
+    size = int(record["width"]), int(record["height"])
+    rotation = torch.tensor([float(x) for x in record["rotation"]], dtype=torch.float64).reshape(3, 3)
+    translation = torch.tensor([float(x) for x in record["translation"]], dtype=torch.float64)
+    turned = torch.dist(rotation @ rotation.T, torch.eye(3, dtype=torch.float64)) < 1e-3
+    finite = all(math.isfinite(x) for x in numbers) and bool(torch.isfinite(translation).all())
+    if not (turned and float(torch.linalg.det(rotation)) > 0 and finite and translation.shape == (3,)):
+        raise ValueError("a pose or lens that is none")
+    if not (min(size) >= 1 and max(size) <= LARGEST_SIDE and min(numbers[:2]) > 0):
+        raise ValueError("a size or focal length out of range")
+    (width, height), (fx, fy, cx, cy) = size, numbers
+    return Camera(width, height, fx, fy, cx, cy, rotation, translation)

@@ -1,0 +1,278 @@
+"""share, export, render --path and the Python interface on a short training: what each writes, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from plyfile import PlyData
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+import polarguide
+from polarguide.cli.app import run
+from polarguide.export import extras, points
+from polarguide.gaussians.ply import read_ply
+from polarguide.training.run import CHECKPOINT, CONFIGURATION
+from polarguide.trajectory import camera_record
+
+EXAMPLES = sorted((Path(__file__).resolve().parents[2] / "examples").glob("*.py"))
+ONE = ("--threads", "1")
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+    """Runs a command line that must be refused in one line; returns it."""
+
+    def run_and_read(*arguments: object) -> str:
+        assert run([str(argument) for argument in arguments]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1, lines
+        assert lines[0].startswith("error: ")
+        return lines[0]
+
+    return run_and_read
+
+
+@pytest.fixture
+def copy(trained: Path, tmp_path: Path) -> Path:
+    """A copy of the training that may be damaged."""
+    return Path(shutil.copytree(trained, tmp_path / "copy"))
+
+
+def exported(trained: Path, folder: Path, kind: str, *more: str) -> Path:
+    assert run(["export", str(trained), "--format", kind, "--out", str(folder), *more, *ONE]) == 0
+    return folder
+
+
+def test_share(trained: Path, tmp_path: Path) -> None:
+    assert run(["share", str(trained), "--out", str(tmp_path / "a" / "page.html"), *ONE]) == 0
+    text = (tmp_path / "a" / "page.html").read_text()
+    assert "<h1>demo</h1>" in text
+    assert str(trained) not in text, "a page tells nothing of the folders it was made from"
+    assert not [p for p in (tmp_path / "a").iterdir() if p.name != "page.html"]
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz", "sog"])
+def test_splats_are_read_back(kind: str, trained: Path, tmp_path: Path) -> None:
+    if kind != "ply":
+        pytest.importorskip("gaussforge")
+    exported(trained, tmp_path, kind)
+    ours = read_ply(trained / "point_cloud.ply")["means"].numpy()
+    if kind == "ply":
+        found = read_ply(tmp_path / "splats.ply")["means"].numpy()
+    else:
+        reader = sys.modules["gaussforge"].GaussForge()
+        data = reader.read((tmp_path / f"splats.{kind}").read_bytes(), kind)["data"]
+        found = np.frombuffer(data["positions"], np.float32).reshape(-1, 3)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [f"splats.{kind}"]
+    assert found.shape == ours.shape
+    for axis in range(3):  # SOG is in another order
+        np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(ours[:, axis]), atol=0.02, rtol=2e-3)
+
+
+def test_points_have_unit_normals_and_colours(
+    trained: Path, tmp_path: Path, refused, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    assert "found none" in refused(
+        "export", trained, "--format", "points", "--out", tmp_path
+    )  # all are faint yet
+    monkeypatch.setattr(points, "OPAQUE", 0.02)
+    exported(trained, tmp_path, "points")
+    cloud = trimesh.load_scene(tmp_path / "points.ply").dump()[0]
+    vertices = PlyData.read(tmp_path / "points.ply")["vertex"]
+    normals = np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1)
+    assert len(cloud.vertices) == len(normals) > 0
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+    assert cloud.colors.shape == (len(normals), 4)
+
+
+def test_environment(trained: Path, tmp_path: Path) -> None:
+    pytest.importorskip("OpenEXR")
+    exported(trained, tmp_path, "environment")
+    assert {p.name for p in tmp_path.iterdir()} == {"environment.exr", "environment.png"}
+    flags = ["--views", "v000", "--layers", "final,specular", "--out", str(tmp_path / "a")]
+    assert (
+        run(["render", str(trained), "--environment", str(tmp_path / "environment.exr"), *flags, *ONE]) == 0
+    )
+    assert run(["render", str(trained), *flags[:-1], str(tmp_path / "b"), *ONE]) == 0
+    pictures = [cv2.imread(str(tmp_path / x / "v000_specular.png")).astype(float) for x in "ab"]
+    assert np.abs(pictures[0] - pictures[1]).mean() < 2, "its own environment gives nearly the same picture"
+
+
+def test_cameras_are_read_by_pycolmap_and_as_opengl_poses(trained: Path, tmp_path: Path) -> None:
+    exported(trained, tmp_path, "cameras")
+    cameras = polarguide.load(trained).cameras
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert {image.name.removesuffix(".png") for image in model.images.values()} == set(cameras)
+    for image in model.images.values():
+        camera, pose = cameras[image.name.removesuffix(".png")], image.cam_from_world()
+        np.testing.assert_allclose(pose.rotation.matrix(), camera.rotation.numpy(), atol=1e-9)
+        np.testing.assert_allclose(pose.translation, camera.translation.numpy(), atol=1e-9)
+        inner = model.cameras[image.camera_id]
+        assert (inner.width, inner.height) == (camera.width, camera.height)
+        np.testing.assert_allclose(inner.params, [camera.fx, camera.fy, camera.cx, camera.cy])
+    assert len(model.points3D) == len(polarguide.load(trained).scene.points)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in data["frames"]:
+        camera = cameras[Path(frame["file_path"]).stem]
+        pose = np.array(frame["transform_matrix"])
+        np.testing.assert_allclose(pose[:3, 3], camera.centre.numpy())
+        np.testing.assert_allclose(-pose[:3, 2], camera.rotation[2].numpy())  # looks along -z
+        np.testing.assert_allclose(pose[:3, 1], -camera.rotation[1].numpy())  # y is up
+
+
+def test_a_video_of_an_orbit_and_pictures_of_a_file(trained: Path, tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    video = tmp_path / "orbit.mp4"
+    flags = ["--layers", "final,normal,depth", *ONE]
+    assert (
+        run(["render", str(trained), "--path", "orbit", "--frames", "5", "--video", str(video), *flags]) == 0
+    )
+    film, pictures = cv2.VideoCapture(str(video)), []
+    while (read := film.read())[0]:
+        pictures.append(read[1])
+    camera = next(iter(polarguide.load(trained).cameras.values()))
+    assert {picture.shape for picture in pictures} == {(camera.height // 2 * 2, 3 * camera.width // 2 * 2, 3)}
+    assert len(pictures) == 5
+    assert [p.name for p in tmp_path.iterdir()] == ["orbit.mp4"]
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"cameras": [camera_record(camera)] * 2}))
+    assert run(["render", str(trained), "--path", str(path), "--out", str(tmp_path / "out"), *flags]) == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["path_00000.png", "path_00001.png"]
+
+
+def test_wrong_flags_are_refused(refused, trained: Path, tmp_path: Path) -> None:
+    assert "--out" in refused("share", trained, "--out", tmp_path / "page.txt")
+    assert "--resolution" in refused("export", trained, "--format", "mesh", "--resolution", 4)
+    assert "--video" in refused("render", trained, "--video", tmp_path / "a.mp4")
+    assert "--video" in refused("render", trained, "--path", "orbit", "--video", tmp_path / "a.gif")
+    assert "camera path" in refused("render", trained, "--path", "loop")
+    assert "panorama" in refused("render", trained, "--environment", tmp_path / "none.exr")
+    assert "--frames" in refused("render", trained, "--path", "orbit", "--frames", 0)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("kind", "module"), [("spz", "gaussforge"), ("mesh", "skimage.measure"), ("environment", "OpenEXR")]
+)
+def test_a_missing_library_is_named(
+    kind: str, module: str, refused, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(name: str) -> object:
+        raise ImportError(name)
+
+    monkeypatch.setattr(extras.importlib, "import_module", missing)
+    line = refused("export", trained, "--format", kind, "--out", tmp_path)
+    assert module.partition(".")[0] in line
+    assert "pip install 'polarguide[export]'" in line
+
+
+def test_load(trained: Path, demo_scene: Path) -> None:
+    model = polarguide.load(trained)
+    layers = model.render("v000", layers=["final", "normal", "alpha"])
+    assert set(layers) == {"final", "normal", "alpha"}
+    assert layers["final"].shape == (*layers["alpha"].shape, 3)
+    torch.testing.assert_close(layers["final"], model.render(model.cameras["v000"])["final"])
+    assert len(model.gaussians["means"]) == len(model.gaussians["opacity_logits"])
+    assert "Gaussians" in repr(model)
+    for wrong in (
+        lambda: model.render("v000", layers=["colour"]),
+        lambda: model.render("nowhere"),
+        model.metrics,
+    ):
+        with pytest.raises(polarguide.PolarguideError):
+            wrong()
+    with pytest.raises(AttributeError):
+        _ = polarguide.nothing
+
+
+def test_a_run_opens_without_its_scene(copy: Path, demo_scene: Path, tmp_path: Path) -> None:
+    data = json.loads((copy / CONFIGURATION).read_text())
+    (copy / CONFIGURATION).write_text(json.dumps(data | {"scene": str(tmp_path / "gone")}))
+    model = polarguide.load(copy)
+    camera = polarguide.load(copy, scene=demo_scene).cameras["v000"]
+    assert model.render(camera)["final"].shape == (camera.height, camera.width, 3)
+    with pytest.raises(polarguide.PolarguideError, match="gone"):
+        _ = model.cameras
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_run(example: Path, trained: Path, tmp_path: Path) -> None:
+    command = [sys.executable, str(example), str(trained), str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def edit(run_folder: Path, **changes: object) -> None:
+    data = json.loads((run_folder / CONFIGURATION).read_text())
+    (run_folder / CONFIGURATION).write_text(json.dumps(data | changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"recipe": "../../etc/passwd"},
+        {"recipe": "tomorrow"},
+        {"scene": "/etc"},
+        {"scene": "\0"},
+        {"scene": "[/red] [link=x]"},
+        {"future": 1},
+        {"settings": {"steps": "<script>", "seed": 0, "refractive_index": 1.5}},
+        {"settings": {"steps": 1, "seed": 0, "refractive_index": 1e308}},
+        {"downscale": 0},
+        {"transfer": "x"},
+    ],
+)
+def test_foreign_configurations_are_refused_or_harmless(
+    changes: dict[str, object], copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(copy, **changes)
+    before = sorted(tmp_path.rglob("*"))
+    status = run(["share", str(copy), "--out", str(tmp_path / "page.html"), *ONE])
+    said = capsys.readouterr().err.splitlines()
+    if status:
+        assert status == 2
+        assert len(said) == 1
+        assert sorted(tmp_path.rglob("*")) == before
+    else:
+        assert "<script>" not in (tmp_path / "page.html").read_text().split("</main>")[0]
+
+
+@pytest.mark.parametrize("damage", ["short", "shape", "nan", "type", "missing", "texels"])
+def test_damaged_checkpoints_are_refused(damage: str, refused, copy: Path, tmp_path: Path) -> None:
+    path = copy / CHECKPOINT
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(path)
+    if damage == "shape":
+        tensors["rows.sh_rest"] = tensors["rows.sh_rest"][:, :8].contiguous()
+    elif damage == "nan":
+        tensors["rows.means"][0, 0] = float("nan")
+    elif damage == "type":
+        tensors["rows.sh_dc"] = tensors["rows.sh_dc"].double()
+    elif damage == "missing":
+        del tensors["rows.log_scales"]
+    elif damage == "texels":
+        tensors["environment.texels"] = tensors["environment.texels"][:5].contiguous()
+    save_file(tensors, path, metadata=metadata)
+    if damage == "short":
+        path.write_bytes(path.read_bytes()[:-1000])
+    for command in (["share"], ["export", "--format", "ply"], ["render"]):
+        assert str(path) in refused(command[0], copy, *command[1:])
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"psnr": "<script>"}', "\xff"])
+def test_damaged_scores_are_refused(text: str, refused, copy: Path) -> None:
+    (copy / "metrics.json").write_text(text, encoding="latin-1")
+    assert "metrics.json" in refused("share", copy)

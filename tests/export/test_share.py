@@ -1,0 +1,143 @@
+"""The page: whole in one file, safe with any name, and small."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from random_runs import KINDS, random_state, ring
+
+from polarguide.export.records import TEXELS, harmonics_steps, records, shading_kind
+from polarguide.export.share import LAYERS, LEFT_OUT, share_page
+
+EVIL = "</script><img src=x onerror=alert(1)>&\"'${0}$title"
+
+
+def page(recipe: str = "3dgs-dr", name: str = "cup") -> str:
+    state, shading = random_state(recipe)
+    cameras = {f"{name}{key}": camera for key, camera in ring().items()}
+    return share_page(
+        state.rows,
+        state.environment.parameters if state.environment else None,
+        shading,
+        cameras,
+        first=f"{name}v1",
+        title=name,
+        caption=name,
+        metrics=[(name, name)],
+    )
+
+
+class Reader(HTMLParser):
+    """Collects tags, attributes and the scripts by their id."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.scripts: dict[str, str] = {}
+        self._script = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += attrs
+        self._script = dict(attrs).get("id") or "program" if tag == "script" else ""
+
+    def handle_endtag(self, tag: str) -> None:
+        self._script = ""
+
+    def handle_data(self, data: str) -> None:
+        if self._script:
+            self.scripts[self._script] = self.scripts.get(self._script, "") + data
+
+
+def test_names_and_captions_are_escaped() -> None:
+    plain, evil = Reader(page()), Reader(page(name=EVIL))
+    assert evil.tags == plain.tags, "a name has become markup"
+    assert not any(key.startswith("on") for key, _ in evil.attributes)
+    assert EVIL not in page(name=EVIL)
+    scene = json.loads(evil.scripts["scene"])
+    assert scene["cameras"][0]["name"] == f"{EVIL}v0"
+    assert scene["first"] == 1
+
+
+def test_nothing_comes_from_outside_and_only_the_page_s_own_script_may_run() -> None:
+    text = page()
+    assert not re.search(r"(?:https?:)//[a-z]|@import|(?<![a-z])url\(", text, re.IGNORECASE)
+    reader = Reader(text)
+    assert not {"link", "iframe", "object", "base", "img"} & set(reader.tags)
+    assert not [value for key, value in reader.attributes if key in ("src", "href", "action")]
+    policy = next(str(value) for key, value in reader.attributes if "default-src" in str(value))
+    digest = base64.b64encode(hashlib.sha256(reader.scripts["program"].encode()).digest()).decode()
+    assert "default-src 'none'" in policy
+    assert f"script-src 'sha256-{digest}' blob:" in policy
+    rest = re.sub(r"(?s)<script.*?</script>", "", text)
+    assert not re.search(r"\$[a-z{]", rest), "a place that was not filled"
+
+
+@pytest.mark.parametrize("recipe", KINDS)
+def test_each_kind_of_shading_has_its_data(recipe: str) -> None:
+    scripts = Reader(page(recipe)).scripts
+    scene, kind = json.loads(scripts["scene"]), KINDS[recipe]
+    assert scene["kind"] == kind
+    assert scene["layers"] == list(LAYERS[kind])  # type: ignore[index]
+    planes = gzip.decompress(base64.b64decode(scripts["records"]))
+    assert len(planes) == 16 * TEXELS[kind] * scene["count"]  # type: ignore[index]
+    assert bool(scripts.get("light")) is (kind != "plain")
+    assert bool(scripts.get("network")) is (kind == "directional")
+
+
+def test_an_unknown_shading_says_what_is_left_out() -> None:
+    class Other:
+        pass
+
+    state, _ = random_state("3dgs-dr")
+    assert state.environment is not None
+    text = share_page(state.rows, state.environment.parameters, Other(), ring(), first="v0", title="t")  # type: ignore[arg-type]
+    assert LEFT_OUT in text
+    assert json.loads(Reader(text).scripts["scene"])["kind"] == "plain"
+
+
+def test_the_same_run_gives_the_same_page() -> None:
+    assert page() == page()
+
+
+@pytest.mark.parametrize("recipe", KINDS)
+def test_records_are_close_to_what_they_stand_for(recipe: str) -> None:
+    state, shading = random_state(recipe)
+    kind = shading_kind(shading, lit=state.environment is not None)
+    assert kind == KINDS[recipe]
+    data = records(state.rows, kind).data
+    seen = torch.sigmoid(state.rows["opacity_logits"].detach()) >= 1 / 255
+    assert len(data) == int(seen.sum())
+    means = data[:, :12].copy().view("<f4")
+    kept = state.rows["means"].detach()[seen].numpy()
+    order = [int(np.flatnonzero((kept == mean).all(axis=1))[0]) for mean in means]
+    assert sorted(order) == list(range(len(kept))), "every visible Gaussian once"
+    opacity = data[:, 12:14].copy().view("<u2")[:, 0] / 65535
+    expected = torch.sigmoid(state.rows["opacity_logits"].detach())[seen].numpy()[order]
+    np.testing.assert_allclose(opacity, expected, atol=1e-5)
+    scales = data[:, 24:30].copy().view("<f2").astype(np.float32)
+    np.testing.assert_allclose(
+        np.exp(scales), state.rows["log_scales"].detach()[seen].exp().numpy()[order], rtol=2e-3
+    )
+
+
+def test_harmonics_keep_to_half_a_step() -> None:
+    rest = (
+        torch.randn(50, 15, 3, generator=torch.Generator().manual_seed(1))
+        * torch.logspace(-4, 1, 50)[:, None, None]
+    )
+    rest[7] = 0
+    steps, scale = harmonics_steps(rest)
+    error = np.abs(steps * scale[:, None].astype(np.float32) - rest.flatten(1).numpy())
+    assert (error <= 0.51 * scale[:, None].astype(np.float32) + 0.06 * np.abs(rest.flatten(1).numpy())).all()
+    assert np.isfinite(scale.astype(np.float32)).all()

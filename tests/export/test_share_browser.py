@@ -1,0 +1,274 @@
+"""The page in a browser: what it draws against our rasteriser, every control pressed, and no request made.
+
+Needs Playwright (``pip install polarguide[browser]``) and a Chromium of the system.
+"""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from random_runs import KINDS, random_state, ring
+
+from polarguide.camera import Camera
+from polarguide.cli.pictures import layer_picture
+from polarguide.export.share import share_page, write_page
+from polarguide.raster.cpu import rasterise_cpu
+from polarguide.shading.render import render
+
+playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system"),
+    pytest.mark.slow,
+]
+FLAGS = (
+    "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--ignore-gpu-blocklist"
+)
+PATIENCE = 240  # seconds; software rendering on a busy machine is slow
+LEAST = 40.0  # dB; the promise is 30, what is seen is above 55
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as running:
+        chromium = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
+        yield chromium
+        chromium.close()
+
+
+class Opened:
+    """A page in the browser, with what it asked for and complained about."""
+
+    def __init__(self, browser: Any, path: Path, width: int = 640, height: int = 420) -> None:
+        self.page = browser.new_page(viewport={"width": width, "height": height}, has_touch=True)
+        self.page.set_default_timeout(1000 * PATIENCE)
+        self.requests: list[str] = []
+        self.complaints: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
+        self.page.goto(path.as_uri())
+        self.until("document.getElementById('message').hidden")
+
+    def until(self, condition: str) -> None:
+        """Wait for an expression; Playwright's own waiting evaluates text, which the page's policy forbids."""
+        end = time.monotonic() + PATIENCE
+        while not self.page.evaluate(condition):
+            assert time.monotonic() < end, f"{condition}: {self.message()} {self.complaints}"
+            time.sleep(0.05)
+
+    def message(self) -> str:
+        return str(self.page.evaluate("document.getElementById('message').textContent"))
+
+    def settled(self) -> None:
+        self.until("!polarguide.waiting && !polarguide.drawing && !polarguide.moving")
+
+    def shot(self) -> np.ndarray:
+        self.page.evaluate("document.activeElement.blur()")  # no frame around the picture
+        self.settled()
+        return decoded(self.page.locator("#stage").screenshot())
+
+    def look(self) -> dict[str, Any]:
+        found = self.page.evaluate("({eye: polarguide.navigation.eye, looks: polarguide.looks})")
+        return dict(found)
+
+    def pictures(self, view: str, layers: list[str]) -> list[np.ndarray]:
+        addresses = self.page.evaluate("([v, l]) => polarguide.pictures(v, l)", [view, layers])
+        return [decoded(base64.b64decode(address.split(",")[1])) for address in addresses]
+
+
+def decoded(data: bytes) -> np.ndarray:
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-9)))
+
+
+def written(recipe: str, folder: Path) -> Path:
+    state, shading = random_state(recipe)
+    light = state.environment.parameters if state.environment else None
+    path = folder / f"{recipe}.html"
+    write_page(
+        path, share_page(state.rows, light, shading, ring(), first="v0", title="<b>title</b>", caption="&")
+    )
+    return path
+
+
+@torch.no_grad()
+def ours(recipe: str, layer: str, camera: Camera) -> np.ndarray:
+    state, shading = random_state(recipe)
+    light = state.environment.parameters if state.environment else None
+    result = render(state.rows, camera, rasterise_cpu, environment=light, shading=shading)
+    picture = layer_picture(result, layer, camera)
+    assert picture is not None
+    return picture
+
+
+@pytest.mark.parametrize("recipe", KINDS)
+def test_layers_agree_with_the_rasteriser(recipe: str, browser: Any, tmp_path: Path) -> None:
+    opened = Opened(browser, written(recipe, tmp_path), 200, 300)
+    cameras = ring()
+    layers = opened.page.evaluate("polarguide.scene.layers")
+    for view in ("v0", "v2"):
+        for layer, picture in zip(layers, opened.pictures(view, layers), strict=True):
+            found = psnr(picture, ours(recipe, layer, cameras[view]))
+            assert found > LEAST, f"{view} {layer}: {found:.1f} dB"
+    own = [url for url in opened.requests if not url.startswith(("file:", "blob:null/"))]
+    assert not own
+    assert opened.requests[0].startswith("file:")
+    assert sum(url.startswith("file:") for url in opened.requests) == 1
+    assert not opened.complaints
+    opened.page.close()
+
+
+@pytest.fixture(scope="module")
+def local(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
+    opened = Opened(browser, written("polarguide-stokes", tmp_path_factory.mktemp("page")))
+    yield opened
+    assert not opened.complaints
+    opened.page.close()
+
+
+@pytest.fixture
+def fresh(local: Opened) -> Opened:
+    local.page.click("#reset")
+    local.settled()
+    return local
+
+
+def test_names_are_text(fresh: Opened) -> None:
+    assert fresh.page.inner_text("h1") == "<b>title</b>"
+    assert fresh.page.title() == "<b>title</b>"
+
+
+def test_layer_buttons_and_keys(fresh: Opened) -> None:
+    final = fresh.shot()
+    for key, name in enumerate(fresh.page.evaluate("polarguide.scene.layers"), start=1):
+        fresh.page.click(f"button[data-layer={name}]")
+        assert fresh.page.get_attribute(f"button[data-layer={name}]", "aria-pressed") == "true"
+        chosen = fresh.shot()
+        assert (name == "final") == bool((chosen == final).all())
+        fresh.page.click("button[data-layer=final]")
+        fresh.page.focus("#picture")
+        fresh.page.keyboard.press(str(key))
+        assert (fresh.shot() == chosen).all()
+
+
+def test_mouse_turns_shifts_and_zooms(fresh: Opened) -> None:
+    def drag(**how: Any) -> float:
+        before, distance = (
+            fresh.look()["eye"],
+            fresh.page.evaluate("Math.hypot(...polarguide.navigation.eye)"),
+        )
+        fresh.page.mouse.move(300, 150)
+        fresh.page.mouse.down(**how)
+        fresh.page.mouse.move(340, 160)
+        fresh.page.mouse.up(**how)
+        after = fresh.look()["eye"]
+        assert after != before
+        return float(abs(fresh.page.evaluate("Math.hypot(...polarguide.navigation.eye)") - distance))
+
+    assert drag() < 1e-3  # about the scene: the distance stays
+    assert drag(button="right") > 1e-3
+    fresh.page.keyboard.down("Shift")
+    assert drag() > 1e-3
+    fresh.page.keyboard.up("Shift")
+    before = fresh.page.evaluate("Math.hypot(...polarguide.navigation.eye)")
+    fresh.page.mouse.wheel(0, -200)
+    fresh.until(f"Math.hypot(...polarguide.navigation.eye) < 0.9 * {before}")
+
+
+def test_keyboard_moves(fresh: Opened) -> None:
+    fresh.page.focus("#picture")
+    for key in ("ArrowLeft", "ArrowUp", "Shift+ArrowRight", "Shift+ArrowDown", "+", "-", "n", "p"):
+        before = fresh.look()["eye"]
+        fresh.page.keyboard.press(key)
+        assert fresh.look()["eye"] != before, key
+
+
+def test_fingers_turn_and_pinch(fresh: Opened) -> None:
+    send = fresh.page.context.new_cdp_session(fresh.page).send
+
+    def touch(kind: str, *points: tuple[int, int]) -> None:
+        send(
+            "Input.dispatchTouchEvent",
+            {"type": kind, "touchPoints": [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]},
+        )
+
+    before = fresh.look()["eye"]
+    touch("touchStart", (300, 150))
+    touch("touchMove", (330, 150))
+    touch("touchEnd")
+    assert fresh.look()["eye"] != before
+    distance = fresh.page.evaluate("Math.hypot(...polarguide.navigation.eye)")
+    touch("touchStart", (280, 150), (320, 150))
+    touch("touchMove", (240, 150), (360, 150))
+    touch("touchEnd")
+    fresh.until(f"Math.hypot(...polarguide.navigation.eye) < 0.8 * {distance}")
+
+
+@pytest.mark.parametrize(("slider", "value"), [("turn", "90"), ("gain", "0"), ("exposure", "1")])
+def test_sliders_change_the_picture(fresh: Opened, slider: str, value: str) -> None:
+    before = fresh.shot()
+    fresh.page.fill(f"#{slider}", value)
+    assert not (fresh.shot() == before).all()
+    fresh.page.click("#reset")
+    assert (fresh.shot() == before).all()
+
+
+def test_turning_the_environment_by_keys(fresh: Opened) -> None:
+    fresh.page.focus("#picture")
+    fresh.page.keyboard.press("]")
+    fresh.page.keyboard.press("]")
+    fresh.page.keyboard.press("[")
+    assert fresh.look()["looks"]["turn"] == 5
+
+
+def test_the_slider_parts_diffuse_from_final(fresh: Opened) -> None:
+    final = fresh.shot()
+    fresh.page.click("button[data-layer=diffuse]")
+    diffuse = fresh.shot()
+    fresh.page.click("button[data-layer=final]")
+    fresh.page.click("#compare")
+    width, handle = final.shape[1], fresh.page.locator("#handle").bounding_box()
+    assert handle
+    fresh.page.mouse.move(handle["x"] + 12, 40)
+    fresh.page.mouse.down()
+    fresh.page.mouse.move(0.25 * width, 40)
+    fresh.page.mouse.up()
+    parted = fresh.shot()
+    left, right = slice(0, width // 4 - 30), slice(width // 4 + 30, width)
+    assert (parted[:, left] == diffuse[:, left]).all()
+    assert (parted[:, right] == final[:, right]).all()
+    fresh.page.focus("#handle")
+    fresh.page.keyboard.press("ArrowRight")
+    assert fresh.page.get_attribute("#handle", "aria-valuenow") == "27"
+
+
+def test_views_are_chosen_by_name(fresh: Opened) -> None:
+    fresh.page.select_option("#view", label="v3")
+    expected = ring()["v3"].centre.tolist()
+    np.testing.assert_allclose(fresh.look()["eye"], expected, atol=1e-6)
+
+
+def test_the_screen_shows_what_pictures_gives(fresh: Opened) -> None:
+    """At rest the whole photograph fits the stage: its middle rows are those of our rasteriser at that size."""
+    size = fresh.page.evaluate("[polarguide.canvas.width, polarguide.canvas.height]")
+    record = fresh.page.evaluate(f"polarguide.navigation.camera({size[0]}, {size[1]})")
+    camera = ring()["v0"]
+    numbers = {key: record[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    seen = Camera(**numbers, rotation=camera.rotation, translation=camera.translation)
+    assert psnr(fresh.shot(), ours("polarguide-stokes", "final", seen)) > LEAST
