@@ -17,6 +17,7 @@ from polarguide.cli.evaluate import evaluate
 from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
+from polarguide.cli.synth import synth
 from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
 
@@ -29,6 +30,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "priors": priors,
     "compare": compare,
     "ablate": ablate,
+    "synth": synth,
 }
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "

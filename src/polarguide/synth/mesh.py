@@ -20,44 +20,43 @@ class Mesh:
         faces: [F, 3] indices, counter-clockwise seen from outside.
         uv: [V, 2] texture coordinates.
         normals: [V, 3] unit normals to shade with, or None for flat triangles.
-        colours: [V, 3] linear diffuse colours, or None.
+        palette: [N, 3] linear colours, side by side along u, where the shape brings its own; else None.
     """
 
     points: Array
     faces: NDArray[np.int64]
     uv: Array
     normals: Array | None = None
-    colours: Array | None = None
+    palette: Array | None = None
 
     def moved(self, scale: float, rotation: Array, position: Array) -> Mesh:
         """Scaled, rotated [3, 3] and moved."""
         normals = None if self.normals is None else self.normals @ rotation.T
         points = scale * self.points @ rotation.T + position
-        return Mesh(points, self.faces, self.uv, normals, self.colours)
+        return Mesh(points, self.faces, self.uv, normals, self.palette)
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
     """Several meshes as one; all have normals or none has."""
     starts = np.cumsum([0] + [len(mesh.points) for mesh in meshes[:-1]])
     normals = [mesh.normals for mesh in meshes if mesh.normals is not None]
-    colours = [mesh.colours for mesh in meshes if mesh.colours is not None]
     return Mesh(
         np.concatenate([mesh.points for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
         np.concatenate([mesh.uv for mesh in meshes]),
         np.concatenate(normals) if len(normals) == len(meshes) else None,
-        np.concatenate(colours) if len(colours) == len(meshes) else None,
     )
 
 
 def smooth_normals(points: Array, faces: NDArray[np.int64]) -> Array:
-    """Vertex normals: face normals averaged by area."""
+    """Vertex normals: face normals averaged by area, over all vertices at one place."""
+    _, place = np.unique(np.round(points, 9), axis=0, return_inverse=True)
     a, b, c = (points[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     total = np.zeros_like(points)
     for k in range(3):
-        np.add.at(total, faces[:, k], across)
-    return unit(total)
+        np.add.at(total, place.reshape(-1)[faces[:, k]], across)
+    return unit(total[place.reshape(-1)])
 
 
 def grid_faces(rows: int, columns: int, *, wrap: bool = False) -> NDArray[np.int64]:

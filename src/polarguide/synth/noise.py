@@ -36,7 +36,9 @@ def _hash(cell: np.ndarray, seed: int) -> Array:
     """A number in [0, 1) for each lattice point: a multiplicative hash with xor shifts."""
     value = np.full(cell.shape[:-1], (seed * 0x9E3779B9 + 0x7F4A7C15) & 0xFFFFFFFF, np.uint64)
     for k in range(cell.shape[-1]):
-        value = (value ^ (cell[..., k].astype(np.uint64) & np.uint64(0xFFFFFFFF))) * np.uint64(0x9E3779B97F4A7C15)
+        value = (value ^ (cell[..., k].astype(np.uint64) & np.uint64(0xFFFFFFFF))) * np.uint64(
+            0x9E3779B97F4A7C15
+        )
         value ^= value >> np.uint64(29)
     value *= np.uint64(0xBF58476D1CE4E5B9)
     value ^= value >> np.uint64(32)

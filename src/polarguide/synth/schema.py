@@ -25,7 +25,7 @@ class Material:
     Attributes:
         type: "plastic" (a dielectric coat over a diffuse base: glaze, paint, polished wood, dark glass, water),
             "metal", or "matte" (depolarizing).
-        colour: diffuse colour, or a texture (see ``textures``), or "vertex" for a shape that brings its own.
+        colour: diffuse colour, or a texture (see ``textures``), or "own" for a shape that brings colours.
         roughness: GGX roughness of the coat or metal.
         index: refractive index of the coat.
         eta, k: complex index of a metal for red, green and blue.
@@ -69,6 +69,7 @@ class CameraPath:
         target: what all look at; ``wander`` is by how much single cameras look past it.
         fov: horizontal field of view.
         views: number of views.
+        spacing: degrees between neighbours on a ring, about the middle of its arc; None fills the arc evenly.
     """
 
     rings: tuple[Data, ...]
@@ -76,6 +77,7 @@ class CameraPath:
     wander: float = 0.0
     fov: float = 40.0
     views: int = 72
+    spacing: float | None = None
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,10 @@ def read_scene_file(path: Path) -> SceneSpec:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise PolarguideError(
-            path, expected="a scene file in JSON", found=str(error), remedy="docs/dataset.md describes the fields."
+            path,
+            expected="a scene file in JSON",
+            found=str(error),
+            remedy="docs/dataset.md describes the fields.",
         ) from None
     return parse_scene(data, str(path), folder=path.parent)
 
@@ -150,7 +155,9 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
     values |= {"camera": camera, "things": tuple(things), "lights": tuple(values.get("lights") or ())}
     spec = _record(SceneSpec, values, where)
     if not camera.rings or camera.views < 1 or not 1 < camera.fov < 150:
-        raise _wrong(f"{where} (camera)", "rings, 1 or more views, a field of view from 1 to 150 degrees", str(camera))
+        raise _wrong(
+            f"{where} (camera)", "rings, 1 or more views, a field of view from 1 to 150 degrees", str(camera)
+        )
     return spec
 
 
@@ -174,7 +181,9 @@ def _record(kind: type[Record], data: Any, where: str) -> Record:
     missing = [
         name
         for name, item in fields.items()
-        if name not in data and item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING
+        if name not in data
+        and item.default is dataclasses.MISSING
+        and item.default_factory is dataclasses.MISSING
     ]
     if missing:
         raise _wrong(where, f"the field{'s' if len(missing) > 1 else ''} {', '.join(missing)}", "none")
@@ -186,4 +195,6 @@ def _tuple(value: Any) -> Any:
 
 
 def _wrong(where: str, expected: str, found: str) -> PolarguideError:
-    return PolarguideError(where, expected=expected, found=found, remedy="docs/dataset.md describes the fields.")
+    return PolarguideError(
+        where, expected=expected, found=found, remedy="docs/dataset.md describes the fields."
+    )

@@ -19,7 +19,8 @@ from polarguide.synth.solid import solid
 def sphere(radius: float = 1.0, detail: int = 96) -> Mesh:
     """A ball as triangles with exact normals."""
     polar = np.linspace(0, np.pi, detail // 2 + 1)
-    return lathe([[radius * np.sin(a), -radius * np.cos(a)] for a in polar], segments=detail, smooth=0)
+    turned = lathe([[np.sin(a), -np.cos(a)] for a in polar], segments=detail, smooth=0)
+    return Mesh(radius * turned.points, turned.faces, turned.uv, unit(turned.points))
 
 
 def plane(size: tuple[float, float] = (1.0, 1.0), tile: float = 0.0) -> Mesh:
@@ -34,7 +35,6 @@ def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0), bevel: float = 0.0, 
     """A box with rounded edges; each side shows the whole texture."""
     half = np.array(size, float) / 2
     round_ = min(bevel, float(half.min()) * 0.999) or 1e-5
-    steps = np.concatenate([-1 + np.zeros(1), np.linspace(-1, 1, 2)])[1:]
     corner = np.tan(np.linspace(-np.pi / 4, np.pi / 4, detail + 1))
     sides = []
     for axis in range(3):
@@ -42,9 +42,8 @@ def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0), bevel: float = 0.0, 
             u, v = ((axis + 1) % 3, (axis + 2) % 3) if sign > 0 else ((axis + 2) % 3, (axis + 1) % 3)
             grids = []
             for k in (u, v):
-                flat = half[k] - round_
                 bent = round_ * (corner[: detail // 2 + 1] + 1)
-                line = np.concatenate([-half[k] + bent, steps * flat, half[k] - bent[::-1]])
+                line = np.concatenate([-half[k] + bent, half[k] - bent[::-1]])
                 grids.append(np.unique(np.round(line, 12)))
             a, b = np.meshgrid(*grids, indexing="ij")
             points = np.zeros((*a.shape, 3))
@@ -73,7 +72,7 @@ def lathe(profile: list[list[float]], segments: int = 96, smooth: int = 8) -> Me
     tangent = unit(np.gradient(line, axis=0))
     normals = np.empty_like(points)
     normals[..., :2] = tangent[:, None, 1:] * direction
-    normals[..., 2] = -tangent[:, None, :1]
+    normals[..., 2] = -tangent[:, :1]
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     uv = np.stack(np.broadcast_arrays(angle / (2 * np.pi), (along / along[-1])[:, None]), -1)
     faces = grid_faces(len(line), segments + 1)
@@ -98,7 +97,11 @@ def tube(path: list[list[float]], radius: float = 0.1, segments: int = 24, smoot
 
 
 def waves(
-    size: tuple[float, float] = (1.0, 1.0), detail: int = 300, height: float = 0.01, length: float = 0.5, seed: int = 0
+    size: tuple[float, float] = (1.0, 1.0),
+    detail: int = 300,
+    height: float = 0.01,
+    length: float = 0.5,
+    seed: int = 0,
 ) -> Mesh:
     """A rectangle that looks up with smooth random waves: ``height`` from crest to trough, ``length`` apart."""
     x, y = (np.linspace(-s / 2, s / 2, detail) for s in size)
@@ -160,5 +163,8 @@ def make_mesh(shape: dict[str, Any], where: str) -> Mesh:
         return maker(**fields)
     except (TypeError, ValueError, IndexError, KeyError) as error:
         raise PolarguideError(
-            f"{where} shape", expected=f"the fields of a {kind}", found=str(error), remedy="docs/dataset.md has them."
+            f"{where} shape",
+            expected=f"the fields of a {kind}",
+            found=str(error),
+            remedy="docs/dataset.md has them.",
         ) from error

@@ -88,8 +88,9 @@ def _llvm_lack() -> str:
         version = dr.detail.llvm_version()
     except (ImportError, RuntimeError):
         return "none was found"
-    major = int(str(version).split(".")[0])
-    return "" if major >= OLDEST_LLVM else f"found {version}"
+    if version[0] >= OLDEST_LLVM:
+        return ""
+    return f"found {'.'.join(str(part) for part in version)}"
 
 
 def slow_estimate(paths: float) -> str:
