@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polarguide.errors import PolarguideError
 from polarguide.synth.mesh import Array, unit
@@ -123,10 +124,10 @@ def room(
     return picture
 
 
-def _furniture(picture: Array, sides: dict[str, Array], u: Array, z: Array, seed: int) -> None:
+def _furniture(picture: Array, sides: dict[str, NDArray[np.bool_]], u: Array, z: Array, seed: int) -> None:
     """Shelves of books, a door, framed pictures and a skirting board on the walls."""
     random = np.random.default_rng(seed + 5)
-    west = sides["west"].astype(bool)
+    west = sides["west"]
     for shelf in range(5):
         foot = 0.35 + 0.42 * shelf
         picture[west & (np.abs(u) < 1.6) & (z > foot - 0.05) & (z < foot)] = (0.16, 0.09, 0.04)
@@ -136,7 +137,7 @@ def _furniture(picture: Array, sides: dict[str, Array], u: Array, z: Array, seed
             book = west & (u > at) & (u < at + thick) & (z > foot) & (z < foot + tall)
             picture[book] = random.uniform(0.03, 0.5, 3)
             at += thick + (0.004 if random.random() < 0.9 else 0.2)
-    south = sides["south"].astype(bool)
+    south = sides["south"]
     picture[south & (u > 1.1) & (u < 2.0) & (z < 2.05)] = (0.3, 0.17, 0.08)
     for start, wide in ((-2.2, 0.9), (-0.9, 1.3)):
         frame = south & (u > start) & (u < start + wide) & (z > 1.2) & (z < 2.1)
@@ -147,7 +148,7 @@ def _furniture(picture: Array, sides: dict[str, Array], u: Array, z: Array, seed
         )
         picture[inner] = paint[inner]
     wall = sides["east"] | sides["west"] | sides["north"] | sides["south"]
-    picture[wall.astype(bool) & (z < 0.12)] = (0.45, 0.43, 0.4)
+    picture[wall & (z < 0.12)] = (0.45, 0.43, 0.4)
 
 
 def studio(

@@ -106,8 +106,8 @@ def _expose_once(
     parts = _path(scene, camera, pixel, sample, seed, walk, centre)
     flat = [value for colour in parts for value in colour]
     dr.eval(flat)
-    sums = [dr.block_reduce(dr.ReduceOp.Add, value, part[1]).numpy() for value in flat]
-    return np.stack(sums, -1).reshape(pixels, 7, -1).astype(np.float64)
+    columns = [dr.block_reduce(dr.ReduceOp.Add, value, part[1]).numpy() for value in flat]
+    return np.stack(columns, -1).reshape(pixels, 7, -1).astype(np.float64)
 
 
 def _path(

@@ -91,10 +91,9 @@ def view_files(out: Path, name: str, *, truth: bool, raw: bool) -> list[Path]:
 
 def photograph(out: Path, name: str) -> NDArray[np.uint8]:
     """The mean of a view's four pictures as shown on a screen (sRGB), [H, W, 3]."""
-    parts = [
-        cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in view_files(out, name, truth=False, raw=False)
-    ]
-    return shown(np.mean([part[..., ::-1] for part in parts], axis=0) / 65535)
+    files = view_files(out, name, truth=False, raw=False)
+    parts = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files]
+    return shown(np.mean(parts, axis=0)[..., ::-1] / 65535)
 
 
 def shown(linear: Array) -> NDArray[np.uint8]:

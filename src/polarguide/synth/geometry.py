@@ -33,9 +33,8 @@ def cast(built: Built, origins: Array, towards: Array) -> Hits:
     import mitsuba as mi
 
     if mi.variant().startswith("scalar"):
-        rows = [
-            _cast(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in zip(origins.tolist(), towards.tolist())
-        ]  # noqa: B905
+        pairs = zip(origins.tolist(), towards.tolist(), strict=True)
+        rows = [_cast(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in pairs]
         distance, normal, thing = (np.array(column, float) for column in zip(*rows, strict=True))
     else:
         origin = mi.Point3f(np.ascontiguousarray(origins.T, np.float32))

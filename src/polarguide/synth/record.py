@@ -15,8 +15,8 @@ CONVENTION = {
     "aolp": "atan2(S2, S1) / 2 from the image's horizontal, counter-clockwise as displayed, in the lens frame of "
     "each ray (docs/conventions.md)",
     "camera": "OpenCV axes, world to camera x_cam = R x_world + t, pixel centres at 0.5",
-    "truth": "gt/<view>.npz: stokes, specular and diffuse as S0 of the lobes of the first surface in the exposure of "
-    "the pictures (specular + diffuse = S0 on surfaces); normal (world), depth (camera z), mask, objid at pixel centres",
+    "truth": "gt/<view>.npz: stokes, specular and diffuse as S0 of the lobes of the first surface, exposed like "
+    "the pictures, whose sum is S0 on surfaces; normal (world), depth (camera z), mask, objid at pixel centres",
     "environment": "environment.hdr: rows from +z down, columns clockwise seen from above, from +x; scene units",
 }
 
@@ -66,6 +66,6 @@ def scene_record(
             "mitsuba": importlib.metadata.version("mitsuba"),
             "variant": variant.name,
             "polarguide": __version__,
-        },  # fmt: skip
+        },
         "settings": settings.data(),
     }

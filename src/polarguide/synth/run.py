@@ -22,6 +22,7 @@ from polarguide.synth.record import scene_record
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.sensor import Sensor, mosaic, noisy
 from polarguide.synth.settings import SynthSettings
+from polarguide.synth.sheet import write_sheet
 from polarguide.synth.sparse import find_points, write_model
 from polarguide.synth.transport import Walk
 from polarguide.synth.variant import choose_variant, slow_estimate
@@ -94,13 +95,15 @@ def synthesise(
     job = Job(built, settings, out, names, tests, cameras, exposure, Sensor())
     clipped = _render_all(job, reporter)
     _write_model(job, names)
-    test_split = json.dumps({"test": tests})
-    folder.write_file(out / "split.json", test_split.encode())
+    folder.write_file(out / "split.json", json.dumps({"test": tests}).encode())
     record = scene_record(spec, settings, variant, names, tests, exposure=exposure, clipped=clipped)
     if job.mosaics:
         gains = {str(45 * k): gain for k, gain in enumerate(job.sensor.gains)}
         folder.write_file(out / "calibration.json", json.dumps({"gains": gains}).encode())
         record["sensor"] = {"name": settings.sensor.upper(), **job.sensor.data()}
+    with_truth = [number for number, name in enumerate(names) if job.has_truth(name)]
+    if with_truth:
+        write_sheet(out, [names[k] for k in with_truth], [cameras[k] for k in with_truth])
     record["sha256"] = folder.checksum(out)
     folder.write_file(out / "scene.json", json.dumps(record, indent=1).encode())
     return out

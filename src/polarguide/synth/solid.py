@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from polarguide.synth.mesh import Array, Mesh, rotation, unit
+from polarguide.synth.nets import surface_nets
 
 NEWTON_STEPS = 2
 COARSE = 4
@@ -25,9 +26,10 @@ def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) ->
 
     Args:
         parts: each with ``kind``: "ellipsoid" (``at``, ``size``: half axes), "box" (``at``, ``size``: half sides,
-            ``round``), "capsule" (``from``, ``to``, ``radius``, ``end``: radius at ``to``), "cylinder" (``from``, ``to``,
-            ``radius``, ``round``) or "ring" (``at``, ``radius``, ``thick``; about z); any with ``rotation`` about its
-            ``at``, ``cut`` to take it away, ``blend`` of its own, ``mirror`` ("x" or "y": a second one), ``colour``.
+            ``round``), "capsule" (``from``, ``to``, ``radius``, and ``end``, that at ``to``), "cylinder" (``from``,
+            ``to``, ``radius``, ``round``) or "ring" (``at``, ``radius``, ``thick``; about z); any with ``rotation``
+            about its ``at``, ``cut`` to take it away, ``blend`` of its own, ``mirror`` ("x" or "y": a second one) and
+            ``colour``.
         blend: width over which neighbours flow into each other.
         detail: cells along the longest side.
     """
@@ -36,7 +38,7 @@ def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) ->
         whole += [part, *([_mirrored(part)] if "mirror" in part else [])]
     low, high = _bounds(whole)
     step = float((high - low).max()) / detail
-    points, faces = _surface_nets(_sampled(whole, blend, low, high, step))
+    points, faces = surface_nets(_sampled(whole, blend, low, high, step))
     points = points * step + low - 2 * step
     for _ in range(NEWTON_STEPS):
         value = _distance(points, whole, blend, BLOCK * step)
@@ -135,7 +137,7 @@ def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: f
     cubes, which = np.unique(np.floor(points / block).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(which.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(cubes)))
-    centres = (cubes + 0.5) * block
+    centres: Array = ((cubes + 0.5) * block).astype(np.float64)
     apart = np.stack([_part(centres, part) for part in parts])
     cut = np.array([bool(part.get("cut")) for part in parts])
     width = np.array([part.get("blend", blend) for part in parts])
@@ -191,7 +193,7 @@ def _painted(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
     coloured = [part for part in parts if "colour" in part and not part.get("cut")]
     if not coloured:
         return mesh
-    middles = mesh.points[mesh.faces].mean(1)
+    middles: Array = mesh.points[mesh.faces].mean(1)
     which = np.stack([_part(middles, part) for part in coloured], -1).argmin(-1)
     palette, number = np.unique([part["colour"] for part in coloured], axis=0, return_inverse=True)
     colour = number.reshape(-1)[which]
@@ -200,41 +202,3 @@ def _painted(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
     uv = np.stack(((shade + 0.5) / len(palette), np.full(len(pairs), 0.5)), -1)
     normals = None if mesh.normals is None else mesh.normals[old]
     return Mesh(mesh.points[old], corners.reshape(-1, 3), uv, normals, palette)
-
-
-def _surface_nets(values: Array) -> tuple[Array, np.ndarray]:
-    """Vertices [V, 3] in units of cells and triangles [F, 3] of the zero level of values on a grid."""
-    inside = values < 0
-    shape = tuple(n - 1 for n in values.shape)
-    sums, counts = np.zeros((*shape, 3)), np.zeros(shape)
-    corners = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-
-    def corner(array: np.ndarray, at: tuple[int, ...]) -> np.ndarray:
-        return np.asarray(array[tuple(slice(o, o + n) for o, n in zip(at, shape, strict=True))])
-
-    for first in corners:
-        for axis in range(3):
-            if first[axis]:
-                continue
-            second = tuple(1 if k == axis else first[k] for k in range(3))
-            a, b = corner(values, first), corner(values, second)
-            crossed = (a < 0) != (b < 0)
-            t = np.where(crossed, a / np.where(crossed, a - b, 1), 0)
-            place = np.array(first) + t[..., None] * np.eye(3)[axis]
-            sums += np.where(crossed[..., None], place, 0)
-            counts += crossed
-    used = counts > 0
-    index = np.full(shape, -1)
-    index[used] = np.arange(int(used.sum()))
-    points = np.argwhere(used) + sums[used] / counts[used][:, None]
-    faces = []
-    for axis in range(3):
-        one, two = (axis + 1) % 3, (axis + 2) % 3
-        low = np.moveaxis(inside, (axis, one, two), (0, 1, 2))[:-1, 1:-1, 1:-1]
-        high = np.moveaxis(inside, (axis, one, two), (0, 1, 2))[1:, 1:-1, 1:-1]
-        cells = np.moveaxis(index, (axis, one, two), (0, 1, 2))
-        around = [cells[:, :-1, :-1], cells[:, 1:, :-1], cells[:, 1:, 1:], cells[:, :-1, 1:]]
-        for mask, order in ((low & ~high, (0, 1, 2, 3)), (high & ~low, (3, 2, 1, 0))):
-            quad = np.stack([around[k][mask] for k in order], -1)
-            faces += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
-    return points, np.concatenate(faces)

@@ -1,7 +1,7 @@
 """A COLMAP model as structure from motion would leave it: exact poses, imperfect points.
 
-Points are spread over surfaces where pictures have contrast, seen in the views to which nothing hides them, and moved by
-the noise of matching; one in a hundred is grossly wrong, and some lie behind mirrors, where reflections seem to be.
+Points are spread over surfaces where pictures have contrast, seen in the views to which nothing hides them, and moved
+by the noise of matching; one in a hundred is grossly wrong, and some lie behind mirrors, where reflections seem to be.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def _mirrored(
     ray: Array,
     places: Array,
     normal: Array,
-    thing: Array,
+    thing: NDArray[np.uint8],
     random: np.random.Generator,
 ) -> tuple[NDArray[np.bool_], Array]:
     """Some points on smooth surfaces replaced by what is seen in them: (which, points)."""

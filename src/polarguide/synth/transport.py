@@ -11,12 +11,18 @@ emitters are all there is, so that of every Mueller matrix only the first column
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from polarguide.synth.draws import Draws
 
-TINY = 1e-30
+TINY, LEAST_DENSITY = 1e-30, 1e-5
+LOTTERY_FROM = 1
+"""Number of surfaces after which paths may end by chance."""
+
+
+Sampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
 
 
 @dataclass(frozen=True)
@@ -53,11 +59,12 @@ def follow(scene: Any, ray: Any, draws: Draws, walk: Walk) -> tuple[list[Any], l
     seen = _emitted(scene, si, mi.Bool(True))
     flags = mi.BSDFFlags
     lobes = []
-    for kinds in (flags.Glossy | flags.Delta, flags.Diffuse):
+    for kinds, sampler in ((flags.Glossy | flags.Delta, _by_surface), (flags.Diffuse, _by_cosine)):
         context = mi.BSDFContext()
         context.type_mask = int(kinds)
         numbers = (draws.next(), draws.pair(), draws.pair())
-        direct, after = _scatter(scene, ray, si, context, dr.identity(mi.Spectrum), numbers, si.is_valid())
+        start = (dr.identity(mi.Spectrum), numbers, si.is_valid())
+        direct, after = _scatter(scene, ray, si, context, *start, sampler)
         lobes.append(_onwards(scene, direct, after, draws, walk))
     return lobes[0], lobes[1], seen
 
@@ -84,8 +91,9 @@ def _onwards(scene: Any, light: list[Any], after: tuple[Any, ...], draws: Draws,
         found = _limited([gain[i, 0] * emitted for i in range(3)], walk.clamp, depth > 1)
         active = active & si.is_valid() & (depth < walk.depth)
         numbers = (random.next_float32(), _point(random), _point(random))
-        direct, state = _scatter(scene, ray, si, both, gain, numbers, active)
+        direct, state = _scatter(scene, ray, si, both, gain, numbers, active, _by_surface)
         direct = _limited(direct, walk.clamp, mi.Bool(True))
+        state = _lottery(state, random.next_float32(), depth > LOTTERY_FROM)
         s0, s1, s2 = (s + a + b for s, a, b in zip((s0, s1, s2), found, direct, strict=True))
         return (depth + 1, s0, s1, s2, *state, random)
 
@@ -96,13 +104,22 @@ def _onwards(scene: Any, light: list[Any], after: tuple[Any, ...], draws: Draws,
 
 
 def _scatter(
-    scene: Any, ray: Any, si: Any, context: Any, gain: Any, numbers: tuple[Any, Any, Any], active: Any
+    scene: Any,
+    ray: Any,
+    si: Any,
+    context: Any,
+    gain: Any,
+    numbers: tuple[Any, Any, Any],
+    active: Any,
+    sampler: Sampler,
 ) -> tuple[list[Any], tuple[Any, ...]]:
     """Direct light at a surface, and how the path goes on.
 
     Args:
+        context: lobes that take part.
         gain: Mueller matrix of the path from this surface to the camera.
         numbers: to choose a lobe, a direction and a light.
+        sampler: how directions are drawn.
 
     Returns:
         [S0, S1, S2] at the camera, and (active, ray, gain, place, density, delta) of the ray that leaves.
@@ -117,20 +134,58 @@ def _scatter(
     bsdf = si.bsdf(ray)
     ds, brought = scene.sample_emitter_direction(si, light, True, active)
     lit = active & (ds.pdf > 0)
-    wo = si.to_local(ds.d)
-    value, pdf = bsdf.eval_pdf(context, si, wo, lit)
-    back = gain @ si.to_world_mueller(value, -wo, si.wi)
+    towards = si.to_local(ds.d)
+    (value, pdf), (wo, density, weight, delta) = sampler(bsdf, context, si, (choose, turn), towards, active)
+    back = gain @ si.to_world_mueller(value, -towards, si.wi)
     share = dr.select(ds.delta, 1.0, ds.pdf / dr.maximum(ds.pdf + pdf, TINY))
     arriving = brought[0, 0] * dr.select(lit, share, 0.0)
     direct = [back[i, 0] * arriving for i in range(3)]
-
-    sample, weight = bsdf.sample(context, si, choose, turn, active)
-    gain = gain @ si.to_world_mueller(weight, -sample.wo, si.wi)
-    leaving = si.spawn_ray(si.to_world(sample.wo))
+    gain = gain @ si.to_world_mueller(weight, -wo, si.wi)
+    leaving = si.spawn_ray(si.to_world(wo))
     leaving.wavelengths = ray.wavelengths
+    active = active & (density > 0)
+    return direct, (active, mi.Ray3f(leaving), gain, mi.Interaction3f(si), density, delta)
+
+
+def _by_surface(bsdf: Any, context: Any, si: Any, numbers: Any, towards: Any, active: Any) -> tuple[Any, Any]:
+    """Directions as the surface draws them: (value, density) towards a light, and (direction, density, weight, delta)
+    of a drawn one."""
+    import mitsuba as mi
+
+    given = bsdf.eval_pdf(context, si, towards, active)
+    sample, weight = bsdf.sample(context, si, *numbers, active)
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    active = active & (sample.pdf > 0)
-    return direct, (active, mi.Ray3f(leaving), gain, mi.Interaction3f(si), sample.pdf, delta)
+    return given, (sample.wo, sample.pdf, weight, delta)
+
+
+def _by_cosine(bsdf: Any, context: Any, si: Any, numbers: Any, towards: Any, active: Any) -> tuple[Any, Any]:
+    """Directions by Lambert's law; result as of ``_by_surface``.
+
+    Mitsuba 3.9 gives values of a coated surface's diffuse lobe rightly, but when that lobe alone is asked for, its
+    densities are those of both lobes together.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    value = bsdf.eval(context, si, towards, active)
+    side = dr.sign(si.wi.z)  # surfaces have two sides
+    there = dr.maximum(towards.z * side, 0.0) * dr.inv_pi
+    wo = mi.warp.square_to_cosine_hemisphere(numbers[1])
+    wo = mi.Vector3f(wo.x, wo.y, wo.z * side)
+    density = dr.abs(wo.z) * dr.inv_pi
+    active = active & (density > LEAST_DENSITY)
+    inverse = dr.select(active, 1 / dr.maximum(density, LEAST_DENSITY), 0.0)
+    weight = bsdf.eval(context, si, wo, active) * inverse
+    return (value, there), (wo, dr.select(active, density, 0.0), weight, mi.Bool(False))
+
+
+def _lottery(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]:
+    """Russian roulette: paths that bring little end early, the others count for more."""
+    import drjit as dr
+
+    active, ray, gain, *rest = state
+    chance = dr.select(where, dr.clip(dr.max(gain[0, 0]), 0.1, 1.0), 1.0)
+    return active & (number < chance), ray, gain * (1 / chance), *rest
 
 
 def _emitted(scene: Any, si: Any, active: Any) -> Any:
