@@ -21,7 +21,7 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
     shares = np.array([float(ring.get("share", 1.0)) for ring in path.rings])
     ends = np.round(np.cumsum(shares) / shares.sum() * path.views).astype(int)
     counts = np.diff(np.concatenate([[0], ends]))
-    focal = width / 2 / np.tan(np.radians(path.fov) / 2)
+    focal = float(width / 2 / np.tan(np.radians(path.fov) / 2))
     cameras = []
     for ring, count in zip(path.rings, counts, strict=True):
         start, stop = float(ring.get("from", 0.0)), float(ring.get("to", 360.0))

@@ -161,7 +161,7 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
     """Write COLMAP's text files."""
     folder.mkdir(parents=True, exist_ok=True)
     first = cameras[0]
-    inner = f"{first.fx!r} {first.fy!r} {first.cx!r} {first.cy!r}"
+    inner = " ".join(f"{float(v)!r}" for v in (first.fx, first.fy, first.cx, first.cy))
     (folder / "cameras.txt").write_text(f"# one camera\n1 PINHOLE {first.width} {first.height} {inner}\n")
     seen: list[list[str]] = [[] for _ in names]
     rows = []
