@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from polarguide import optics
 from polarguide.capture import load_scene
@@ -64,7 +63,9 @@ def test_the_folder_is_read_like_a_capture(scene: Path) -> None:
     everywhere = truth.mask & ~view.saturated
     off = (stokes[0] - total)[everywhere].abs().amax(-1)
     assert off.median() < 5e-4
-    assert (off < 2e-3).float().mean() > 0.7  # pixels at edges see the sky, too, which belongs to neither layer
+    assert (
+        off < 2e-3
+    ).float().mean() > 0.7  # pixels at edges see the sky, too, which belongs to neither layer
     record = json.loads((scene / "scene.json").read_text())
     assert record["train"] == ["v001", "v002", "v003"]
     assert len(record["sha256"]) == 64
