@@ -1,4 +1,5 @@
 # make demo    train, score and render the demo scene that ships with the package
+# make dataset    render the five scenes of docs/dataset.md into scenes/ (hours on few cores; goes on where it stopped)
 # make test    linter, formatter, types and tests, on the package as it is installed
 # make cross-check    compile the kernels for aarch64 (needs aarch64-linux-gnu-g++ and cmake)
 # make gpu-check    build, test and measure on a machine with a GPU; in parts: call it again until it says complete
@@ -17,12 +18,17 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
 
-.PHONY: demo test cross-check gpu-check gpu-pack clean
+.PHONY: demo dataset test cross-check gpu-check gpu-pack clean
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
 
 demo: $(VENV)/.installed
 	$(BIN)/polarguide demo
+
+SCENES := figure kit car cup water
+
+dataset: $(VENV)/.installed-synth
+	set -e; for scene in $(SCENES); do $(BIN)/polarguide synth $$scene --out scenes/$$scene --size 256x192; done
 
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
@@ -44,6 +50,10 @@ $(VENV)/.installed: $(SOURCES) | $(VENV)/pyvenv.cfg
 	@echo "Building and installing polarguide into $(VENV); the first time takes minutes."
 	$(PIP_INSTALL) .
 	@touch $@
+
+$(VENV)/.installed-synth: $(SOURCES) | $(VENV)/pyvenv.cfg
+	$(PIP_INSTALL) '.[synth]'
+	@touch $(VENV)/.installed $@
 
 $(VENV)/.installed-test: $(SOURCES) | $(VENV)/pyvenv.cfg
 	@echo "Building and installing polarguide and its test tools into $(VENV); the first time takes minutes."

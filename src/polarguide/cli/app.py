@@ -20,6 +20,7 @@ from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
 from polarguide.cli.share import share
+from polarguide.cli.synth import synth
 from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
 
@@ -35,6 +36,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "priors": priors,
     "compare": compare,
     "ablate": ablate,
+    "synth": synth,
 }
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -20,10 +20,11 @@ from polarguide.cli.jobs import STDERR, Job, run_jobs
 from polarguide.cli.report import REPORT, write_report
 from polarguide.cli.train import check_count, checked_settings
 from polarguide.errors import PolarguideError
+from polarguide.evaluation.study import read_study, study_svg
 from polarguide.raster import DeviceName, choose_backend
 from polarguide.recipes import recipe_named
 
-LOCK = ".lock"
+LOCK, STUDY = ".lock", "study.svg"
 
 
 def compare(
@@ -113,6 +114,7 @@ def run_comparison(comparison: Comparison) -> None:
         results = collect(comparison, scenes, plan, failures)
         write_tables(comparison.out, results)
         write_report(comparison, scenes, plan, results)
+        _write_study(comparison, scenes, results)
     console.print(
         f"tables: {comparison.out}/results.md, .csv, .tex, .json   report: {comparison.out / REPORT}"
     )
@@ -124,6 +126,14 @@ def run_comparison(comparison: Comparison) -> None:
             found=f"that {len(failures)} failed ({said})",
             remedy="What there is has been written. Remove the cause and give the same command again.",
         )
+
+
+def _write_study(comparison: Comparison, scenes: Sequence[SceneEntry], results: Mapping[str, Any]) -> None:
+    """Where the scenes are a family of ``polarguide synth --sweep``: the scores over the number under study."""
+    drawn = study_svg(results, {scene.name: read_study(scene.path) for scene in scenes})
+    if drawn is not None:
+        (comparison.out / STUDY).write_text(drawn, encoding="utf-8")
+        console.print(f"study: {comparison.out / STUDY}", markup=False)
 
 
 def _train(

@@ -51,7 +51,7 @@ def export(
         raise PolarguideError(
             "--resolution", expected="16 to 1024", found=str(resolution), remedy="Choose such a number."
         )
-    opened = open_run(run)
+    opened = open_run(run, device="cpu")
     folder = out or run / "export"
     folder.mkdir(parents=True, exist_ok=True)
     writers: dict[str, Callable[[], list[Path]]] = {

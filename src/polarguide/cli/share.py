@@ -37,7 +37,7 @@ def share(
         raise PolarguideError(
             "--out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
         )
-    opened = open_run(run)
+    opened = open_run(run, device="cpu")
     page = page_of(opened, title=title, caption=caption)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_page(path, page)

@@ -1,0 +1,128 @@
+"""A scene as data -> Mitsuba's scenes: one for all wavelengths, or one for each of red, green and blue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from polarguide.errors import PolarguideError
+from polarguide.synth.environment import make_environment
+from polarguide.synth.mesh import Array, Mesh, rotation, write_ply
+from polarguide.synth.schema import SceneSpec, Thing
+from polarguide.synth.shapes import make_mesh, sphere
+from polarguide.synth.surfaces import lamp, sky, surface
+from polarguide.synth.textures import make_texture
+from polarguide.synth.variant import Variant
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """A scene that can be rendered.
+
+    Attributes:
+        spec: as data.
+        scenes: Mitsuba's scenes, one or three (see ``film.expose``).
+        shapes: of the first scene, Mitsuba's shape of every thing, in their order.
+        panorama: the environment, [H, W, 3].
+    """
+
+    spec: SceneSpec
+    scenes: list[Any]
+    shapes: list[Any]
+    panorama: Array
+
+
+def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> Built:
+    """Make meshes, textures and the environment, write them to ``folder`` and load them.
+
+    ``folder`` receives ``mesh/<thing>.ply`` and ``environment.hdr``.
+    """
+    import mitsuba as mi
+
+    (folder / "mesh").mkdir(parents=True, exist_ok=True)
+    meshes = [_mesh(thing, spec) for thing in spec.things]
+    for thing, mesh in zip(spec.things, meshes, strict=True):
+        write_ply(folder / "mesh" / f"{thing.name}.ply", mesh)
+    panorama = make_environment(spec.environment, spec.name, spec.folder)
+    cv2.imwrite(str(folder / "environment.hdr"), panorama[..., ::-1].astype(np.float32))
+    pictures = [_picture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
+    scenes: list[Any] = []
+    first: list[Any] = []
+    for channel in range(3) if variant.channels == 3 else (None,):
+        content: dict[str, Any] = {"type": "scene", "sky": sky(panorama, channel)}
+        for number, thing in enumerate(spec.things):
+            place = folder / "mesh" / f"{thing.name}.ply"
+            shape = _shape(thing, meshes[number], place, surface(thing.material, pictures[number], channel))
+            content[f"thing{number}"] = shape
+        for number, light in enumerate(spec.lights):
+            content[f"light{number}"] = lamp(light, channel, spec.name)
+        scene = mi.load_dict(content)
+        scenes.append(scene)
+        if not first:
+            first = [content[f"thing{number}"] for number in range(len(spec.things))]
+    return Built(spec, scenes, first, panorama)
+
+
+def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
+    turn, position = rotation(thing.rotation), np.array(thing.position, float)
+    if thing.shape.get("type") == "ball":
+        mesh = sphere(float(thing.shape.get("radius", 1.0)))
+    elif thing.shape.get("type") == "mesh":
+        mesh = _own_mesh(spec.folder / str(thing.shape.get("file")))
+    else:
+        mesh = make_mesh(thing.shape, thing.name)
+    return mesh.moved(thing.scale, turn, position)
+
+
+def _own_mesh(path: Path) -> Mesh:
+    """A PLY or OBJ file of the user's, by Mitsuba's readers."""
+    import mitsuba as mi
+
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in ("ply", "obj") or not path.is_file():
+        raise PolarguideError(
+            path,
+            expected="a mesh as .ply or .obj",
+            found="nothing" if not path.is_file() else f"a {path.suffix} file",
+            remedy="File names of meshes start at the folder of the scene file.",
+        )
+    params = mi.traverse(mi.load_dict({"type": kind, "filename": str(path)}))
+    points = np.array(params["vertex_positions"], float).reshape(-1, 3)
+    faces = np.array(params["faces"], np.int64).reshape(-1, 3)
+    normals = np.array(params["vertex_normals"], float).reshape(-1, 3)
+    uv = np.array(params["vertex_texcoords"], float).reshape(-1, 2)
+    return Mesh(
+        points, faces, uv if len(uv) else np.zeros((len(points), 2)), normals if len(normals) else None
+    )
+
+
+def _picture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
+    """The texture of a thing, [H, W, 3], or None where it has one colour."""
+    colour = thing.material.colour
+    if colour != "own":
+        return make_texture(colour, thing.name, folder) if isinstance(colour, dict) else None
+    if mesh.palette is None:
+        raise PolarguideError(
+            f"{thing.name} material.colour",
+            expected='a shape that brings colours, where the colour is "own"',
+            found=f"a {thing.shape.get('type')} without",
+            remedy="Give the parts of a solid a colour each, or the material one.",
+        )
+    return mesh.palette[None]
+
+
+def _shape(thing: Thing, mesh: Mesh, path: Path, bsdf: dict[str, Any]) -> Any:
+    """Mitsuba's shape with its surface."""
+    import mitsuba as mi
+
+    if thing.shape.get("type") == "ball":
+        radius = float(thing.shape.get("radius", 1.0)) * thing.scale
+        return mi.load_dict(
+            {"type": "sphere", "center": list(thing.position), "radius": radius, "bsdf": bsdf}
+        )
+    flat = mesh.normals is None
+    return mi.load_dict({"type": "ply", "filename": str(path), "face_normals": flat, "bsdf": bsdf})

@@ -1,0 +1,114 @@
+"""Writing a scene folder view by view, so that a rendering that was stopped can go on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.view import ANGLES
+from polarguide.errors import PolarguideError
+from polarguide.synth.mesh import Array
+
+REQUEST = "request.json"
+STEP = 16
+"""Pictures have 12 bits in 16, as cameras give them: 0, 16, 32, ..."""
+
+
+def open_folder(out: Path, request: dict[str, Any]) -> bool:
+    """Make the folder, or find in it an earlier start of the same request; True if that has been finished.
+
+    Raises:
+        PolarguideError: the folder holds something else, or the same scene with other settings.
+    """
+    path = out / REQUEST
+    text = json.dumps(request, indent=1)
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(path, text.encode())
+        return False
+    if not path.is_file():
+        raise PolarguideError(
+            out,
+            expected="a new or an empty folder",
+            found="one with other files",
+            remedy="Give another --out.",
+        )
+    if path.read_text(encoding="utf-8") != text:
+        raise PolarguideError(
+            out,
+            expected="a scene that was begun with the same settings",
+            found="one with others",
+            remedy="Give another --out, or remove the folder.",
+        )
+    return (out / "scene.json").exists()
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a whole file or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(data)
+    os.replace(part, path)
+
+
+def write_picture(path: Path, values: NDArray[Any]) -> None:
+    """Write a PNG, grey or RGB."""
+    colour = values[..., ::-1] if values.ndim == 3 else values
+    done, data = cv2.imencode(".png", np.ascontiguousarray(colour))
+    if not done:
+        raise OSError(f"{path}: PNG encoding failed")
+    write_file(path, data.tobytes())
+
+
+def picture_codes(stokes: Array, change: Callable[[Array], Array]) -> tuple[NDArray[np.uint16], float]:
+    """The four pictures behind a polarizer, [4, H, W, 3], and the share of their samples that clip.
+
+    Args:
+        stokes: [3, H, W, 3], full scale 1.
+        change: what happens to intensities [4, H, W, 3] before they are stored (noise).
+    """
+    twice = [2 * np.radians(angle) for angle in ANGLES]
+    light = np.stack([(stokes[0] + stokes[1] * np.cos(a) + stokes[2] * np.sin(a)) / 2 for a in twice])
+    light = change(light)
+    codes = np.clip(np.round(light * (65535 / STEP)), 0, 65535 // STEP).astype(np.uint16) * STEP
+    return codes, float((light >= 1).mean())
+
+
+def view_files(out: Path, name: str, *, truth: bool, raw: bool) -> list[Path]:
+    """All files of a view; it is finished when they exist."""
+    files = [out / "polar" / f"{name}_{angle:03d}.png" for angle in ANGLES]
+    files += [out / "gt" / f"{name}.npz"] if truth else []
+    return files + ([out / "raw" / f"{name}.png"] if raw else [])
+
+
+def photograph(out: Path, name: str) -> NDArray[np.uint8]:
+    """The mean of a view's four pictures as shown on a screen (sRGB), [H, W, 3]."""
+    files = view_files(out, name, truth=False, raw=False)
+    parts = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files]
+    return shown(np.mean(parts, axis=0)[..., ::-1] / 65535)
+
+
+def shown(linear: Array) -> NDArray[np.uint8]:
+    """Linear values in [0, 1] as 8-bit sRGB."""
+    linear = np.clip(linear, 0, 1)
+    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.asarray(np.round(255 * curve), np.uint8)
+
+
+def checksum(out: Path) -> str:
+    """SHA-256 over the names and contents of the pictures, ground truth, model and split of a scene."""
+    total = hashlib.sha256()
+    for folder in ("gt", "polar", "raw", "sparse"):
+        for path in sorted((out / folder).rglob("*")):
+            if path.is_file():
+                total.update(f"{path.relative_to(out).as_posix()} ".encode())
+                total.update(hashlib.sha256(path.read_bytes()).hexdigest().encode())
+    return total.hexdigest()

@@ -1,0 +1,85 @@
+"""What a polarization camera would have recorded: raw mosaics with the faults of real sensors.
+
+Electrons at full scale, read noise and extinction ratio are about those of Sony's IMX250MYR; noise follows Poisson's
+law for photons and a normal distribution for reading (EMVA 1288).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.sensor.pattern import sensor_pattern
+from polarguide.synth.mesh import Array
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor.
+
+    Attributes:
+        full_well: electrons of a sample at full scale.
+        read_noise: standard deviation of reading, electrons.
+        extinction: light through a polarizer along its axis, over light across it.
+        gains: of the samples behind polarizers at 0, 45, 90 and 135 degrees.
+        bits: of a stored value.
+        black: stored value without light.
+    """
+
+    full_well: float = 10500.0
+    read_noise: float = 2.4
+    extinction: float = 300.0
+    gains: tuple[float, float, float, float] = (1.0, 0.985, 1.01, 0.992)
+    bits: int = 12
+    black: int = 64
+
+    def data(self) -> dict[str, Any]:
+        """As JSON."""
+        return {"full_well": self.full_well, "read_noise": self.read_noise, "extinction": self.extinction,
+                "gains": list(self.gains), "bits": self.bits, "black": self.black}  # fmt: skip
+
+
+def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: Sensor) -> Array:
+    """Intensities with photon and read noise.
+
+    Args:
+        intensity: linear, 1 is full scale.
+        noise: 1 is a sensor exposed to its full well, 2 one with a quarter of that light, 0 none at all.
+        random: source of the noise.
+        sensor: its electrons.
+    """
+    if noise <= 0:
+        return intensity
+    electrons = sensor.full_well / noise**2
+    counts = random.poisson(np.clip(intensity, 0, None) * electrons) + random.normal(
+        0, sensor.read_noise, intensity.shape
+    )
+    return np.asarray(counts / electrons)
+
+
+def mosaic(
+    stokes: Array, name: str, noise: float, random: np.random.Generator, sensor: Sensor
+) -> NDArray[np.uint16]:
+    """The raw picture that a sensor stores, [H, W], of light [3, H, W, 3] whose radiance 1 is full scale.
+
+    A polarizer of finite extinction E weakens S1 and S2 by (E - 1) / (E + 1). A monochrome sensor sees the mean of the
+    colours.
+    """
+    height, width = stokes.shape[1:3]
+    pattern = sensor_pattern(name)
+    repeat = (-(-height // pattern.period), -(-width // pattern.period))
+    angles = np.tile(pattern.angles, repeat)[:height, :width]
+    if pattern.colours is None:
+        light = stokes.mean(-1)
+    else:
+        colours = np.tile(pattern.colours, repeat)[:height, :width]
+        light = np.take_along_axis(stokes, colours[None, ..., None], -1)[..., 0]
+    contrast = (sensor.extinction - 1) / (sensor.extinction + 1)
+    twice = 2 * np.radians(angles)
+    value = (light[0] + contrast * (light[1] * np.cos(twice) + light[2] * np.sin(twice))) / 2
+    value = noisy(value, noise, random, sensor) * np.array(sensor.gains)[angles // 45]
+    top = (1 << sensor.bits) - 1
+    return np.clip(np.round(sensor.black + value * (top - sensor.black)), 0, top).astype(np.uint16)

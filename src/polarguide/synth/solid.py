@@ -1,0 +1,204 @@
+"""Smooth solids: simple parts blended by their signed distances, and made triangles of.
+
+The blend is the polynomial smooth minimum; triangles come from the dual of the grid (naive surface nets: one vertex in
+every cell that the surface crosses), moved onto the surface by Newton's method, with the gradient of the distance as
+normal, so that highlights run smoothly over the blends.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from polarguide.synth.mesh import Array, Mesh, rotation, unit
+from polarguide.synth.nets import surface_nets
+
+NEWTON_STEPS = 2
+COARSE = 4
+FEW = 8
+BLOCK = 10
+"""Side of the cubes that are looked at together, in cells."""
+
+
+def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) -> Mesh:
+    """Parts as one surface.
+
+    Args:
+        parts: each with ``kind``: "ellipsoid" (``at``, ``size``: half axes), "box" (``at``, ``size``: half sides,
+            ``round``), "capsule" (``from``, ``to``, ``radius``, and ``end``, that at ``to``), "cylinder" (``from``,
+            ``to``, ``radius``, ``round``) or "ring" (``at``, ``radius``, ``thick``; about z); any with ``rotation``
+            about its ``at``, ``cut`` to take it away, ``blend`` of its own, ``mirror`` ("x" or "y": a second one) and
+            ``colour``.
+        blend: width over which neighbours flow into each other.
+        detail: cells along the longest side.
+    """
+    whole = []
+    for part in parts:
+        whole += [part, *([_mirrored(part)] if "mirror" in part else [])]
+    low, high = _bounds(whole)
+    step = float((high - low).max()) / detail
+    points, faces = surface_nets(_sampled(whole, blend, low, high, step))
+    points = points * step + low - 2 * step
+    for _ in range(NEWTON_STEPS):
+        value = _distance(points, whole, blend, BLOCK * step)
+        slope = _gradient(points, whole, blend, step * 0.05, BLOCK * step)
+        move = slope * (value / np.maximum((slope * slope).sum(-1), 1e-6))[:, None]
+        points = points - np.clip(move, -step, step)
+    normals = unit(_gradient(points, whole, blend, step * 0.3, BLOCK * step))
+    span = high - low
+    uv = np.stack(
+        (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi), (points[:, 2] - low[2]) / span[2]), -1
+    )
+    return _painted(Mesh(points, faces, uv, normals), whole)
+
+
+def _sampled(parts: list[dict[str, Any]], blend: float, low: Array, high: Array, step: float) -> Array:
+    """Distances on a grid with two cells of margin: exact near the surface, elsewhere those of a coarser grid."""
+    counts = np.ceil((np.ceil((high - low) / step) + 5) / COARSE).astype(int) + 1
+    coarse = np.stack(np.meshgrid(*(np.arange(n) * COARSE for n in counts), indexing="ij"), -1)
+    values = _distance(low + step * (coarse - 2.0), parts, blend)
+    for axis in range(3):
+        values = np.repeat(values, COARSE, axis=axis)
+    near = np.argwhere(np.abs(values) < 3 * COARSE * step)
+    values[tuple(near.T)] = _distance(low + step * (near - 2.0), parts, blend, BLOCK * step)
+    return values
+
+
+def _mirrored(part: dict[str, Any]) -> dict[str, Any]:
+    axis = "xy".index(part["mirror"])
+    other = dict(part)
+    for name in ("at", "from", "to"):
+        if name in part:
+            other[name] = [-v if k == axis else v for k, v in enumerate(part[name])]
+    if "rotation" in part:  # a reflection reverses turns about the other axes
+        other["rotation"] = [v if k == axis else -v for k, v in enumerate(part["rotation"])]
+    return other
+
+
+def _bounds(parts: list[dict[str, Any]]) -> tuple[Array, Array]:
+    corners = []
+    for part in parts:
+        if part.get("cut"):
+            continue
+        if "from" in part:
+            reach = max(part["radius"], part.get("end", 0.0))
+            centres = [part["from"], part["to"]]
+        else:
+            centres = [part["at"]]
+            size = part.get("size") or [part["radius"] + part["thick"]] * 3
+            reach = np.linalg.norm(size) if "rotation" in part else np.array(size)
+        corners += [np.array(c) + s * np.ones(3) * reach for c in centres for s in (-1, 1)]
+    return np.min(corners, axis=0), np.max(corners, axis=0)
+
+
+def _part(points: Array, part: dict[str, Any]) -> Array:
+    """Signed distance (of an ellipsoid: to first order) to one part."""
+    kind = part["kind"]
+    if "from" in part:
+        start, end = np.array(part["from"], float), np.array(part["to"], float)
+        axis = end - start
+        along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
+        if kind == "capsule":
+            radius = part["radius"] + (part.get("end", part["radius"]) - part["radius"]) * along
+            return np.asarray(np.linalg.norm(points - start - along[..., None] * axis, axis=-1) - radius)
+        if kind == "cylinder":
+            length, round_ = float(np.linalg.norm(axis)), part.get("round", 0.0)
+            height = (points - start) @ axis / length
+            across = np.linalg.norm(points - start - (height / length)[..., None] * axis, axis=-1)
+            sides = np.stack((across - part["radius"], np.abs(height - length / 2) - length / 2), -1) + round_
+            return _outside(sides) - round_
+    local = points - np.array(part["at"], float)
+    if "rotation" in part:
+        local = local @ rotation(tuple(part["rotation"]))
+    if kind == "ellipsoid":
+        size = np.array(part["size"], float)
+        near, slope = np.linalg.norm(local / size, axis=-1), np.linalg.norm(local / size**2, axis=-1)
+        return np.asarray(near * (near - 1) / np.maximum(slope, 1e-9))
+    if kind == "box":
+        round_ = part.get("round", 0.0)
+        return _outside(np.abs(local) - np.array(part["size"], float) + round_) - round_
+    if kind == "ring":
+        across = np.linalg.norm(local[..., :2], axis=-1) - part["radius"]
+        return np.asarray(np.hypot(across, local[..., 2]) - part["thick"])
+    raise ValueError(f"no part of a solid is a {kind!r}")
+
+
+def _outside(sides: Array) -> Array:
+    """Distance to a box from the signed distances to its pairs of sides."""
+    return np.asarray(np.linalg.norm(np.maximum(sides, 0), axis=-1) + np.minimum(sides.max(-1), 0))
+
+
+def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: float = 0.0) -> Array:
+    """Signed distance of all parts; with ``block``, the points [N, 3] are gone through in cubes of this side, and in
+    each only the parts that can matter there are asked."""
+    if block <= 0 or len(parts) < FEW:
+        return _combined(points, parts, blend)
+    cubes, which = np.unique(np.floor(points / block).astype(np.int64), axis=0, return_inverse=True)
+    order = np.argsort(which.reshape(-1), kind="stable")
+    ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(cubes)))
+    centres: Array = ((cubes + 0.5) * block).astype(np.float64)
+    apart = np.stack([_part(centres, part) for part in parts])
+    cut = np.array([bool(part.get("cut")) for part in parts])
+    width = np.array([part.get("blend", blend) for part in parts])
+    nearest = np.where(cut[:, None], np.inf, apart).min(0)
+    # Half the diagonal of a cube, twice, and a reserve since distances of ellipsoids are not exact.
+    reach = 3 * block + width[:, None] + np.maximum(nearest, 0)
+    matters = apart < np.where(cut[:, None], 0, np.minimum(nearest, 0)) + reach
+    result = np.empty(len(points))
+    for number, (start, end) in enumerate(zip(np.concatenate([[0], ends[:-1]]), ends, strict=True)):
+        some = order[start:end]
+        result[some] = _combined(
+            points[some], [p for p, m in zip(parts, matters[:, number], strict=True) if m], blend
+        )
+    return result
+
+
+def _combined(points: Array, parts: list[dict[str, Any]], blend: float) -> Array:
+    total: Array | None = None
+    for part in parts:
+        value, width = _part(points, part), part.get("blend", blend)
+        if total is None:
+            total = value
+        elif part.get("cut"):
+            total = -_smooth_minimum(-total, value, width)
+        else:
+            total = _smooth_minimum(total, value, width)
+    if total is None:
+        raise ValueError("a solid needs parts")
+    return total
+
+
+def _smooth_minimum(a: Array, b: Array, width: float) -> Array:
+    if width <= 0:
+        return np.minimum(a, b)
+    overlap = np.maximum(width - np.abs(a - b), 0) / width
+    return np.asarray(np.minimum(a, b) - overlap**3 * width / 6)
+
+
+def _gradient(points: Array, parts: list[dict[str, Any]], blend: float, step: float, block: float) -> Array:
+    slopes = []
+    for k in range(3):
+        offset = np.eye(3)[k] * step
+        ahead, behind = (_distance(points + side * offset, parts, blend, block) for side in (1, -1))
+        slopes.append((ahead - behind) / (2 * step))
+    return np.stack(slopes, -1)
+
+
+def _painted(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
+    """The mesh with a palette: every triangle has the colour of the coloured part nearest to its middle.
+
+    Vertices between two colours become two, and texture coordinates choose a colour of the palette.
+    """
+    coloured = [part for part in parts if "colour" in part and not part.get("cut")]
+    if not coloured:
+        return mesh
+    middles: Array = mesh.points[mesh.faces].mean(1)
+    which = np.stack([_part(middles, part) for part in coloured], -1).argmin(-1)
+    palette, number = np.unique([part["colour"] for part in coloured], axis=0, return_inverse=True)
+    colour = number.reshape(-1)[which]
+    pairs, corners = np.unique(mesh.faces * len(palette) + colour[:, None], return_inverse=True)
+    old, shade = np.divmod(pairs, len(palette))
+    uv = np.stack(((shade + 0.5) / len(palette), np.full(len(pairs), 0.5)), -1)
+    normals = None if mesh.normals is None else mesh.normals[old]
+    return Mesh(mesh.points[old], corners.reshape(-1, 3), uv, normals, palette)

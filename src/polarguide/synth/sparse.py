@@ -1,0 +1,187 @@
+"""A COLMAP model as structure from motion would leave it: exact poses, imperfect points.
+
+Points are spread over surfaces where pictures have contrast, seen in the views to which nothing hides them, and moved
+by the noise of matching; one in a hundred is grossly wrong, and some lie behind mirrors, where reflections seem to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from polarguide.camera import Camera
+from polarguide.synth.build import Built
+from polarguide.synth.geometry import cast
+from polarguide.synth.mesh import Array
+
+NOISE_PIXELS = 0.6
+OUTLIERS = 0.01
+VIRTUAL = 0.02
+SMOOTH = 0.1
+"""Roughness below which reflections are sharp enough to be matched."""
+FOUND = 0.6
+"""Share of the views that see a point in which it is found."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sparse:
+    """Points and where they were found.
+
+    Attributes:
+        points: [M, 3]. colours: [M, 3] display-encoded.
+        tracks: of each point, (view, x, y) of each observation.
+        virtual, outliers: how many points lie behind mirrors, and are grossly wrong.
+    """
+
+    points: Array
+    colours: NDArray[np.uint8]
+    tracks: list[list[tuple[int, float, float]]]
+    virtual: int
+    outliers: int
+
+
+def find_points(
+    built: Built, cameras: Sequence[Camera], pictures: Sequence[NDArray[np.uint8]], count: int, seed: int
+) -> Sparse:
+    """About ``count`` points.
+
+    Args:
+        built: the scene.
+        cameras: of the views that take part.
+        pictures: their photographs, display-encoded [H, W, 3].
+        count: points to look for.
+        seed: of every random draw.
+    """
+    random = np.random.default_rng((seed, 23))
+    origins, rays, colours, home = [], [], [], []
+    for number, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
+        grey = picture.mean(-1)
+        contrast = np.hypot(*np.gradient(grey)) + 2
+        amount = -(-count * 13 // 10 // len(cameras))
+        chosen = random.choice(grey.size, amount, p=(contrast / contrast.sum()).ravel())
+        world = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
+        rays.append(world[chosen])
+        origins.append(np.broadcast_to(camera.centre.numpy(), (amount, 3)))
+        colours.append(picture.reshape(-1, 3)[chosen])
+        home.append(np.full(amount, number))
+    origin, ray = np.concatenate(origins), np.concatenate(rays)
+    colour, view = np.concatenate(colours), np.concatenate(home)
+    hits = cast(built, origin, ray)
+    places = origin + hits.distance[:, None] * ray
+    seen = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < FOUND)
+    ghost, places = _mirrored(built, origin, ray, places, hits.normal, hits.thing, random)
+    near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1  # a reflection holds only between neighbours
+    seen = np.where(ghost[:, None], near, seen)
+    seen[np.arange(len(view)), view] = True
+    keep = np.flatnonzero((hits.thing > 0) & (seen.sum(1) >= 2))
+    keep = np.sort(random.permutation(keep)[:count])
+    tracks = [_track(places[k], np.flatnonzero(seen[k]), cameras, random) for k in keep]
+    focal = cameras[0].fx
+    reach = np.linalg.norm(places - origin, axis=1)[keep]
+    size = NOISE_PIXELS * reach / focal
+    moved = places[keep] + size[:, None] * random.normal(size=(len(keep), 3))
+    moved += (2 * size * random.normal(size=len(keep)))[:, None] * ray[keep]
+    wrong = random.random(len(keep)) < OUTLIERS
+    stretch = random.uniform(0.5, 1.8, len(keep))[:, None]
+    moved = np.where(wrong[:, None], origin[keep] + stretch * (moved - origin[keep]), moved)
+    return Sparse(moved, colour[keep], tracks, int(ghost[keep].sum()), int(wrong.sum()))
+
+
+def _visible(built: Built, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:
+    """Which of the points [M, 3] every camera sees: [M, V]."""
+    seen = np.zeros((len(places), len(cameras)), bool)
+    for number, camera in enumerate(cameras):
+        x, y, z = _project(camera, places).T
+        inside = np.flatnonzero(
+            (z > 1e-3) & (x > 1) & (y > 1) & (x < camera.width - 1) & (y < camera.height - 1)
+        )
+        if len(inside) == 0:
+            continue
+        way = places[inside] - camera.centre.numpy()
+        length = np.linalg.norm(way, axis=1)
+        hits = cast(built, np.broadcast_to(camera.centre.numpy(), way.shape), way / length[:, None])
+        seen[inside, number] = np.abs(hits.distance - length) < 2e-3 * length
+    return seen
+
+
+def _mirrored(
+    built: Built,
+    origin: Array,
+    ray: Array,
+    places: Array,
+    normal: Array,
+    thing: NDArray[np.uint8],
+    random: np.random.Generator,
+) -> tuple[NDArray[np.bool_], Array]:
+    """Some points on smooth surfaces replaced by what is seen in them: (which, points)."""
+    sharp = np.array([False] + [item.material.roughness < SMOOTH for item in built.spec.things])
+    wanted = np.flatnonzero(
+        sharp[thing] & (random.random(len(thing)) < VIRTUAL / max(sharp[thing].mean(), VIRTUAL))
+    )
+    ghost = np.zeros(len(places), bool)
+    if len(wanted) == 0:
+        return ghost, places
+    d, n = ray[wanted], normal[wanted]
+    back = d - 2 * (d * n).sum(-1, keepdims=True) * n
+    hits = cast(built, places[wanted] + 1e-4 * n, back)
+    hit = hits.distance > 0
+    ghost[wanted[hit]] = True
+    places = places.copy()
+    places[wanted[hit]] += hits.distance[hit][:, None] * d[hit]
+    return ghost, places
+
+
+def _track(
+    place: Array, views: NDArray[np.int64], cameras: Sequence[Camera], random: np.random.Generator
+) -> list[tuple[int, float, float]]:
+    track = []
+    for view in views:
+        x, y, z = _project(cameras[view], place[None])[0]
+        dx, dy = random.normal(0, NOISE_PIXELS, 2)
+        if z > 0:
+            track.append((int(view), float(x + dx), float(y + dy)))
+    return track
+
+
+def _project(camera: Camera, places: Array) -> Array:
+    """(x, y) in pixels and z of points [M, 3]."""
+    local = places @ camera.rotation.numpy().T + camera.translation.numpy()
+    z = np.where(np.abs(local[:, 2]) < 1e-9, 1e-9, local[:, 2])
+    return np.stack(
+        (camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy, local[:, 2]), -1
+    )
+
+
+def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], sparse: Sparse) -> None:
+    """Write COLMAP's text files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    first = cameras[0]
+    inner = " ".join(f"{float(v)!r}" for v in (first.fx, first.fy, first.cx, first.cy))
+    (folder / "cameras.txt").write_text(f"# one camera\n1 PINHOLE {first.width} {first.height} {inner}\n")
+    seen: list[list[str]] = [[] for _ in names]
+    rows = []
+    for number, (place, colour, track) in enumerate(
+        zip(sparse.points, sparse.colours, sparse.tracks, strict=True), 1
+    ):
+        errors = []
+        parts = []
+        for view, x, y in track:
+            parts.append(f"{view + 1} {len(seen[view])}")
+            seen[view].append(f"{x:.3f} {y:.3f} {number}")
+            px, py, _ = _project(cameras[view], place[None])[0]
+            errors.append(np.hypot(px - x, py - y))
+        xyz = " ".join(f"{v:.6f}" for v in place)
+        rgb = " ".join(str(int(c)) for c in colour)
+        rows.append(f"{number} {xyz} {rgb} {np.mean(errors):.4f} {' '.join(parts)}")
+    (folder / "points3D.txt").write_text("# points\n" + "\n".join(rows) + "\n")
+    lines = []
+    for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
+        x, y, z, w = Rotation.from_matrix(camera.rotation.numpy()).as_quat()
+        pose = " ".join(f"{v:.15g}" for v in (w, x, y, z, *camera.translation.tolist()))
+        lines += [f"{number + 1} {pose} 1 {name}.png", " ".join(seen[number])]
+    (folder / "images.txt").write_text("# two lines an image\n" + "\n".join(lines) + "\n")

@@ -1,0 +1,87 @@
+"""Surfaces and lights as Mitsuba describes them, for one channel or, where ``channel`` is None, for all wavelengths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from polarguide.errors import PolarguideError
+from polarguide.synth.mesh import Array
+from polarguide.synth.schema import Material
+
+AIR = 1.0
+
+
+def surface(material: Material, picture: Array | None, channel: int | None) -> dict[str, Any]:
+    """Mitsuba's description of a surface, of one channel or of all."""
+    base = _value(material.colour, channel) if picture is None else _bitmap(picture, channel)
+    if material.type == "metal":
+        index = {name: _metal(getattr(material, name), channel) for name in ("eta", "k")}
+        inner = {"type": "roughconductor", "distribution": "ggx", "alpha": material.roughness, **index}
+    elif material.type == "matte":
+        inner = {"type": "diffuse", "reflectance": base}
+    else:
+        inner = {"type": "pplastic", "distribution": "ggx", "alpha": material.roughness, "diffuse_reflectance": base,
+                 "int_ior": float(material.index), "ext_ior": AIR}  # fmt: skip
+    return {"type": "twosided", "inner": inner}
+
+
+def _value(colour: Any, channel: int | None) -> dict[str, Any]:
+    """A reflectance or radiance."""
+    if channel is None:
+        return {"type": "rgb", "value": [float(c) for c in colour]}
+    return {"type": "uniform", "value": float(colour[channel])}
+
+
+def _metal(index: tuple[float, float, float], channel: int | None) -> dict[str, Any]:
+    """A complex index given at red, green and blue."""
+    if channel is not None:
+        return {"type": "uniform", "value": float(index[channel])}
+    red, green, blue = index
+    values = f"{blue}, {blue}, {green}, {red}, {red}"
+    return {"type": "irregular", "wavelengths": "360, 450, 545, 620, 830", "values": values}
+
+
+def _bitmap(picture: Array, channel: int | None) -> dict[str, Any]:
+    import mitsuba as mi
+
+    part = picture if channel is None else picture[..., channel : channel + 1]
+    # Rows of a picture go down, v goes up.
+    data = np.ascontiguousarray(part[::-1], np.float32)
+    blend = "nearest" if len(data) == 1 else "bilinear"  # a palette has one row
+    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": channel is not None, "filter_type": blend}
+
+
+def sky(panorama: Array, channel: int | None) -> dict[str, Any]:
+    import mitsuba as mi
+
+    part = panorama if channel is None else np.repeat(panorama[..., channel : channel + 1], 3, -1)
+    # Mitsuba's panoramas look down its -z at their left edge, with y up and columns that turn to the right.
+    axes = np.array([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(part, np.float32)),
+            "to_world": mi.ScalarTransform4f(axes)}  # fmt: skip
+
+
+def lamp(light: dict[str, Any], channel: int | None, where: str) -> dict[str, Any]:
+    import mitsuba as mi
+
+    try:
+        position, towards = list(light["position"]), list(light["towards"])
+        half = [float(s) / 2 for s in light["size"]]
+        radiance = [float(v) for v in light["radiance"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise PolarguideError(
+            f"{where} (lights)",
+            expected="position, towards, size and radiance of each light",
+            found=repr(error),
+            remedy="docs/dataset.md describes them.",
+        ) from error
+    up = (
+        [0, 0, 1]
+        if abs(towards[2] - position[2]) < 0.99 * np.linalg.norm(np.subtract(towards, position))
+        else [0, 1, 0]
+    )
+    place = mi.ScalarTransform4f().look_at(position, towards, up) @ mi.ScalarTransform4f().scale([*half, 1.0])
+    return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": _value(radiance, channel)},
+            "bsdf": {"type": "diffuse", "reflectance": _value((0.0, 0.0, 0.0), channel)}}  # fmt: skip

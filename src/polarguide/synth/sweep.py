@@ -1,0 +1,150 @@
+"""Families of scenes that differ in one number, for controlled studies."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from polarguide.capture.prepare.reporter import Reporter
+from polarguide.errors import PolarguideError
+from polarguide.synth import folder
+from polarguide.synth.build import build_scene
+from polarguide.synth.cameras import place_cameras
+from polarguide.synth.run import synthesise
+from polarguide.synth.schema import SceneSpec
+from polarguide.synth.settings import Overrides, SynthSettings
+from polarguide.synth.sparse import find_points, write_model
+from polarguide.synth.variant import choose_variant
+
+PARAMETERS = ("views", "noise", "roughness", "index", "spacing")
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A parameter and its values, in rising order."""
+
+    parameter: str
+    values: tuple[float, ...]
+
+
+def parse_sweep(text: str) -> Sweep:
+    """``noise=0,1,2`` -> Sweep.
+
+    Raises:
+        PolarguideError: it has another form.
+    """
+    parameter, _, listed = text.partition("=")
+    try:
+        values = tuple(sorted({float(value) for value in listed.split(",")}))
+    except ValueError:
+        values = ()
+    whole = parameter != "views" or all(value == int(value) and value >= 2 for value in values)
+    if parameter not in PARAMETERS or not values or not whole:
+        raise PolarguideError(
+            "--sweep",
+            expected=f"one of {', '.join(PARAMETERS)} with values, such as noise=0,1,2 or views=9,18,36",
+            found=repr(text),
+            remedy="docs/dataset.md has examples.",
+        )
+    return Sweep(parameter, values)
+
+
+def sweep_scenes(
+    spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep, reporter: Reporter, *,
+    threads: int = 0,
+) -> list[Path]:  # fmt: skip
+    """Write ``out/<parameter>-<value>`` for every value.
+
+    A sweep over ``views`` (their number in training) renders the scene once, as it is, and makes the smaller scenes by
+    leaving out training views evenly, so that all share their test views and even their pictures.
+    """
+    if sweep.parameter == "views":
+        return _fewer_views(overrides.apply(spec), out, settings, sweep, reporter, threads)
+    done = []
+    for value in sweep.values:
+        one, how = overrides, settings
+        if sweep.parameter == "noise":
+            how = replace(settings, noise=value)
+        elif sweep.parameter == "roughness":
+            one = replace(overrides, roughness=value)
+        elif sweep.parameter == "index":
+            one = replace(overrides, index=value)
+        else:
+            one = replace(overrides, spacing=value)
+        done.append(synthesise(one.apply(spec), _member(out, sweep, value), how, reporter, threads=threads))
+        _note(done[-1], sweep.parameter, value)
+    return done
+
+
+def _member(out: Path, sweep: Sweep, value: float) -> Path:
+    return out / f"{sweep.parameter}-{value:g}"
+
+
+def _note(scene: Path, parameter: str, value: float) -> None:
+    """Write the number under study into ``scene.json``."""
+    record = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
+    record["study"] = {"parameter": parameter, "value": value}
+    folder.write_file(scene / "scene.json", json.dumps(record, indent=1).encode())
+
+
+def _fewer_views(
+    spec: SceneSpec, out: Path, settings: SynthSettings, sweep: Sweep, reporter: Reporter, threads: int
+) -> list[Path]:
+    """All members of a sweep over the number of training views."""
+    whole = synthesise(spec, out / "all", settings, reporter, threads=threads)
+    record = json.loads((whole / "scene.json").read_text(encoding="utf-8"))
+    train, tests = record["train"], record["test"]
+    if sweep.values[-1] > len(train):
+        raise PolarguideError(
+            "--sweep",
+            expected=f"up to {len(train)} training views",
+            found=f"{sweep.values[-1]:g}",
+            remedy=f"The scene has {len(record['views'])} views; give --views to render more.",
+        )
+    cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
+    by_name = dict(zip(record["views"], cameras, strict=True))
+    done = []
+    for value in sweep.values:
+        member = _member(out, sweep, value)
+        done.append(member)
+        if (member / "scene.json").exists():
+            continue
+        chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, int(value)).round().astype(int))]
+        names = sorted([*chosen, *tests])
+        _link(whole, member, names)
+        variant = choose_variant(settings.colour, threads=threads)
+        built = build_scene(spec, member, variant)
+        some = [by_name[name] for name in names]
+        pictures = [folder.photograph(member, name) for name in names]
+        write_model(
+            member / "sparse" / "0",
+            some,
+            names,
+            find_points(built, some, pictures, settings.points, settings.seed),
+        )
+        folder.write_file(member / "split.json", json.dumps({"test": tests}).encode())
+        smaller = {**record, "views": names, "train": chosen, "sha256": folder.checksum(member)}
+        folder.write_file(member / "scene.json", json.dumps(smaller, indent=1).encode())
+        _note(member, "views", value)
+        reporter.say(f"{member}: {len(chosen)} training views")
+    return done
+
+
+def _link(whole: Path, member: Path, names: list[str]) -> None:
+    """Share the files of views between two scenes: one file under two names where the disk allows it."""
+    for name in names:
+        truth = (whole / "gt" / f"{name}.npz").exists()
+        raw = (whole / "raw" / f"{name}.png").exists()
+        for source in folder.view_files(whole, name, truth=truth, raw=raw):
+            target = member / source.relative_to(whole)
+            if target.exists():
+                continue
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(source, target)
+            except OSError:
+                folder.write_file(target, source.read_bytes())

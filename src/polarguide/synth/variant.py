@@ -1,0 +1,99 @@
+"""Which of Mitsuba's variants computes, and what to say when the fast ones cannot."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from dataclasses import dataclass
+from typing import Literal
+
+from polarguide.errors import PolarguideError
+
+Colour = Literal["rgb", "spectral"]
+OLDEST_LLVM = 16
+"""Older ones crash on processors that are newer than they are."""
+SLOW_PATHS_PER_SECOND = 800.0
+"""Of the scalar variant, a rough figure for one core."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A variant of Mitsuba that has been made current.
+
+    Attributes:
+        name: Mitsuba's name.
+        colour: "rgb" renders three channels one after the other, each with exact values; "spectral" follows four
+            wavelengths a path and converts.
+        fast: compiled for all paths at once, not one by one.
+        note: why the slow one had to be taken; empty otherwise.
+    """
+
+    name: str
+    colour: Colour
+    fast: bool
+    note: str = ""
+
+    @property
+    def channels(self) -> int:
+        """Renderings per picture."""
+        return 3 if self.colour == "rgb" else 1
+
+
+def choose_variant(colour: Colour = "rgb", *, threads: int = 0) -> Variant:
+    """Make a polarized variant current: a fast one where LLVM's library can be loaded, else the scalar one.
+
+    Args:
+        colour: how colours are rendered; the scalar variant knows only "spectral".
+        threads: threads to use; 0 takes all cores.
+
+    Raises:
+        PolarguideError: Mitsuba is not installed.
+    """
+    if importlib.util.find_spec("mitsuba") is None:
+        raise PolarguideError(
+            "synth",
+            expected="Mitsuba 3.9, which renders the scenes",
+            found="no package mitsuba",
+            remedy="Install the optional extra: pip install 'polarguide[synth]'.",
+        )
+    import mitsuba as mi
+
+    lack = _llvm_lack()
+    if not lack:
+        mi.set_variant("llvm_ad_mono_polarized" if colour == "rgb" else "llvm_ad_spectral_polarized")
+        if threads:
+            import drjit as dr
+
+            dr.set_thread_count(threads)
+        return Variant(mi.variant(), colour, True)
+    mi.set_variant("scalar_spectral_polarized")
+    note = (
+        f"Mitsuba's fast variants need LLVM {OLDEST_LLVM} or newer as a shared library ({lack}); on Debian "
+        "'apt-get install libllvm19', elsewhere set DRJIT_LIBLLVM_PATH. The slow scalar variant is used."
+    )
+    return Variant(mi.variant(), "spectral", False, note)
+
+
+def _llvm_lack() -> str:
+    """Why LLVM cannot be used, or nothing."""
+    import mitsuba as mi
+
+    path = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if path and not os.path.exists(path):  # asking would make the library print lines of its own
+        return f"DRJIT_LIBLLVM_PATH names {path}, which does not exist"
+    try:
+        mi.set_variant("llvm_ad_mono_polarized")
+        import drjit as dr
+
+        version = dr.detail.llvm_version()
+    except (ImportError, RuntimeError):
+        return "none was found"
+    if version[0] >= OLDEST_LLVM:
+        return ""
+    return f"found {'.'.join(str(part) for part in version)}"
+
+
+def slow_estimate(paths: float) -> str:
+    """A time for that many paths with the scalar variant, in words."""
+    hours = paths / SLOW_PATHS_PER_SECOND / 3600
+    return f"about {hours:.0f} hours" if hours >= 2 else f"about {max(1.0, hours * 60):.0f} minutes"

@@ -1,0 +1,202 @@
+"""Scenes as data: the presets, what is refused, shapes and textures. No renderer is needed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polarguide.errors import PolarguideError
+from polarguide.synth.cameras import place_cameras
+from polarguide.synth.environment import ENVIRONMENTS, directions, make_environment
+from polarguide.synth.mesh import Mesh, write_ply
+from polarguide.synth.schema import parse_scene, read_scene_file
+from polarguide.synth.settings import PRESETS, Overrides, find_scene
+from polarguide.synth.shapes import make_mesh
+from polarguide.synth.sweep import parse_sweep
+from polarguide.synth.textures import TEXTURES, make_texture
+
+SMALL = {
+    "name": "small",
+    "camera": {"rings": [{"radius": 3, "height": 1}], "views": 9},
+    "environment": {"type": "uniform"},
+    "things": [{"name": "a", "shape": {"type": "sphere"}}],
+}
+SHAPES = [
+    {"type": "sphere", "radius": 0.5},
+    {"type": "box", "size": [1, 2, 3], "bevel": 0.1},
+    {"type": "lathe", "profile": [[0, 0], [0.5, 0], [0.5, 1], [0, 1]], "smooth": 0},
+    {"type": "rock", "radius": 1, "seed": 3},
+    {
+        "type": "solid",
+        "detail": 32,
+        "parts": [
+            {"kind": "ellipsoid", "at": [0, 0, 0], "size": [1, 0.7, 0.6], "colour": [1, 0, 0]},
+            {
+                "kind": "capsule",
+                "from": [0, 0.3, 0],
+                "to": [0, 0.5, 1],
+                "radius": 0.2,
+                "mirror": "y",
+                "colour": [0, 0, 1],
+            },
+            {"kind": "box", "at": [0, 0, -0.6], "size": [0.3, 0.3, 0.3], "cut": True},
+        ],
+    },
+]
+
+
+def parsed(**changes: object) -> object:
+    return parse_scene({**json.loads(json.dumps(SMALL)), **changes}, "test", folder=Path())
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_full_scenes(name: str) -> None:
+    spec = find_scene(name)
+    assert spec.name == name
+    assert spec.exposure
+    if name != "proof":
+        assert spec.about
+        assert len(spec.things) >= 8
+        assert not all(thing.foreground for thing in spec.things)
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"wings": 2}, "wings"),
+        ({"things": []}, "0"),
+        ({"things": [{"name": "a", "shape": {}}, {"name": "a", "shape": {}}]}, "'a', 'a'"),
+        ({"things": [{"name": "a"}]}, "field shape"),
+        ({"things": [{"name": "a", "shape": {}, "material": {"index": 0.9}}]}, "0.9"),
+        ({"things": [{"name": "a", "shape": {}, "material": {"type": "cheese"}}]}, "cheese"),
+        ({"camera": {"rings": []}}, "rings"),
+        ({"camera": None}, "camera"),
+    ],
+)
+def test_mistakes_in_a_scene_are_named(changes: dict[str, object], fault: str) -> None:
+    with pytest.raises(PolarguideError) as error:
+        parsed(**changes)
+    assert fault in str(error.value)
+
+
+def test_files_that_are_no_scene(tmp_path: Path) -> None:
+    with pytest.raises(PolarguideError, match="figure, kit"):
+        find_scene("no-such-scene")
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(PolarguideError, match="JSON"):
+        read_scene_file(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape["type"])
+def test_shapes_face_outwards(shape: dict[str, object]) -> None:
+    mesh = make_mesh(shape, "test")
+    a, b, c = (mesh.points[mesh.faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    assert (a * np.cross(b, c)).sum() > 0  # six times the volume
+    assert mesh.normals is not None
+    full = np.linalg.norm(across, axis=1) > 1e-9
+    agree = (across * mesh.normals[mesh.faces].mean(1)).sum(-1) > 0
+    assert agree[full].mean() > 0.995
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
+
+
+def test_a_painted_solid_keeps_its_colours() -> None:
+    mesh = make_mesh(SHAPES[-1], "test")
+    assert mesh.palette is not None
+    colours = mesh.palette[(mesh.uv[:, 0] * len(mesh.palette)).astype(int)]
+    top = mesh.points[:, 2] > 0.9
+    assert (colours[top] == [0, 0, 1]).all()
+    assert len(np.unique(colours, axis=0)) == 2
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"type": "cat"},
+        {},
+        {"type": "box", "wings": 1},
+        {"type": "solid", "parts": [{"kind": "x", "at": [0, 0, 0], "size": [1, 1, 1]}]},
+    ],
+)
+def test_mistakes_in_a_shape_are_named(shape: dict[str, object]) -> None:
+    with pytest.raises(PolarguideError):
+        make_mesh(shape, "test")
+
+
+@pytest.mark.parametrize("kind", [name for name in TEXTURES if name != "image"])
+def test_textures_are_reflectances(kind: str) -> None:
+    picture = make_texture({"type": kind, "pixels": 64}, "test", Path())
+    assert picture.shape == (64, 64, 3)
+    assert picture.min() >= 0
+    assert picture.max() <= 1
+    assert picture.std() > 0.005
+
+
+@pytest.mark.parametrize("kind", [name for name in ENVIRONMENTS if name != "image"])
+def test_environments(kind: str) -> None:
+    picture = make_environment({"type": kind, "height": 32}, "test", Path())
+    assert picture.shape == (32, 64, 3)
+    assert np.isfinite(picture).all()
+    assert (picture >= 0).all()
+
+
+def test_panoramas_turn_to_the_right() -> None:
+    d = directions(64)
+    np.testing.assert_allclose(d[32, 0], [1, 0, 0], atol=0.05)
+    np.testing.assert_allclose(d[32, 32], [0, -1, 0], atol=0.05)
+    assert d[0, 0, 2] > 0.99
+
+
+@pytest.mark.parametrize("data", [{"type": "moon"}, {}, {"type": "sky", "wings": 1}])
+def test_mistakes_in_an_environment_are_named(data: dict[str, object]) -> None:
+    with pytest.raises(PolarguideError, match="environment"):
+        make_environment(data, "test", Path())
+
+
+def test_cameras_look_at_the_target() -> None:
+    cameras = place_cameras(find_scene("cup").camera, 64, 48, 0)
+    assert len(cameras) == 72
+    for camera in cameras:
+        ahead = camera.rotation[2].numpy()
+        towards = np.array([0, 0, 0.42]) - camera.centre.numpy()
+        assert ahead @ towards / np.linalg.norm(towards) > 0.99
+        assert camera.rotation[1, 2] < 0  # y goes down
+        np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_spacing_sets_the_angle_between_neighbours() -> None:
+    spec = Overrides(views=5, spacing=10.0).apply(parsed())  # type: ignore[arg-type]
+    centres = np.stack([camera.centre.numpy() for camera in place_cameras(spec.camera, 64, 48, 0)])
+    turns = np.degrees(np.arctan2(centres[:, 1], centres[:, 0])) % 360
+    np.testing.assert_allclose(np.diff(turns), 10, atol=3.1)
+
+
+def test_overrides_reach_foreground_plastic_only() -> None:
+    spec = Overrides(roughness=0.3, index=1.7).apply(find_scene("car"))
+    for thing, before in zip(spec.things, find_scene("car").things, strict=True):
+        changed = thing.foreground and thing.material.type == "plastic"
+        assert thing.material.roughness == (0.3 if changed else before.material.roughness)
+        assert thing.material.index == (1.7 if changed else before.material.index)
+    with pytest.raises(PolarguideError, match="less than 4, found"):
+        Overrides(index=0.5).apply(find_scene("cup"))
+
+
+def test_sweeps() -> None:
+    assert parse_sweep("noise=2,0,1").values == (0.0, 1.0, 2.0)
+    for text in ("noise", "noise=", "size=1,2", "views=1.5", "noise=a"):
+        with pytest.raises(PolarguideError, match="--sweep"):
+            parse_sweep(text)
+
+
+def test_ply_files_hold_the_mesh(tmp_path: Path) -> None:
+    import plyfile
+
+    mesh = make_mesh({"type": "box"}, "test")
+    write_ply(tmp_path / "a.ply", mesh)
+    data = plyfile.PlyData.read(str(tmp_path / "a.ply"))
+    assert len(data["vertex"]) == len(mesh.points)
+    assert (np.stack(list(data["face"]["vertex_indices"])) == mesh.faces).all()
+    assert isinstance(mesh, Mesh)

@@ -1,0 +1,175 @@
+"""``polarguide synth`` from end to end on a tiny scene: read again, resumed, refused, prepared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polarguide import optics
+from polarguide.capture import load_scene
+from polarguide.capture.prepare import PrepareSettings, Reporter, prepare_scene
+from polarguide.cli.app import run
+from polarguide.synth import run as runner
+from polarguide.synth.run import synthesise
+from polarguide.synth.schema import SceneSpec, parse_scene
+from polarguide.synth.settings import Overrides, SynthSettings
+from polarguide.synth.sweep import Sweep, sweep_scenes
+from polarguide.synth.variant import OLDEST_LLVM, Variant, choose_variant, slow_estimate
+
+TINY = {
+    "name": "tiny",
+    "camera": {"rings": [{"radius": 3, "height": 1.2}], "target": [0, 0, 0.4], "views": 4, "fov": 45},
+    "environment": {"type": "uniform", "height": 4},
+    "exposure": 0.8,
+    "depth": 2,
+    "things": [
+        {"name": "ground", "foreground": False, "shape": {"type": "plane", "size": [6, 6]},
+         "material": {"colour": {"type": "checker", "pixels": 64}}},
+        {"name": "ball", "shape": {"type": "sphere", "radius": 0.6, "detail": 32}, "position": [0, 0, 0.6],
+         "material": {"colour": [0.2, 0.3, 0.1]}},
+    ],
+}  # fmt: skip
+SETTINGS = SynthSettings(width=16, height=16, samples=1, points=60)
+
+
+@pytest.fixture(scope="module")
+def spec() -> SceneSpec:
+    return parse_scene(json.loads(json.dumps(TINY)), "tiny", folder=Path())
+
+
+@pytest.fixture(scope="module")
+def scene(spec: SceneSpec, variant: Variant, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthesise(spec, tmp_path_factory.mktemp("synth") / "tiny", SETTINGS, Reporter(), threads=1)
+
+
+def test_the_folder_is_read_like_a_capture(scene: Path) -> None:
+    found = load_scene(scene)
+    assert [view.name for view in found.views] == ["v000", "v001", "v002", "v003"]
+    assert found.test_names == ("v000",)
+    assert found.refractive_index == 1.5
+    assert not [text for text in found.warnings if "belong to no view" in text]
+    assert len(found.points) > 20
+    (view,) = found.test_views
+    truth = view.truth
+    assert truth is not None
+    stokes = optics.stokes(view.intensities())
+    assert truth.specular is not None
+    assert truth.diffuse is not None
+    assert truth.mask is not None
+    total = truth.specular + truth.diffuse
+    everywhere = truth.mask & ~view.saturated
+    off = (stokes[0] - total)[everywhere].abs().amax(-1)
+    assert off.median() < 5e-4
+    assert (
+        off < 2e-3
+    ).float().mean() > 0.7  # pixels at edges see the sky, too, which belongs to neither layer
+    record = json.loads((scene / "scene.json").read_text())
+    assert record["train"] == ["v001", "v002", "v003"]
+    assert len(record["sha256"]) == 64
+    assert {path.name for path in (scene / "mesh").iterdir()} == {"ground.ply", "ball.ply"}
+
+
+def test_points_lie_near_surfaces(scene: Path) -> None:
+    points = load_scene(scene).points.numpy().astype(float)
+    ground = np.abs(points[:, 2])
+    ball = np.abs(np.linalg.norm(points - [0, 0, 0.6], axis=1) - 0.6)
+    assert np.median(np.minimum(ground, ball)) < 0.15  # sixteen pixels are coarse
+
+
+def test_rendering_goes_on_to_the_same_files(
+    scene: Path, spec: SceneSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(job: runner.Job, number: int) -> float:
+        if number == 2:
+            raise KeyboardInterrupt
+        return render(job, number)
+
+    render = runner._render_view
+    out = tmp_path / "again"
+    monkeypatch.setattr(runner, "_render_view", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        synthesise(spec, out, SETTINGS, Reporter(), threads=1)
+    assert not (out / "scene.json").exists()
+    monkeypatch.setattr(runner, "_render_view", render)
+    synthesise(spec, out, SETTINGS, Reporter(), threads=1)
+    digest = [json.loads((path / "scene.json").read_text())["sha256"] for path in (scene, out)]
+    assert digest[0] == digest[1]
+
+
+def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSpec, tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="same settings"):
+        synthesise(spec, scene, SynthSettings(width=16, height=16, samples=2), Reporter())
+    (tmp_path / "x").write_text("mine")
+    with pytest.raises(Exception, match="empty folder"):
+        synthesise(spec, tmp_path, SETTINGS, Reporter())
+    with pytest.raises(Exception, match="--samples"):
+        synthesise(spec, tmp_path / "new", SynthSettings(samples=0), Reporter())
+
+
+def test_mosaics_are_prepared_to_the_same_pictures(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
+    settings = SynthSettings(width=16, height=16, samples=4, points=60, sensor="imx250mzr")
+    scene = synthesise(spec, tmp_path / "raw-scene", settings, Reporter(), threads=1)
+    from polarguide.capture.calibration import read_calibration
+
+    prepared = prepare_scene(
+        scene / "raw",
+        tmp_path / "prepared",
+        PrepareSettings(sensor="IMX250MZR", bits=12, black_level=64, poses=str(scene), gains="none",
+                        calibration=read_calibration(scene / "calibration.json")),
+        Reporter(),
+    )  # fmt: skip
+    ours, theirs = load_scene(scene), load_scene(prepared.folder)
+    assert [view.name for view in theirs.views] == [view.name for view in ours.views]
+    for mine, other in zip(ours.views, theirs.views, strict=True):
+        assert (mine.camera.width, mine.camera.fx) == (other.camera.width, pytest.approx(other.camera.fx))
+        usable = ~(other.invalid | mine.saturated)
+        s0 = [optics.stokes(view.intensities().mean(-1))[0][usable] for view in (mine, other)]
+        # One sample of each cell and angle against the mean of four: alike in the mean, not pixel by pixel.
+        assert float(s0[0].mean()) == pytest.approx(float(s0[1].mean()), rel=0.03)
+
+
+def test_a_sweep_over_views_shares_its_test_views(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
+    folders = sweep_scenes(
+        spec, tmp_path / "s", SETTINGS, Overrides(), Sweep("views", (2.0, 3.0)), Reporter(), threads=1
+    )
+    assert [folder.name for folder in folders] == ["views-2", "views-3"]
+    scenes = [load_scene(folder) for folder in folders]
+    assert [len(scene.train_views) for scene in scenes] == [2, 3]
+    assert scenes[0].test_names == scenes[1].test_names
+    assert (scenes[0].test_views[0].codes == scenes[1].test_views[0].codes).all()
+    study = json.loads((folders[0] / "scene.json").read_text())["study"]
+    assert study == {"parameter": "views", "value": 2.0}
+
+
+def test_without_mitsuba_the_extra_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert run(["synth", "proof", "--out", str(tmp_path / "x")]) == 2
+    assert "polarguide[synth]" in capsys.readouterr().err
+
+
+def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("polarguide.synth.variant._llvm_lack", lambda: "none was found")
+    try:
+        found = choose_variant("rgb")
+        assert not found.fast
+        assert found.colour == "spectral"
+        assert f"LLVM {OLDEST_LLVM}" in found.note
+        assert "\n" not in found.note
+    finally:
+        monkeypatch.undo()
+        choose_variant("rgb", threads=1)
+    assert slow_estimate(1e8).endswith("hours")
+    assert slow_estimate(1e5).endswith("minutes")
+
+
+@pytest.mark.parametrize("arguments", [["cat"], ["proof", "--size", "big"], ["proof", "--sweep", "size=1"]])
+def test_wrong_input_is_one_line(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["synth", *arguments, "--out", str(tmp_path / "x")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
