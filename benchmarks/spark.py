@@ -4,8 +4,8 @@
     pip install 'polarguide[browser,export]'
     python benchmarks/spark.py RUN --node-modules NODE_MODULES --format ply
 
-For each test view it prints PSNR against the final layer: of the file in Spark, and of the diffuse layer alone, which is
-what a file without baked reflections would show at best.
+For each test view it prints PSNR against the final layer: of the file in Spark, and of the diffuse layer alone, which
+is what a file without baked reflections would show at best.
 """
 
 from __future__ import annotations

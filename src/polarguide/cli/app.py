@@ -14,8 +14,8 @@ from polarguide.cli.ablate import ablate
 from polarguide.cli.compare import compare
 from polarguide.cli.demo import demo
 from polarguide.cli.evaluate import evaluate
-from polarguide.cli.inspect import inspect
 from polarguide.cli.export import export
+from polarguide.cli.inspect import inspect
 from polarguide.cli.prepare import prepare
 from polarguide.cli.priors import priors
 from polarguide.cli.render import render_views
