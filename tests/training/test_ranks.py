@@ -61,11 +61,11 @@ def test_two_ranks_of_one_view_are_one_process_of_two_bit_by_bit(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ranks", "views"), [(2, 4), (3, 2)])
+@pytest.mark.parametrize(("ranks", "views"), [(2, 4), (2, 1)])
 def test_other_shares_agree_up_to_summation_order(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, ranks: int, views: int
 ) -> None:
-    """Two views each; and a rank too many. The ranks decide the same, to the bit."""
+    """Two views each; and a rank without a view. The ranks decide the same, to the bit."""
     steps = 8  # the density control comes after the last: its decisions are compared by the row counts
     trainer, _ = alone(tiny_scene, busy_recipe, steps=steps, views=views)
     first, *others = shared(tmp_path, ranks=ranks, steps=steps, views=views)

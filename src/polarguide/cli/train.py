@@ -80,9 +80,7 @@ def train(
     chosen = recipe_named(recipe)
     with company(device, out) as ranks:
         leads = ranks.rank == 0
-        if leads:
-            _check_out(out, resume)
-        ranks.wait()
+        _check_out(out, resume, ranks)
         settings = replace(settings, views_per_step=_views(views_per_step, ranks, out if resume else None))
         backend = backend_of(ranks, device)
         loaded = read_scene(scene, downscale=downscale, transfer=transfer)
@@ -146,22 +144,30 @@ def checked_settings(steps: int, seed: int, refractive_index: float) -> TrainSet
     return TrainSettings(steps, seed, refractive_index)
 
 
-def _check_out(out: Path, resume: bool) -> None:
+def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
+    """Refuse a folder that does not suit, once for all ranks: rank 0 looks, before it writes there itself."""
+    problem = _unsuitable(out, resume) if ranks.rank == 0 else None
+    if ranks.any(problem is not None):
+        raise problem or SystemExit(2)
+
+
+def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
     has_run = (out / CONFIGURATION).exists()
     if resume and not has_run:
-        raise PolarguideError(
+        return PolarguideError(
             out,
             expected="a run to resume",
             found="no run.json",
             remedy="Leave out --resume, or give the right --out.",
         )
     if not resume and has_run:
-        raise PolarguideError(
+        return PolarguideError(
             out,
             expected="a new folder",
             found="a run",
             remedy="Add --resume to go on with it, or give another --out.",
         )
+    return None
 
 
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:

@@ -95,8 +95,6 @@ class SeveralRanks(Ranks):
             t.copy_(values.view_as(t))
 
     def exchange_slots(self, sums: Tensor) -> None:
-        if sums.ndim < 2:
-            return
         most = len(self.slots(len(sums), 0))
         own = sums.new_zeros(most, *sums.shape[1:])
         mine = self.slots(len(sums))

@@ -113,8 +113,8 @@ class Trainer:
 
     def exchange_statistics(self) -> None:
         """Let every rank know what all have seen since the last densification. All ranks have to call it."""
-        self.ranks.exchange_slots(self.state.statistics.gradient)
-        self.ranks.exchange_slots(self.state.statistics.seen)
+        for sums in (self.state.statistics.gradient, self.state.statistics.seen):
+            self.ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])
 
     def _look(self, slot: int, stage: Stage, counts: bool) -> Tensor:
         """Render the view of a slot and add its gradients; [3] as of ``StepReport.measured``."""
