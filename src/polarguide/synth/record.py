@@ -11,7 +11,7 @@ from polarguide.synth.settings import SynthSettings
 from polarguide.synth.variant import Variant
 
 CONVENTION = {
-    "intensity": "I_a = (S0 + S1 cos 2a + S2 sin 2a) / 2 is PNG value / 65535, linear; S0 = 1 is display white",
+    "intensity": "I_a = (S0 + S1 cos 2a + S2 sin 2a) / 2 is PNG value / 65535, linear",
     "aolp": "atan2(S2, S1) / 2 from the image's horizontal, counter-clockwise as displayed, in the lens frame of "
     "each ray (docs/conventions.md)",
     "camera": "OpenCV axes, world to camera x_cam = R x_world + t, pixel centres at 0.5",

@@ -29,7 +29,7 @@ from polarguide.synth.variant import choose_variant, slow_estimate
 
 TEST_SAMPLES = 4
 METER_VIEWS, METER_SAMPLES, METER_WIDTH = 4, 16, 64
-BRIGHT = 0.9
+BRIGHT = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ def _write_model(job: Job, names: list[str]) -> None:
 
 
 def _metered(built: Built, cameras: list[Camera], seed: int) -> float:
-    """The exposure by which 1 % of S0 in some small pictures lies above ``BRIGHT``."""
+    """The exposure by which 1 % of S0 in some small pictures lies above ``BRIGHT``, three quarters of full scale."""
     values = []
     for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
         factor = max(1, camera.width // METER_WIDTH)

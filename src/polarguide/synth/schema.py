@@ -92,7 +92,7 @@ class SceneSpec:
         lights: rectangles that shine, each with ``position``, ``towards``, ``size`` and ``radiance``.
         depth: largest number of surfaces that a path of light touches.
         clamp: see ``transport.Walk``.
-        exposure: display value of radiance 1; None takes one by which 1 % of S0 lies above 0.9.
+        exposure: display value of radiance 1; None takes one by which 1 % of S0 lies above 1.5.
         folder: where relative file names of meshes and pictures start.
     """
 

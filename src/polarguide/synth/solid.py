@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.synth.mesh import Array, Mesh, rotation, unit
+from polarguide.synth.mesh import Array, Mesh, unit
 from polarguide.synth.nets import surface_nets
+from polarguide.synth.parts import part_distance
 
 NEWTON_STEPS = 2
 COARSE = 4
@@ -92,43 +93,6 @@ def _bounds(parts: list[dict[str, Any]]) -> tuple[Array, Array]:
     return np.min(corners, axis=0), np.max(corners, axis=0)
 
 
-def _part(points: Array, part: dict[str, Any]) -> Array:
-    """Signed distance (of an ellipsoid: to first order) to one part."""
-    kind = part["kind"]
-    if "from" in part:
-        start, end = np.array(part["from"], float), np.array(part["to"], float)
-        axis = end - start
-        along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
-        if kind == "capsule":
-            radius = part["radius"] + (part.get("end", part["radius"]) - part["radius"]) * along
-            return np.asarray(np.linalg.norm(points - start - along[..., None] * axis, axis=-1) - radius)
-        if kind == "cylinder":
-            length, round_ = float(np.linalg.norm(axis)), part.get("round", 0.0)
-            height = (points - start) @ axis / length
-            across = np.linalg.norm(points - start - (height / length)[..., None] * axis, axis=-1)
-            sides = np.stack((across - part["radius"], np.abs(height - length / 2) - length / 2), -1) + round_
-            return _outside(sides) - round_
-    local = points - np.array(part["at"], float)
-    if "rotation" in part:
-        local = local @ rotation(tuple(part["rotation"]))
-    if kind == "ellipsoid":
-        size = np.array(part["size"], float)
-        near, slope = np.linalg.norm(local / size, axis=-1), np.linalg.norm(local / size**2, axis=-1)
-        return np.asarray(near * (near - 1) / np.maximum(slope, 1e-9))
-    if kind == "box":
-        round_ = part.get("round", 0.0)
-        return _outside(np.abs(local) - np.array(part["size"], float) + round_) - round_
-    if kind == "ring":
-        across = np.linalg.norm(local[..., :2], axis=-1) - part["radius"]
-        return np.asarray(np.hypot(across, local[..., 2]) - part["thick"])
-    raise ValueError(f"no part of a solid is a {kind!r}")
-
-
-def _outside(sides: Array) -> Array:
-    """Distance to a box from the signed distances to its pairs of sides."""
-    return np.asarray(np.linalg.norm(np.maximum(sides, 0), axis=-1) + np.minimum(sides.max(-1), 0))
-
-
 def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: float = 0.0) -> Array:
     """Signed distance of all parts; with ``block``, the points [N, 3] are gone through in cubes of this side, and in
     each only the parts that can matter there are asked."""
@@ -138,7 +102,7 @@ def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: f
     order = np.argsort(which.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(cubes)))
     centres: Array = ((cubes + 0.5) * block).astype(np.float64)
-    apart = np.stack([_part(centres, part) for part in parts])
+    apart = np.stack([part_distance(centres, part) for part in parts])
     cut = np.array([bool(part.get("cut")) for part in parts])
     width = np.array([part.get("blend", blend) for part in parts])
     nearest = np.where(cut[:, None], np.inf, apart).min(0)
@@ -157,7 +121,7 @@ def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: f
 def _combined(points: Array, parts: list[dict[str, Any]], blend: float) -> Array:
     total: Array | None = None
     for part in parts:
-        value, width = _part(points, part), part.get("blend", blend)
+        value, width = part_distance(points, part), part.get("blend", blend)
         if total is None:
             total = value
         elif part.get("cut"):
@@ -194,7 +158,7 @@ def _painted(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
     if not coloured:
         return mesh
     middles: Array = mesh.points[mesh.faces].mean(1)
-    which = np.stack([_part(middles, part) for part in coloured], -1).argmin(-1)
+    which = np.stack([part_distance(middles, part) for part in coloured], -1).argmin(-1)
     palette, number = np.unique([part["colour"] for part in coloured], axis=0, return_inverse=True)
     colour = number.reshape(-1)[which]
     pairs, corners = np.unique(mesh.faces * len(palette) + colour[:, None], return_inverse=True)

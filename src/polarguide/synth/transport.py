@@ -11,18 +11,15 @@ emitters are all there is, so that of every Mueller matrix only the first column
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from polarguide.synth.draws import Draws
+from polarguide.synth.sampling import Sampler, by_cosine, by_surface
 
-TINY, LEAST_DENSITY = 1e-30, 1e-5
+TINY = 1e-30
 LOTTERY_FROM = 1
 """Number of surfaces after which paths may end by chance."""
-
-
-Sampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ def follow(scene: Any, ray: Any, draws: Draws, walk: Walk) -> tuple[list[Any], l
     seen = _emitted(scene, si, mi.Bool(True))
     flags = mi.BSDFFlags
     lobes = []
-    for kinds, sampler in ((flags.Glossy | flags.Delta, _by_surface), (flags.Diffuse, _by_cosine)):
+    for kinds, sampler in ((flags.Glossy | flags.Delta, by_surface), (flags.Diffuse, by_cosine)):
         context = mi.BSDFContext()
         context.type_mask = int(kinds)
         numbers = (draws.next(), draws.pair(), draws.pair())
@@ -91,7 +88,7 @@ def _onwards(scene: Any, light: list[Any], after: tuple[Any, ...], draws: Draws,
         found = _limited([gain[i, 0] * emitted for i in range(3)], walk.clamp, depth > 1)
         active = active & si.is_valid() & (depth < walk.depth)
         numbers = (random.next_float32(), _point(random), _point(random))
-        direct, state = _scatter(scene, ray, si, both, gain, numbers, active, _by_surface)
+        direct, state = _scatter(scene, ray, si, both, gain, numbers, active, by_surface)
         direct = _limited(direct, walk.clamp, mi.Bool(True))
         state = _lottery(state, random.next_float32(), depth > LOTTERY_FROM)
         s0, s1, s2 = (s + a + b for s, a, b in zip((s0, s1, s2), found, direct, strict=True))
@@ -145,38 +142,6 @@ def _scatter(
     leaving.wavelengths = ray.wavelengths
     active = active & (density > 0)
     return direct, (active, mi.Ray3f(leaving), gain, mi.Interaction3f(si), density, delta)
-
-
-def _by_surface(bsdf: Any, context: Any, si: Any, numbers: Any, towards: Any, active: Any) -> tuple[Any, Any]:
-    """Directions as the surface draws them: (value, density) towards a light, and (direction, density, weight, delta)
-    of a drawn one."""
-    import mitsuba as mi
-
-    given = bsdf.eval_pdf(context, si, towards, active)
-    sample, weight = bsdf.sample(context, si, *numbers, active)
-    delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    return given, (sample.wo, sample.pdf, weight, delta)
-
-
-def _by_cosine(bsdf: Any, context: Any, si: Any, numbers: Any, towards: Any, active: Any) -> tuple[Any, Any]:
-    """Directions by Lambert's law; result as of ``_by_surface``.
-
-    Mitsuba 3.9 gives values of a coated surface's diffuse lobe rightly, but when that lobe alone is asked for, its
-    densities are those of both lobes together.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    value = bsdf.eval(context, si, towards, active)
-    side = dr.sign(si.wi.z)  # surfaces have two sides
-    there = dr.maximum(towards.z * side, 0.0) * dr.inv_pi
-    wo = mi.warp.square_to_cosine_hemisphere(numbers[1])
-    wo = mi.Vector3f(wo.x, wo.y, wo.z * side)
-    density = dr.abs(wo.z) * dr.inv_pi
-    active = active & (density > LEAST_DENSITY)
-    inverse = dr.select(active, 1 / dr.maximum(density, LEAST_DENSITY), 0.0)
-    weight = bsdf.eval(context, si, wo, active) * inverse
-    return (value, there), (wo, dr.select(active, density, 0.0), weight, mi.Bool(False))
 
 
 def _lottery(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -56,9 +59,10 @@ def choose_variant(colour: Colour = "rgb", *, threads: int = 0) -> Variant:
             found="no package mitsuba",
             remedy="Install the optional extra: pip install 'polarguide[synth]'.",
         )
-    import mitsuba as mi
+    with _hushed():
+        import mitsuba as mi
 
-    lack = _llvm_lack()
+        lack = _llvm_lack()
     if not lack:
         mi.set_variant("llvm_ad_mono_polarized" if colour == "rgb" else "llvm_ad_spectral_polarized")
         if threads:
@@ -66,12 +70,27 @@ def choose_variant(colour: Colour = "rgb", *, threads: int = 0) -> Variant:
 
             dr.set_thread_count(threads)
         return Variant(mi.variant(), colour, True)
-    mi.set_variant("scalar_spectral_polarized")
+    with _hushed():
+        mi.set_variant("scalar_spectral_polarized")
     note = (
         f"Mitsuba's fast variants need LLVM {OLDEST_LLVM} or newer as a shared library ({lack}); on Debian "
         "'apt-get install libllvm19', elsewhere set DRJIT_LIBLLVM_PATH. The slow scalar variant is used."
     )
     return Variant(mi.variant(), "spectral", False, note)
+
+
+@contextlib.contextmanager
+def _hushed() -> Iterator[None]:
+    """Keep what a library prints to the error stream behind Python's back from the user: its loading, here."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _llvm_lack() -> str:
@@ -96,4 +115,4 @@ def _llvm_lack() -> str:
 def slow_estimate(paths: float) -> str:
     """A time for that many paths with the scalar variant, in words."""
     hours = paths / SLOW_PATHS_PER_SECOND / 3600
-    return f"about {hours:.0f} hours" if hours >= 2 else f"about {max(1.0, hours * 60):.0f} minutes"
+    return f"about {hours:.0f} hours" if hours >= 2 else f"about {max(2.0, hours * 60):.0f} minutes"
