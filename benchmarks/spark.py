@@ -2,7 +2,7 @@
 
     npm install three @sparkjsdev/spark          # anywhere; say where with --node-modules
     pip install 'polarguide[browser,export]'
-    python benchmarks/spark.py RUN --node-modules NODE_MODULES --format ply
+    python benchmarks/spark.py RUN --node-modules DIR --format ply
 
 For each test view it prints PSNR against the final layer: of the file in Spark, and of the diffuse layer alone, which
 is what a file without baked reflections would show at best.
@@ -32,6 +32,7 @@ FLAGS = (
     "--ignore-gpu-blocklist"
 )
 PAGE = """<!doctype html><script type="importmap">{"imports": {"three": "/three/build/three.module.js",
+"three/addons/": "/three/examples/jsm/",
 "@sparkjsdev/spark": "/@sparkjsdev/spark/dist/spark.module.js"}}</script><script type="module">
 import * as THREE from "three";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
