@@ -36,7 +36,8 @@ class Rasterised(NamedTuple):
     Attributes:
         features: [H, W, D], the blended channels.
         alpha: [H, W] in [0, 1], 1 - transmittance.
-        radii: [N] pixels, three standard deviations of the wider axis of each projected Gaussian; 0 where culled.
+        radii: [N] pixels, three standard deviations of the wider axis of each projected Gaussian, or what a backend's
+            page says; 0 where culled.
     """
 
     features: Tensor
@@ -73,7 +74,8 @@ class Rasterise(Protocol):
         statistic: filled by the backward pass, if given.
 
     Raises:
-        PolarguideError: shapes that do not fit, or values that are not finite.
+        PolarguideError: shapes that do not fit, or values that are not finite (these only where finding out does not
+            mean waiting for the device).
     """
 
     def __call__(
