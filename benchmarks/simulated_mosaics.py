@@ -2,10 +2,11 @@
 
 Each picture pixel becomes one 2x2 cell of the sensor, so a capture of 612x512 gives mosaics of 1224x1024: the cell
 takes the one colour that its filter passes, and its four samples are the four angles. Nothing is interpolated, so
-what ``prepare`` has to put back is exactly what a sensor leaves out. Values are 12-bit in 16-bit PNG files.
+what ``prepare`` has to put back is exactly what a sensor leaves out; unlike one, all angles of a cell lie in one place
+(hence ``--no-register``). Values are 12-bit in 16-bit PNG files.
 
     python benchmarks/simulated_mosaics.py CAPTURE MOSAICS
-    polarguide prepare MOSAICS --out SCENE --sensor IMX250MYR
+    polarguide prepare MOSAICS --out SCENE --sensor IMX250MYR --no-register
     python benchmarks/pose_error.py SCENE CAPTURE
 """
 
