@@ -73,7 +73,7 @@ def test_eval_writes_a_valid_record(
     assert tuple(sorted(record["views"])) == TEST_VIEWS
     assert record["steps"] == 40
     assert record["gaussians"] == len(load_file(trained / CHECKPOINT)["rows.means"])
-    assert record["provenance"]["recipe"] == "polarguide"
+    assert record["provenance"]["recipe"] == "polarguide-stokes"
     assert record["provenance"]["downscale"] == 4
     assert 5 < record["psnr"] < 60
     shown = capsys.readouterr().out
@@ -91,7 +91,9 @@ def test_render_writes_every_layer_of_every_test_view(trained: Path, tmp_path: P
     sheet = picture(out / "contact_sheet.png")
     assert sheet.shape[0] >= 2 * len(TEST_VIEWS) * SIZE[0]
     assert sheet.shape[1] >= len(layers) * SIZE[1]
-    assert len({picture(out / f"v000_{layer}.png").tobytes() for layer in layers}) == len(layers)
+    seen = {layer: picture(out / f"v000_{layer}.png").tobytes() for layer in layers}
+    assert seen.pop("base") == seen["diffuse"], "Fresnel-weighted light is added to the base as it is"
+    assert len(set(seen.values())) == len(layers) - 1
 
 
 def test_render_of_chosen_views_and_layers(trained: Path, tmp_path: Path) -> None:

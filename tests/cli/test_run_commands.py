@@ -26,7 +26,7 @@ def planned(demo_scene: Path, tmp_path: Path) -> Planned:
     """A comparison with one run, of which nothing is there yet."""
     question = Comparison(
         scenes=(demo_scene,),
-        recipes=(recipe_named("polarguide"),),
+        recipes=(recipe_named("polarguide-stokes"),),
         settings=TrainSettings(40, 0),
         seeds=1,
         downscale=4,
