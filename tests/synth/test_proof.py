@@ -93,14 +93,16 @@ def test_each_lobe_obeys_fresnel(
 
 
 def test_specular_light_is_fresnels_reflectance(
-    light: Light, normals: tuple[Tensor, Tensor], camera: Camera
+    light: Light, normals: tuple[Tensor, Tensor], camera: Camera, variant: Variant
 ) -> None:
     normal, where = normals
     zenith = optics.zenith(normal, camera.rays(dtype=torch.float64))
     rs, rp = optics.reflectances(zenith, INDEX)
     found = torch.from_numpy(light.specular[0]).mean(-1)
     where = where & (zenith < math.radians(75))
-    assert torch.allclose(found[where], ((rs + rp) / 2)[where], rtol=0.02, atol=2e-4)
+    ratio = found[where] / ((rs + rp) / 2)[where]
+    assert ratio.mean() == pytest.approx(1, abs=5e-3)
+    assert (ratio - 1).abs().max() < (0.02 if variant.channels == 3 else 0.1)  # sampled wavelengths are noisy
 
 
 def test_full_polarization_at_brewsters_angle(
@@ -193,4 +195,5 @@ def test_lobes_add_up_to_mitsubas_own_path_tracer(
         for image in (other, mine)
     )
     assert float(a[0].mean()) == pytest.approx(float(b[0].mean()), rel=0.02)
-    assert (optics.dolp(a) - optics.dolp(b)).abs().mean() < 5e-3
+    # Sampled wavelengths make noise of their own.
+    assert (optics.dolp(a) - optics.dolp(b)).abs().mean() < (5e-3 if variant.channels == 3 else 2e-2)
