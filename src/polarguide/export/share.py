@@ -26,7 +26,7 @@ from polarguide.shading.render import Shading
 from polarguide.surroundings import surroundings
 from polarguide.training.run import atomic
 
-SCRIPTS = ("algebra.js", "sorter.js", "renderer.js", "navigation.js", "controls.js", "main.js")
+SCRIPTS = ("algebra.js", "sorter.js", "renderer.js", "navigation.js", "controls.js", "unpack.js", "main.js")
 SHADERS = {
     "records": "records.glsl",
     "derive": "derive.frag",
