@@ -137,3 +137,8 @@ def write_model(folder: Path, names: tuple[str, ...], camera: str) -> Path:
     write_text_model(folder, names)
     (folder / "cameras.txt").write_text(f"1 {camera}\n")
     return folder
+
+
+def read_mask(scene: Path, view: str) -> np.ndarray:
+    """The object mask that was written."""
+    return cv2.imread(str(scene / "masks" / f"{view}.png"), cv2.IMREAD_UNCHANGED) > 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -14,17 +15,21 @@ from camera_files import (
     behind,
     mosaic,
     read_invalid,
+    read_mask,
     read_polar,
     smooth_light,
     write_model,
     write_mosaic,
     write_mosaics,
+    write_picture,
     write_shots,
 )
 from relief import write_relief
 
 from polarguide.capture import load_scene
 from polarguide.capture.prepare import PrepareSettings, Reporter, prepare_scene
+from polarguide.capture.prepare.sfm import tone_mapped
+from polarguide.errors import PolarguideError
 
 MOSAIC = PrepareSettings(sensor="IMX250MYR", gains="none")
 FILTER = PrepareSettings(gains="none", align=False, transfer="linear")
@@ -136,6 +141,70 @@ def test_sfm_on_a_textured_scene(tmp_path: Path) -> None:
     scene = load_scene(tmp_path / "out")
     assert len(scene.points) > 100
     assert scene.views[0].camera.fx == pytest.approx(260, rel=0.25)
+
+
+def test_sfm_with_known_intrinsics_looks_at_masks_alone(tmp_path: Path) -> None:
+    """Features are found inside the masks only, the camera stays as it was given, and the masks are kept."""
+    cameras = write_relief(tmp_path / "in")
+    mask = np.zeros((240, 320), np.uint8)
+    mask[:, :200] = 255
+    for view in list(cameras)[1:]:
+        write_picture(tmp_path / "masks" / f"{view}.png", mask / 255.0, bits=8)
+    asked = replace(
+        FILTER, masks=str(tmp_path / "masks"), intrinsics="260,260,160.5,120.5", sfm_pictures="minimum"
+    )
+    heard = Heard()
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", asked, heard)
+    assert len(done.views) >= 5
+    assert any(text.startswith("1 of 6 views have no mask") for text in heard.said)
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    for camera in model.cameras.values():
+        assert camera.model_name == "PINHOLE"
+        assert camera.params.tolist() == [260, 260, 160.5, 120.5]
+    seen = {view: [] for view in done.views}
+    for image in model.images.values():
+        seen[Path(image.name).stem] += [p.xy[0] for p in image.points2D]
+    assert len(seen["v2"]) > 50
+    assert max(max(columns) for view, columns in seen.items() if view != "v0") < 202
+    assert not (tmp_path / "out" / "masks" / "v0.png").exists()
+    assert (read_mask(tmp_path / "out", "v2") == (mask > 0)).all()
+
+
+def test_pictures_for_sfm_with_less_glare() -> None:
+    intensities = np.full((4, 6, 8, 3), 0.5, np.float32)
+    intensities[2, :, :4] = 0.1
+    darkest = tone_mapped(intensities, "minimum")
+    assert (darkest[:, 4:] == 255).all()
+    assert (darkest[:, :4] == round(255 * (1.055 * 0.2 ** (1 / 2.4) - 0.055))).all()
+    assert (tone_mapped(intensities)[:, :4] > darkest[:, :4]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"intrinsics": "260,260,160"}, "--intrinsics: expected fx,fy,cx,cy or"),
+        ({"intrinsics": "260,0,160,120"}, "--intrinsics: expected fx,fy,cx,cy or"),
+        ({"refine_intrinsics": True}, "--refine-intrinsics: expected intrinsics to begin with"),
+        ({"intrinsics": "9,9,9,9", "poses": "none"}, "expected poses by structure from motion"),
+        ({"masks": "nowhere"}, "--masks: expected a folder of masks"),
+    ],
+)
+def test_wrong_use_is_told(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    write_shots(tmp_path / "in", "v0", behind(smooth_light()))
+    with pytest.raises(PolarguideError, match=words):
+        prepare_scene(tmp_path / "in", tmp_path / "out", replace(FILTER, **changes))
+    assert not (tmp_path / "out").exists()
+
+
+def test_masks_have_to_fit(tmp_path: Path) -> None:
+    write_shots(tmp_path / "in", "v0", behind(smooth_light()))
+    settings = replace(FILTER, masks=str(tmp_path / "masks"), poses="none")
+    write_picture(tmp_path / "masks" / "other.png", np.ones((4, 4)), bits=8)
+    with pytest.raises(PolarguideError, match="expected masks called like the views"):
+        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    write_picture(tmp_path / "masks" / "v0.png", np.ones((4, 4)), bits=8)
+    with pytest.raises(PolarguideError, match=r"v0\.png: expected the size of the picture"):
+        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
 
 
 def test_poses_may_follow_on_none(tmp_path: Path) -> None:

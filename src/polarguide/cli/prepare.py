@@ -48,6 +48,10 @@ def prepare(
     zero: float | None = None,
     poses: str = "auto",
     matching: Literal["exhaustive", "sequential"] = "exhaustive",
+    sfm_pictures: Literal["photograph", "minimum"] = "photograph",
+    intrinsics: str | None = None,
+    refine_intrinsics: bool = False,
+    masks: Path | None = None,
     seed: int = 0,
     threads: int = 0,
 ) -> None:
@@ -82,6 +86,10 @@ def prepare(
         zero: Where their zero lies, in degrees counter-clockwise from the image's horizontal.
         poses: sfm, dataset, none, or the path of a COLMAP model; auto takes those of a dataset, else sfm.
         matching: Pairs that SfM compares: all, or neighbours in the order of their names.
+        sfm_pictures: What SfM finds features in: the photograph, or the minimum over the angles, which has less glare.
+        intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all pictures as developed, for SfM; without it they are estimated.
+        refine_intrinsics: Let SfM change the focal lengths and distortion given.
+        masks: Folder of object masks called like the views; SfM looks at their white parts alone.
         seed: Seed of SfM.
         threads: Threads for the pictures; 0 takes all cores, as SfM always does.
     """
@@ -95,6 +103,8 @@ def prepare(
         white_balance=white_balance, demosaic=demosaic, interpolation=interpolation, register=register,
         transfer=transfer, align=align, gains=gains, calibration=_calibration(calibration, order, sense, zero),
         poses=poses if poses in ORIGINS else os.path.realpath(poses), matching=matching, seed=seed,
+        sfm_pictures=sfm_pictures, intrinsics=intrinsics, refine_intrinsics=refine_intrinsics,
+        masks=None if masks is None else os.path.realpath(masks),
     )  # fmt: skip
     done = prepare_scene(source, out, settings, ConsoleReporter())
     without = f", {len(done.left_out)} left out" if done.left_out else ""

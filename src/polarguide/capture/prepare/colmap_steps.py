@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 from polarguide.capture.posed_camera import PosedCamera
+from polarguide.capture.prepare.folder import encoded, guarded, write_whole
 from polarguide.capture.prepare.reporter import Reporter
 from polarguide.capture.prepare.row_counter import RowCounter
 from polarguide.errors import PolarguideError
@@ -29,6 +32,7 @@ def match(
     seed: int,
     reporter: Reporter,
     cameras: Mapping[str, PosedCamera] | None = None,
+    masks: Path | None = None,
 ) -> dict[str, tuple[int, int]]:
     """Features, matches and two-view geometries of the pictures, into the database.
 
@@ -40,6 +44,7 @@ def match(
         seed: of all random draws.
         reporter: for progress.
         cameras: intrinsics by view, where they are known.
+        masks: folder of ``<view>.png``, outside of whose white parts nothing is looked at; may lack some or all.
 
     Returns:
         The numbers of each view's image and camera in the database, where ``cameras`` were given; else nothing.
@@ -55,10 +60,14 @@ def match(
     seeded(verify.ransac, seed)
     compare = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
     pairs = count * (count - 1) // 2 if matching == "exhaustive" else None
+    reading: dict[str, Any] = {}
+    if masks is not None and masks.is_dir() and any(masks.iterdir()):
+        reading["reader_options"] = pycolmap.ImageReaderOptions()
+        reading["reader_options"].mask_path = str(_named_for_colmap(masks, sizes))
     try:
         with RowCounter(database, "keypoints") as counter:
             run(
-                lambda: pycolmap.extract_features(database, images, camera_mode=mode),
+                lambda: pycolmap.extract_features(database, images, camera_mode=mode, **reading),
                 seed, reporter, "finding features", count, lambda: counter.rows,
             )  # fmt: skip
         numbers: dict[str, tuple[int, int]] = {}
@@ -75,6 +84,19 @@ def match(
                 path.unlink()
         raise
     return numbers
+
+
+def _named_for_colmap(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
+    """Masks under the names that COLMAP wants, ``<view>.png.png``; white for views without, which it would skip."""
+    named = masks.with_name("colmap_masks")
+    guarded(lambda: named.mkdir(exist_ok=True), named)
+    for view, (width, height) in sizes.items():
+        mask, wanted = masks / f"{view}.png", named / f"{view}.png.png"
+        if mask.exists():
+            guarded(lambda mask=mask, wanted=wanted: shutil.copyfile(mask, wanted), wanted)  # type: ignore[misc]
+        else:
+            write_whole(wanted, encoded(np.full((height, width), 255, np.uint8)))
+    return named
 
 
 def _know(database: Path, cameras: Mapping[str, PosedCamera]) -> dict[str, tuple[int, int]]:

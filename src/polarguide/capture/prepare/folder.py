@@ -24,6 +24,7 @@ from polarguide.errors import PolarguideError
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
 SFM = ".sfm"
+_OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 
 
 class SceneFolder:
@@ -75,9 +76,7 @@ class SceneFolder:
         self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
         if self._follows_none:
             for record in (before, now):
-                record["settings"] = {
-                    k: v for k, v in record["settings"].items() if k not in ("poses", "matching", "seed")
-                }
+                record["settings"] = {k: v for k, v in record["settings"].items() if k not in _OF_POSES}
                 record.pop("model", None)
         differing = _first_difference(before, now)
         if differing is not None:

@@ -10,6 +10,7 @@ from polarguide.capture.filter import find_shots
 from polarguide.capture.layout import angle_folders, contents
 from polarguide.capture.prepare.filter_source import FilterSource
 from polarguide.capture.prepare.mosaic_source import MosaicSource
+from polarguide.capture.prepare.object_masks import MaskedSource
 from polarguide.capture.prepare.poses import Poses
 from polarguide.capture.prepare.settings import PrepareSettings, check_format
 from polarguide.capture.prepare.source import Source
@@ -47,7 +48,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             found=contents(root),
             remedy="See docs/formats.md for the layouts.",
         )
-    return found
+    return found if settings.masks is None else MaskedSource(found, Path(settings.masks))
 
 
 def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:

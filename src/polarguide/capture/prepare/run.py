@@ -18,6 +18,7 @@ from polarguide.capture.prepare.settings import PrepareSettings, check_settings
 from polarguide.capture.prepare.source import Geometry, Source
 from polarguide.capture.prepare.workshop import PHOTOGRAPHS, Workshop
 from polarguide.capture.view import listed
+from polarguide.errors import PolarguideError
 
 _PARTIAL = ".sparse.partial"
 
@@ -66,6 +67,13 @@ def prepare_scene(
     check_settings(settings)
     pictures = open_source(root, settings)
     settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
+    if settings.poses != "sfm" and settings.intrinsics is not None:
+        raise PolarguideError(
+            "--intrinsics",
+            expected="poses by structure from motion, which they are for",
+            found=f"--poses {settings.poses}",
+            remedy="Leave them out: the cameras come with the poses.",
+        )
     poses = given_poses(root, pictures, settings.poses)
     folder = SceneFolder(target, _request(root, pictures, settings, poses))
     if folder.finished:

@@ -39,6 +39,10 @@ class PrepareSettings:
         gains: "auto" or "none"; a calibration with gains goes first.
         poses: "auto" (those of a published dataset, else "sfm"), "dataset", "sfm", "none" or the path of a
             COLMAP model.
+        sfm_pictures: what features are found in: "photograph" (S0/2) or "minimum" (the least of the four angles).
+        intrinsics: of structure from motion, see ``known_intrinsics``; None: estimated.
+        refine_intrinsics: whether it may change them.
+        masks: folder of object masks.
     """
 
     format: str = "auto"
@@ -62,6 +66,10 @@ class PrepareSettings:
     calibration: Calibration = field(default_factory=Calibration)
     poses: str = "auto"
     matching: str = "exhaustive"
+    sfm_pictures: str = "photograph"
+    intrinsics: str | None = None
+    refine_intrinsics: bool = False
+    masks: str | None = None
     seed: int = 0
 
     def record(self) -> dict[str, Any]:
@@ -83,6 +91,7 @@ def check_settings(settings: PrepareSettings) -> None:
         "transfer": ("auto", "linear", "srgb"),
         "gains": ("auto", "none"),
         "matching": ("exhaustive", "sequential"),
+        "sfm_pictures": ("photograph", "minimum"),
         "packing": (None, *PACKINGS),
     }
     for name, allowed in choices.items():
@@ -97,6 +106,15 @@ def check_settings(settings: PrepareSettings) -> None:
     level = settings.black_level
     _require("black_level", math.isfinite(level) and level >= 0, "0 or more", settings)
     checked(settings.calibration, "calibration")
+    if settings.intrinsics is not None:
+        known_intrinsics(settings.intrinsics)
+    elif settings.refine_intrinsics:
+        raise PolarguideError(
+            "--refine-intrinsics",
+            expected="intrinsics to begin with",
+            found="no --intrinsics",
+            remedy="Leave it out: unknown intrinsics are always estimated.",
+        )
     if settings.sensor is not None:
         sensor_pattern(settings.sensor)
 
@@ -152,6 +170,27 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
             remedy="Take the gains from a picture of a grey card.",
         ) from None
     return red, green, blue
+
+
+def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's camera model and parameters from ``--intrinsics``: PINHOLE of four numbers, OPENCV of eight.
+
+    Raises:
+        PolarguideError: it is neither.
+    """
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+        right = len(numbers) in (4, 8) and all(map(math.isfinite, numbers)) and min(numbers[:4]) > 0
+    except ValueError:
+        right = False
+    if not right:
+        raise PolarguideError(
+            "--intrinsics",
+            expected="fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 in pixels of the developed pictures",
+            found=repr(text),
+            remedy="Correct the value; the centre of the first pixel is at 0.5.",
+        )
+    return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
 
 
 def flag(name: str) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from polarguide.capture.posed_camera import PosedCamera
 from polarguide.capture.prepare.colmap_steps import match, run, seeded
 from polarguide.capture.prepare.folder import guarded
 from polarguide.capture.prepare.reporter import Reporter
@@ -23,9 +24,14 @@ ADVICE = (
 )
 
 
-def tone_mapped(intensities: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """S0/2 of a view as an 8-bit sRGB picture, BGR, with the 99th percentile at white."""
-    photograph = intensities.mean(axis=0)
+def tone_mapped(intensities: NDArray[np.float32], pictures: str = "photograph") -> NDArray[np.uint8]:
+    """A view as an 8-bit sRGB picture, BGR, with the 99th percentile at white.
+
+    Args:
+        intensities: [4, H, W, 3] linear.
+        pictures: "photograph" for S0/2, "minimum" for the least of the four, which has less glare.
+    """
+    photograph = intensities.min(axis=0) if pictures == "minimum" else intensities.mean(axis=0)
     white = max(float(np.percentile(photograph, 99.0)), 1e-4)
     linear = np.clip(photograph / white, 0.0, 1.0)
     shown = np.where(
@@ -35,9 +41,18 @@ def tone_mapped(intensities: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def reconstruct(
-    folder: Path, sizes: dict[str, tuple[int, int]], *, matching: str, seed: int, reporter: Reporter
+    folder: Path,
+    sizes: dict[str, tuple[int, int]],
+    *,
+    matching: str,
+    seed: int,
+    reporter: Reporter,
+    intrinsics: tuple[str, tuple[float, ...]] | None = None,
+    refine: bool = True,
 ) -> Path:
     """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
+
+    Where there is ``folder/masks/<view>.png``, only its white parts are looked at.
 
     Features and matches are kept in a database, so that a run that was stopped does not repeat them. The
     largest model wins.
@@ -48,9 +63,11 @@ def reconstruct(
         matching: "exhaustive", or "sequential" for views taken in the order of their names.
         seed: of all random draws.
         reporter: for progress and what was registered.
+        intrinsics: model and parameters of all pictures, where they are known.
+        refine: whether known ones may change.
 
     Returns:
-        The folder of the model, with one camera model SIMPLE_RADIAL for pictures of one size.
+        The folder of the model, with one camera for pictures of one size: of the model given, or SIMPLE_RADIAL.
 
     Raises:
         PolarguideError: fewer than three views were registered, or COLMAP failed.
@@ -59,10 +76,18 @@ def reconstruct(
     if model.is_dir():
         return model
     database, images, trial = folder / "database.db", folder / "images", folder / "models"
-    match(database, images, sizes, matching=matching, seed=seed, reporter=reporter)
+    cameras = None
+    if intrinsics is not None:
+        still = np.eye(3), np.zeros(3)
+        cameras = {view: PosedCamera(*size, *intrinsics, *still) for view, size in sizes.items()}
+    match(
+        database, images, sizes,
+        matching=matching, seed=seed, reporter=reporter, cameras=cameras, masks=folder / "masks",
+    )  # fmt: skip
     shutil.rmtree(trial, ignore_errors=True)
     guarded(lambda: trial.mkdir(), trial)
-    models = _map(database, images, trial, len(sizes), seed, reporter)
+    free = intrinsics is None or refine
+    models = _map(database, images, trial, len(sizes), seed, reporter, free)
     best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
     registered = 0 if best is None else best.num_reg_images()
     if best is None or registered < _LEAST:
@@ -88,11 +113,12 @@ def reconstruct(
 
 
 def _map(
-    database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter
+    database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter, free: bool
 ) -> dict[int, Any]:
-    """Incremental mapping: pycolmap's models, by number."""
+    """Incremental mapping: pycolmap's models, by number; ``free`` intrinsics are estimated."""
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = _LEAST
+    options.ba_refine_focal_length = options.ba_refine_extra_params = free
     for part in (options, options.mapper, options.triangulation):
         seeded(part, seed)
     placed = [0]

@@ -12,7 +12,7 @@ from polarguide.capture.prepare.folder import SFM, SceneFolder, encoded, guarded
 from polarguide.capture.prepare.points import add_points
 from polarguide.capture.prepare.poses import Poses
 from polarguide.capture.prepare.reporter import Reporter
-from polarguide.capture.prepare.settings import PrepareSettings
+from polarguide.capture.prepare.settings import PrepareSettings, known_intrinsics
 from polarguide.capture.prepare.sfm import reconstruct, tone_mapped
 from polarguide.capture.prepare.source import Geometry, Source
 
@@ -40,7 +40,13 @@ class Workshop:
         sizes = {view: geometry.size for view, geometry in self._photographs(self._pictures.views).items()}
         asked = self._settings
         return reconstruct(
-            self._root, sizes, matching=asked.matching, seed=asked.seed, reporter=self._reporter
+            self._root,
+            sizes,
+            matching=asked.matching,
+            seed=asked.seed,
+            reporter=self._reporter,
+            intrinsics=None if asked.intrinsics is None else known_intrinsics(asked.intrinsics),
+            refine=asked.refine_intrinsics,
         )
 
     def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:
@@ -79,7 +85,7 @@ class Workshop:
                     done = self._pictures.develop(view, measured)
                     if done.mask is not None:
                         write_whole(masks / f"{view}.png", encoded(done.mask.astype(np.uint8) * 255))
-                    write_whole(path, encoded(tone_mapped(done.intensities)))
+                    write_whole(path, encoded(tone_mapped(done.intensities, self._settings.sfm_pictures)))
                     known[view] = done.geometry.record()
                     self._folder.save()
                 advance(count)
