@@ -98,7 +98,7 @@ def test_the_command_in_the_record_asks_for_the_same() -> None:
 def planned(trained: Path, demo_scene: Path, tmp_path: Path) -> PlannedRun:
     """The short training of the demo scene as a run of a comparison, scored."""
     question = asked(
-        scenes=(demo_scene,), recipes=(recipe_named("polarguide"),), seeds=1, downscale=4, out=tmp_path
+        scenes=(demo_scene,), recipes=(recipe_named("polarguide-stokes"),), seeds=1, downscale=4, out=tmp_path
     )
     (only,) = plan_runs(question, scene_entries(question))
     shutil.copytree(trained, only.folder)

@@ -19,6 +19,9 @@ WITHOUT_PART = {
     "inspection",
     "viewer",
     "synth",
+    "api.py",
+    "surroundings.py",
+    "trajectory.py",
 }
 
 

@@ -28,7 +28,13 @@ TRAINED_BY = (
 )
 """What decides a training's result, below the package. ``_native`` is the compiled library."""
 
-SCORED_BY = ("evaluation/metrics.py", "evaluation/scores.py", "evaluation/lpips.py", "cli/evaluate.py")
+SCORED_BY = (
+    "trained.py",
+    "evaluation/metrics.py",
+    "evaluation/scores.py",
+    "evaluation/lpips.py",
+    "cli/evaluate.py",
+)
 """What decides, beside that, the numbers of a finished training."""
 
 DIGITS = 16
