@@ -94,15 +94,18 @@ def machine(results: dict[str, dict[str, Any]]) -> str:
 
 
 def provide(pack: Path, out: Path) -> dict[str, str]:
-    """The environment of the parts: our source with its kernels, and the pack's wheels for what is not installed."""
+    """The environment of the parts: our source with its kernels, and the pack's wheels for what is not installed.
+
+    Where the source has no kernels, but polarguide is installed with them, that is taken as it is.
+    """
     site = out / "site"
     if not pack.is_dir():
         sys.exit(
             f"{pack}: expected the folder that benchmarks/gpu/pack.py makes, found nothing; see docs/gpu.md"
         )
-    paths = [str(ROOT / "src"), str(site)]
-    paths += [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    paths = [str(site), *(path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path)]
+    as_installed = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), *paths])}
     wheels = [str(wheel) for wheel in sorted((pack / "wheels").glob("*.whl")) if not installed(wheel)]
     if wheels and not site.is_dir():
         pip("--target", str(site), *wheels)
@@ -112,8 +115,10 @@ def provide(pack: Path, out: Path) -> dict[str, str]:
     if lacking:
         print(f"not installed, and no wheel in the pack: {', '.join(lacking)}", flush=True)
     probe = [sys.executable, "-c", "import polarguide._native"]
-    if subprocess.run(probe, env=environment, capture_output=True, check=False).returncode:
-        build_native(environment, out)
+    for found in (environment, as_installed):
+        if not subprocess.run(probe, env=found, cwd=out, capture_output=True, check=False).returncode:
+            return found
+    build_native(environment, out)
     return environment
 
 
