@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
 # Threads that wait should sleep: torch's OpenMP workers must not fight the kernels' threads for cores by spinning.
@@ -14,6 +15,8 @@ from polarguide.cli.app import run
 
 def main() -> None:
     """Entry point of the command line."""
+    # pycolmap prints a stack trace at this signal; a process that is asked to end should just end.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(run(sys.argv[1:]))
 
 

@@ -19,7 +19,7 @@ import torch
 from random_runs import KINDS, random_state, ring
 
 from polarguide.camera import Camera
-from polarguide.cli.pictures import layer_picture
+from polarguide.evaluation.pictures import layer_picture
 from polarguide.export.share import share_page, write_page
 from polarguide.raster.cpu import rasterise_cpu
 from polarguide.shading.render import render

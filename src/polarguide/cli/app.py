@@ -22,6 +22,7 @@ from polarguide.cli.render import render_views
 from polarguide.cli.share import share
 from polarguide.cli.synth import synth
 from polarguide.cli.train import train
+from polarguide.cli.view import view
 from polarguide.errors import PolarguideError
 
 VERBS: dict[str, Callable[..., Any]] = {
@@ -31,6 +32,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "train": train,
     "eval": evaluate,
     "render": render_views,
+    "view": view,
     "share": share,
     "export": export,
     "priors": priors,

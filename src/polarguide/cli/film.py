@@ -11,9 +11,9 @@ from rich.progress import track
 
 from polarguide.camera import Camera
 from polarguide.cli.common import OpenRun, console
-from polarguide.cli.pictures import Picture, layer_picture
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import figures
+from polarguide.evaluation.pictures import Picture, layer_picture
 from polarguide.export.video import write_video
 from polarguide.trajectory import interpolated, orbit, read_path, spiral
 

@@ -11,9 +11,9 @@ import tyro
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, console, open_run, select_views, use_threads
 from polarguide.cli.film import film
-from polarguide.cli.pictures import Picture, layer_picture, true_depth_range, truth_pictures
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import figures
+from polarguide.evaluation.pictures import Picture, layer_picture, true_depth_range, truth_pictures
 from polarguide.export.environment import needs_radiance, read_panorama, texels_of, turned_cubemap
 from polarguide.raster import DeviceName
 from polarguide.surroundings import surroundings

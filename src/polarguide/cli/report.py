@@ -11,11 +11,11 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.cli.common import OpenRun, console, open_run, read_scene
 from polarguide.cli.comparison import Comparison, PlannedRun, SceneEntry
-from polarguide.cli.pictures import Picture, layer_picture, truth_pictures
 from polarguide.evaluation import figures
 from polarguide.evaluation.curves import Curve, read_curve
 from polarguide.evaluation.embedded import EmbeddedView, Tile, chosen_views, embed
 from polarguide.evaluation.metrics import normal_angles_deg
+from polarguide.evaluation.pictures import Picture, layer_picture, truth_pictures
 from polarguide.evaluation.report import ERROR_HIGH, NORMAL_ERROR_HIGH, report_html
 from polarguide.training.run import atomic
 

@@ -3,34 +3,29 @@
 from __future__ import annotations
 
 import json
-import signal
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import tyro
 
 from polarguide.cli.common import Transfer, console, read_scene, use_threads
 from polarguide.cli.company import backend_of, company
-from polarguide.cli.meter import LOG_EVERY, Meter, progress_bar
+from polarguide.cli.train_loop import train_run, watched
 from polarguide.errors import PolarguideError
-from polarguide.export import write_run_ply
 from polarguide.raster import DeviceName
 from polarguide.recipes import recipe_named
 from polarguide.training.ranks import Ranks
 from polarguide.training.run import (
     CHECKPOINT,
     CONFIGURATION,
-    PLY,
     RunConfiguration,
-    RunLog,
     load_checkpoint,
     recipe_data,
-    save_checkpoint,
 )
-from polarguide.training.stopwatch import Stopwatch
 from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.viewer import LOOPBACK
 
 
 def train(
@@ -49,6 +44,9 @@ def train(
     checkpoint_every: int = 500,
     views_per_step: int = 0,
     resume: bool = False,
+    viewer: bool = False,
+    viewer_host: str = LOOPBACK[0],
+    viewer_port: int = 8080,
 ) -> None:
     """Train a recipe on a scene.
 
@@ -73,6 +71,9 @@ def train(
         views_per_step: Views whose mean gradient makes a step; 0 takes one for each process (or what the run to resume
             took). Learning rates grow with its square root; steps are steps, so more views are looked at.
         resume: Go on with the run in --out.
+        viewer: Look on in a browser while it trains (afterwards: polarguide view).
+        viewer_host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
+        viewer_port: To listen at; the next free one is taken if it is in use.
     """
     use_threads(threads)
     check_count("--checkpoint-every", checkpoint_every)
@@ -103,9 +104,10 @@ def train(
             out.mkdir(parents=True, exist_ok=True)
             configuration.save(out)
         trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
-        train_run(trainer, out, checkpoint_every=checkpoint_every)
+        with watched(trainer, viewer_host, viewer_port) if viewer else nullcontext() as look:
+            train_run(trainer, out, checkpoint_every=checkpoint_every, look=look)
     if leads:
-        console.print(f"trained: {out}   next: polarguide eval {out}   polarguide render {out}")
+        console.print(f"trained: {out}   next: polarguide eval {out}   polarguide view {out}")
 
 
 def _views(asked: int, ranks: Ranks, resumed: Path | None) -> int:
@@ -183,64 +185,3 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
                 found=json.dumps(b, default=str)[:120],
                 remedy="Resume with the same scene, flags and program version, or train into a new folder.",
             )
-
-
-class _Interrupt:
-    """Turns the first Ctrl-C (or SIGTERM) into a flag that the loop looks at between two steps."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._old = {s: signal.signal(s, self._ask) for s in (signal.SIGINT, signal.SIGTERM)}
-
-    def _ask(self, number: int, _: FrameType | None) -> None:
-        if self.asked and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.asked = True
-
-    def restore(self) -> None:
-        """Put the previous handlers back."""
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-
-def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int) -> None:
-    """Train to the end with progress, checkpoints and a log; then write the PLY. Rank 0 alone writes."""
-    ranks, leads = trainer.ranks, trainer.ranks.rank == 0
-    log = RunLog(out) if leads else None
-    if log is not None:
-        log.cut(trainer.state.step)
-    stopwatch = Stopwatch(*log.elapsed()) if log else Stopwatch()
-    interrupt = _Interrupt()
-    try:
-        with progress_bar() as progress:
-            task = progress.add_task("", total=trainer.settings.steps, completed=trainer.state.step, note="")
-            meter = Meter(progress, task, log, stopwatch)
-            stopped = False
-            while trainer.state.step < trainer.settings.steps and not stopped:
-                meter.show(trainer.step())
-                if trainer.state.step % checkpoint_every == 0:
-                    with stopwatch.paused():
-                        meter.read()
-                        _save(trainer, out)
-                # Several ranks stop after the same step, so they have to ask each other, which takes time.
-                if ranks.world == 1 or trainer.state.step % LOG_EVERY == 0:
-                    stopped = ranks.any(interrupt.asked)
-            meter.read()
-        _save(trainer, out)
-        if stopped:
-            console.print(
-                f"stopped after step {trainer.state.step}; go on with the same command and --resume"
-            )
-            raise KeyboardInterrupt
-    finally:
-        interrupt.restore()
-    if leads:
-        shading = trainer.recipe.shading(trainer.settings.refractive_index)
-        write_run_ply(out / PLY, trainer.state, shading)
-
-
-def _save(trainer: Trainer, out: Path) -> None:
-    """A checkpoint of what all ranks have seen, by rank 0."""
-    trainer.exchange_statistics()
-    if trainer.ranks.rank == 0:
-        save_checkpoint(out, trainer.state)

@@ -32,7 +32,7 @@ def base_colours(rows: Rows, centre: Tensor, sh_degree: int) -> Tensor:
 
 def harmonic_colours(rows: Rows, rays: Tensor) -> Tensor:
     """Linear base colours [N, 3] along unit rays [N, 3], of degree 3, not negative."""
-    origin = torch.zeros_like(rays[0])
+    origin = rays.new_zeros(3)
     return (evaluate_sh(rays, origin, rows["sh_dc"], rows["sh_rest"], 3) + 0.5).clamp(min=0)
 
 
@@ -47,7 +47,7 @@ def local_light(rows: Rows, directions: Tensor, sh_degree: int) -> Tensor:
         [N, 3], differentiable in the harmonics alone.
     """
     directions = directions.detach()
-    origin = torch.zeros_like(directions[0])
+    origin = directions.new_zeros(3)
     return evaluate_sh(directions, origin, rows["local_dc"], rows["local_rest"], sh_degree)
 
 

@@ -25,7 +25,7 @@ def layer_picture(
         return None
     near, far = depths or (0.0, 1.0)
     if name == "depth" and depths is None:
-        near, far = _depth_range(values, result.alpha > 0.5)
+        near, far = depth_range(values, result.alpha > 0.5)
     draw: dict[str, Callable[[Tensor], Picture]] = {
         "normal": lambda v: figures.normal_to_rgb(v, camera),
         "depth": lambda v: figures.scalar_to_rgb(v, near, far),
@@ -35,7 +35,7 @@ def layer_picture(
     return draw.get(name, figures.radiance_to_rgb)(values)
 
 
-def _depth_range(depth: Tensor, seen: Tensor) -> tuple[float, float]:
+def depth_range(depth: Tensor, seen: Tensor) -> tuple[float, float]:
     """Nearest and farthest depth [H, W] worth a colour where ``seen`` [H, W]."""
     values = depth[seen]
     if values.numel() == 0:
@@ -49,7 +49,7 @@ def true_depth_range(view: View) -> tuple[float, float] | None:
     truth = view.truth
     if truth is None or truth.depth is None or truth.mask is None:
         return None
-    return _depth_range(truth.depth, truth.mask)
+    return depth_range(truth.depth, truth.mask)
 
 
 def truth_pictures(view: View) -> dict[str, Picture]:

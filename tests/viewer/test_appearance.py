@@ -1,0 +1,124 @@
+"""What a visitor sees, against the renderer itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from random_runs import KINDS, ring
+from sights import around, photograph, shown
+
+from polarguide.evaluation import figures
+from polarguide.viewer.appearance import MEASURED, RENDERED, Appearance, Crop, Painter
+from polarguide.viewer.lens import fit
+
+CAMERAS = ring()
+CAMERA = CAMERAS["v1"]
+EVERYTHING = Crop((-9, -9, -9), (9, 9, 9))
+
+
+def paint(seen, appearance=Appearance(), view=None, camera=CAMERA, **named):
+    return Painter(around()).paint(seen, camera, appearance, view, **named)
+
+
+@pytest.mark.parametrize("recipe", KINDS)
+def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
+    seen = shown(recipe)
+    result = seen.render(CAMERA, seen.rows, seen.environment, depth=True)
+    for layer in RENDERED:
+        picture = paint(seen, Appearance(layer=layer))
+        if getattr(result, layer) is None:
+            assert picture is None
+        else:
+            assert picture.shape == (CAMERA.height, CAMERA.width, 3)
+            assert picture.std() > 3
+    assert np.array_equal(paint(seen), figures.radiance_to_rgb(result.final))
+    normals = figures.normal_to_rgb(result.normal, CAMERA)
+    assert np.array_equal(paint(seen, Appearance(layer="normal")), normals)
+
+
+def test_exposure_and_reflection():
+    seen = shown()
+    result = seen.render(CAMERA, seen.rows, seen.environment, depth=False)
+    brighter = paint(seen, Appearance(exposure=-1.5))
+    assert np.array_equal(brighter, figures.radiance_to_rgb(result.final / 2**1.5))
+    without = paint(seen, Appearance(strength=0.0))
+    assert np.array_equal(without, figures.radiance_to_rgb(result.diffuse))
+    doubled = paint(seen, Appearance(strength=2.0))
+    assert np.array_equal(doubled, figures.radiance_to_rgb(result.diffuse + 2 * result.specular))
+
+
+def test_turning_the_environment_turns_what_a_mirror_shows():
+    seen = shown("3dgs-dr")
+    assert np.array_equal(paint(seen, Appearance(turn=360)), paint(seen))
+    assert not np.array_equal(paint(seen, Appearance(turn=90)), paint(seen))
+    # Light that is the same all around stays; so does what does not reflect.
+    even = replace(seen, environment={"texels": torch.full((6, 8, 8, 3), 0.3)})
+    assert np.abs(paint(even, Appearance(turn=90)).astype(int) - paint(even)).max() <= 1
+    base = Appearance(layer="base")
+    assert np.array_equal(paint(seen, replace(base, turn=90)), paint(seen, base))
+
+
+def test_features_for_a_network_are_not_turned():
+    seen = shown("ref-gs")
+    assert np.array_equal(paint(seen, Appearance(turn=90)), paint(seen))
+
+
+def test_a_crop_shows_what_is_inside():
+    seen = shown()
+    alpha = Appearance(layer="alpha")
+    assert np.array_equal(paint(seen, replace(alpha, crop=EVERYTHING)), paint(seen, alpha))
+    nothing = figures.scalar_to_rgb(torch.zeros(CAMERA.height, CAMERA.width), 0, 1)
+    outside = Crop((8, 8, 8), (9, 9, 9))
+    assert np.array_equal(paint(seen, replace(alpha, crop=outside)), nothing)
+    # What lies above the middle is in the upper half of the picture.
+    upper = paint(seen, replace(alpha, crop=Crop((-9, 0.15, -9), (9, 9, 9)))).astype(int) - nothing
+    rows = np.abs(upper).sum(axis=(1, 2))
+    assert rows[: CAMERA.height // 2].sum() > 3 * rows[CAMERA.height // 2 :].sum()
+
+
+def test_a_crops_corners_are_inside_and_a_bit_more_is_not():
+    place, crop = around(), Crop((-0.5, -0.25, -1), (0.5, 0.75, 0.1))
+    corners = crop.corners(place)
+    middle = corners.mean(dim=0)
+    assert crop.inside(middle + 0.999 * (corners - middle), place).all()
+    assert not crop.inside(middle + 1.001 * (corners - middle), place).any()
+
+
+def test_at_a_photograph_the_pose_is_the_photographs():
+    seen = shown()
+    view = photograph("v2", CAMERAS["v2"], seen).view
+    window = replace(CAMERA, width=200, height=90)
+    picture = paint(seen, view=view, camera=window)
+    expected = fit(view.camera, (200, 90)).camera(view.camera)
+    assert np.array_equal(picture, paint(seen, camera=expected))
+
+
+def test_what_was_measured_there():
+    seen = shown()
+    view = photograph("v1", CAMERA, seen).view
+    assert all(paint(seen, Appearance(layer=layer)) is None for layer in MEASURED)
+    found = {layer: paint(seen, Appearance(layer=layer), view) for layer in MEASURED}
+    assert np.array_equal(found["photograph"], figures.radiance_to_rgb(view.photograph()))
+    # S1 / S0 = (1.3 - 0.7) / 2 everywhere, along the rows.
+    there = view.photograph().mean(dim=-1) > 0.02
+    dolp = figures.dolp_to_rgb(torch.full(there.shape, 0.3), 0.5)
+    assert np.abs(found["DoLP"].astype(int) - dolp)[there].max() <= 3
+    aolp = figures.aolp_to_rgb(torch.zeros(there.shape))
+    assert np.abs(found["AoLP"].astype(int) - aolp)[there].max() <= 3
+    final = seen.render(CAMERA, seen.rows, seen.environment, depth=False).final
+    assert np.array_equal(found["error"], figures.error_to_rgb(final, view.photograph()))
+    right = paint(replace(seen, rows=seen.rows), Appearance(layer="error"), view)
+    assert np.array_equal(right, found["error"])
+
+
+def test_colours_of_depths_stay_while_the_camera_moves():
+    seen, painter, depth = shown(), Painter(around()), Appearance(layer="depth")
+    first = painter.paint(seen, CAMERA, depth)
+    nearer = replace(CAMERA, translation=0.7 * CAMERA.translation)
+    moving = painter.paint(seen, nearer, depth, settled=False)
+    rested = painter.paint(seen, nearer, depth, settled=True)
+    assert not np.array_equal(moving, rested)
+    assert np.array_equal(painter.paint(seen, CAMERA, depth), first)

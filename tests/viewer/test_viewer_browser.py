@@ -1,0 +1,157 @@
+"""The viewer in a real browser: its picture at a photograph's pose against ``render``, and its controls.
+
+Needs Playwright (``pip install polarguide[browser]``) and a Chromium of the system.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from random_runs import ring
+from sights import photograph, shown
+
+from polarguide.evaluation import figures
+from polarguide.viewer import Viewer
+
+playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system"),
+    pytest.mark.slow,
+]
+FLAGS = (
+    "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--ignore-gpu-blocklist"
+)
+PATIENCE = 120  # seconds; software rendering on a busy machine is slow
+WIDTH, HEIGHT = 960, 600
+FREE = np.s_[200:, : WIDTH - 350]  # neither under the panel nor under what viser says of software rendering
+HOSTILE = '<img src=x onerror="window.hurt=1">{window.hurt=1}'
+
+
+class Opened:
+    """A viewer over random Gaussians, and a browser that looks at it."""
+
+    def __init__(self, browser: Any) -> None:
+        self.seen = shown()
+        cameras = {**ring(width=WIDTH // 4, height=HEIGHT // 4)}
+        cameras[HOSTILE] = cameras.pop("v5")
+        self.photographs = {name: photograph(name, camera, self.seen) for name, camera in cameras.items()}
+        self.viewer = Viewer(
+            lambda: self.seen, self.photographs, list(cameras.values()), lit=True, port=18080, title=HOSTILE
+        )
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+        self.page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        self.page.set_default_timeout(1000 * PATIENCE)
+        self.requests: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(self.viewer.address)
+        self.page.get_by_label("Layer", exact=True).first.wait_for()
+
+    def _serve(self) -> None:
+        while not self._ends.is_set():
+            self.viewer.serve(0.2)
+
+    def close(self) -> None:
+        self.page.close()
+        self._ends.set()
+        self._thread.join()
+        self.viewer.close()
+
+    def screenshot(self) -> np.ndarray:
+        data = np.frombuffer(self.page.screenshot(timeout=1000 * PATIENCE), dtype=np.uint8)
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+
+    def until(self, holds: Callable[[np.ndarray], bool]) -> np.ndarray:
+        """A screenshot for which something holds; the last one if it never does."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            picture = self.screenshot()
+            if holds(picture) or time.monotonic() > deadline:
+                return picture
+            time.sleep(0.2)
+
+    def choose(self, label: str, value: str) -> None:
+        self.page.get_by_label(label, exact=True).first.click()
+        self.page.get_by_role("option", name=value, exact=True).click()
+
+    def expected(self, name: str, layer: str = "final") -> np.ndarray:
+        """What ``render`` gives for a photograph's camera at the window's size, the aspect being the same."""
+        lens = self.photographs[name].view.camera
+        scaled = {key: 4 * getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        camera = replace(lens, **scaled)
+        result = self.seen.render(camera, self.seen.rows, self.seen.environment, depth=True)
+        if layer == "normal":
+            return figures.normal_to_rgb(result.normal, camera)
+        return figures.radiance_to_rgb(getattr(result, layer))
+
+
+def psnr(picture: np.ndarray, expected: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean(((picture - expected.astype(float))[FREE] / 255) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def opened() -> Iterator[Opened]:
+    with playwright.sync_playwright() as running:
+        chromium = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
+        viewing = Opened(chromium)
+        yield viewing
+        viewing.close()
+        chromium.close()
+
+
+@pytest.mark.parametrize("layer", ["final", "specular", "normal", "diffuse", "final"])
+def test_layers_at_a_photographs_pose_are_those_of_render(opened, layer):
+    opened.choose("Layer", layer)
+    expected = opened.expected("v0", layer)
+    found = opened.until(lambda picture: psnr(picture, expected) > 35)
+    assert psnr(found, expected) > 35
+
+
+def test_going_on_to_the_next_photograph(opened):
+    opened.page.get_by_text("next", exact=True).click()
+    expected = opened.expected("v1")
+    assert psnr(opened.until(lambda picture: psnr(picture, expected) > 35), expected) > 35
+
+
+def test_dragging_turns_the_scene(opened):
+    before = opened.screenshot()
+    opened.page.mouse.move(200, 400)
+    opened.page.mouse.down()
+    opened.page.mouse.move(320, 430, steps=6)
+    opened.page.mouse.up()
+    moved = opened.until(lambda picture: psnr(picture, before) < 30)
+    assert psnr(moved, before) < 30
+    assert opened.page.get_by_label("Go to").first.input_value() == "(free)"
+
+
+def test_a_path_and_a_picture_are_downloaded(opened):
+    for heading in ("Picture and path",):
+        opened.page.get_by_text(heading, exact=True).click()
+    opened.page.get_by_role("button", name="Add this pose").click()
+    with opened.page.expect_download() as path:
+        opened.page.get_by_role("button", name="Save path").click()
+    assert path.value.suggested_filename == "camera_path.json"
+    with opened.page.expect_download() as picture:
+        opened.page.get_by_role("button", name="Save picture").click()
+    assert picture.value.suggested_filename == "polarguide.png"
+
+
+def test_names_run_nothing_and_nothing_is_asked_of_others(opened):
+    opened.choose("Go to", HOSTILE)
+    expected = opened.expected(HOSTILE)
+    opened.until(lambda picture: psnr(picture, expected) > 35)
+    assert opened.page.evaluate("window.hurt") is None
+    ours = opened.viewer.address.removeprefix("http://")
+    strangers = [url for url in opened.requests if ours not in url and not url.startswith(("data:", "blob:"))]
+    assert strangers == []
