@@ -19,7 +19,10 @@ CAMERA = CAMERAS["v1"]
 EVERYTHING = Crop((-9, -9, -9), (9, 9, 9))
 
 
-def paint(seen, appearance=Appearance(), view=None, camera=CAMERA, **named):
+PLAIN = Appearance()
+
+
+def paint(seen, appearance=PLAIN, view=None, camera=CAMERA, **named):
     return Painter(around()).paint(seen, camera, appearance, view, **named)
 
 

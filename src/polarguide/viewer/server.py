@@ -8,6 +8,7 @@ import io
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -62,6 +63,8 @@ class Viewer:
         title: str = "polarguide",
     ) -> None:
         viser = _viser()
+        # Of pictures for a browser that has just left.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self._look, self._cameras = look, cameras
         self._photographs = photographs
         self._around = surroundings(cameras)
