@@ -86,5 +86,5 @@ class Frusta:
         if crop is not None:
             corners = crop.corners(self._around).numpy()
             points = np.array([[corners[a], corners[b]] for a, b in EDGES], dtype=np.float32)
-            width = 0.004 * self._around.distance
+            width = 0.0015 * self._around.distance
             self._box = self._scene.add_line_segments("/crop", points, BOX_COLOUR, thickness=width)

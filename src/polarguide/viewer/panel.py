@@ -58,7 +58,7 @@ class Panel:
             self._use_crop = gui.add_checkbox("Crop", False)
             self.box = gui.add_checkbox("Show box", True)
             for label in ("Left, right", "Down, up", "Front, back"):
-                self._crop.append(gui.add_multi_slider(label, -150, 150, 1, (-50, 50), min_range=1))
+                self._crop.append(gui.add_multi_slider(label, -150, 150, 1, (-40, 40), min_range=1))
         with gui.add_folder("Picture and path", expand_by_default=False):
             self.screenshot = gui.add_button("Save picture")
             self.keys = gui.add_text("Poses", "0", disabled=True)
