@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 import tyro
 
@@ -13,11 +13,12 @@ from polarguide.cli.common import OpenRun, console, open_run, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import figures
 from polarguide.export.cameras import write_colmap, write_transforms
-from polarguide.export.compressed import Compressed, write_compressed
 from polarguide.export.environment import needs_radiance, panorama, write_exr
 from polarguide.export.mesh import scene_mesh, write_mesh
 from polarguide.export.points import surface_points, write_points
+from polarguide.export.sog import write_sog
 from polarguide.export.splats import write_run_ply
+from polarguide.export.spz import write_spz
 from polarguide.surroundings import surroundings
 
 Format = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
@@ -56,7 +57,8 @@ def export(
     folder.mkdir(parents=True, exist_ok=True)
     writers: dict[str, Callable[[], list[Path]]] = {
         "ply": lambda: [_ply(opened, folder / "splats.ply")],
-        **{kind: _compressed_writer(opened, folder, kind) for kind in get_args(Compressed)},
+        "spz": lambda: [_compressed(opened, folder / "splats.spz", write_spz)],
+        "sog": lambda: [_compressed(opened, folder / "splats.sog", write_sog)],
         "mesh": lambda: _mesh(opened, folder, resolution),
         "points": lambda: _points(opened, folder),
         "environment": lambda: _environment(opened, folder),
@@ -72,14 +74,11 @@ def _ply(opened: OpenRun, path: Path) -> Path:
     return path
 
 
-def _compressed_writer(opened: OpenRun, folder: Path, kind: Compressed) -> Callable[[], list[Path]]:
-    def write() -> list[Path]:
-        path = folder / f"splats.{kind}"
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".ply-") as place:
-            write_compressed(path, _ply(opened, Path(place) / "splats.ply"), kind)
-        return [path]
-
-    return write
+def _compressed(opened: OpenRun, path: Path, write: Callable[[Path, Path], None]) -> Path:
+    """From a PLY that is gone afterwards."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".ply-") as place:
+        write(path, _ply(opened, Path(place) / "splats.ply"))
+    return path
 
 
 def _mesh(opened: OpenRun, folder: Path, resolution: int) -> list[Path]:

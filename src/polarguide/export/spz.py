@@ -1,11 +1,8 @@
-"""Splats in the compressed formats that today's viewers read: SPZ and SOG, from the PLY of a run."""
+"""Splats in SPZ, Niantic's compressed format, from the PLY of a run."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
-from typing import Literal
 
 import torch
 
@@ -14,38 +11,33 @@ from polarguide.export.extras import needed
 from polarguide.gaussians.ply import read_ply, write_ply
 from polarguide.training.run import atomic
 
-Compressed = Literal["spz", "sog"]
-
 # Signs of the harmonics of degree 1 to 3, in the order of a PLY, after half a turn about x: y and z change theirs.
 _HALF_TURN_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 
 
-def write_compressed(path: Path, ply: Path, kind: Compressed) -> None:
-    """Convert a PLY of Gaussians; our own fields in it are left out, as neither format has a place for them.
+def write_spz(path: Path, ply: Path) -> None:
+    """Convert a PLY of Gaussians; our own fields in it are left out, as the format has no place for them.
 
     SPZ is in its own axes (right, up, back), so half a turn about x from ours; readers turn it back. Positions in it
-    are multiples of 1/4096 of the world's unit; both formats keep 8 bits or fewer of colours and harmonics. SOG
-    clusters harmonics, which takes minutes for 100,000 Gaussians.
+    are multiples of 1/4096 of the world's unit; colours and scales keep 8 bits, harmonics 5 or 4.
 
     Args:
-        path: the file to write. ply: as ``write_run_ply`` writes it. kind: the format.
+        path: the file to write. ply: as ``write_run_ply`` writes it.
 
     Raises:
         PolarguideError: the converter is not installed, or refuses.
     """
-    needed("gaussforge", f"--format {kind}")
-    if kind == "spz":
-        ply = _half_turned(ply)
+    converter = needed("gaussforge", "--format spz").GaussForge()
+    converted = converter.convert(_half_turned(ply).read_bytes(), "ply", "spz")
+    if "error" in converted:
+        raise PolarguideError(
+            ply,
+            expected="Gaussians that spz can hold",
+            found=str(converted["error"]),
+            remedy="Export them as ply.",
+        )
     with atomic(path) as temporary:
-        command = [sys.executable, "-m", "polarguide.export.converter", str(ply), kind, str(temporary)]
-        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        if done.returncode != 0:
-            raise PolarguideError(
-                ply,
-                expected=f"Gaussians that {kind} can hold",
-                found=(done.stderr.strip().splitlines() or ["a converter that failed"])[-1],
-                remedy="Export them as ply.",
-            )
+        temporary.write_bytes(bytes(converted["data"]))
 
 
 def _half_turned(ply: Path) -> Path:

@@ -1,0 +1,179 @@
+"""SOG, PlayCanvas' compressed splats: pictures in a ZIP file, after its specification, version 2.
+
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
+
+Ours, because the libraries at hand compare every Gaussian with up to 65,536 harmonics of a palette on one core: with
+more than 65,535 Gaussians that takes them over half an hour.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide.gaussians.ply import read_ply
+from polarguide.training.run import atomic
+
+CODES = 256
+PALETTE_ROW = 64
+LARGEST_PALETTE = 8192
+ROUNDS = 8
+SEED = 0
+Pixels = NDArray[np.uint8]
+
+
+def write_sog(path: Path, ply: Path) -> None:
+    """Convert a PLY of Gaussians; our own fields in it are left out. A fixed file for a fixed PLY.
+
+    Positions keep 16 bits of their signed logarithm, rotations 8 bits a component, the rest a code of 256 values;
+    harmonics beyond the first become one of at most 8,192.
+
+    Args:
+        path: the file to write. ply: as ``write_run_ply`` writes it.
+    """
+    rows = {name: values for name, values in read_ply(ply).items() if name != "extra"}
+    order = _morton_order(rows["means"])
+    rows = {name: values[order] for name, values in rows.items()}
+    width = math.ceil(math.sqrt(len(order)))
+    pictures: dict[str, Pixels] = {}
+    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "polarguide"}, "count": len(order)}
+    meta["means"] = _means(rows["means"], width, pictures)
+    meta["scales"] = _coded("scales.webp", rows["log_scales"], None, width, pictures)
+    pictures["quats.webp"] = _picture(_smallest_three(rows["quaternions"]), width)
+    meta["quats"] = {"files": ["quats.webp"]}
+    opacity = _bytes(torch.sigmoid(rows["opacity_logits"].reshape(-1, 1)))
+    meta["sh0"] = _coded("sh0.webp", rows["sh_dc"].reshape(-1, 3), opacity, width, pictures)
+    meta["shN"] = _harmonics(rows["sh_rest"], width, pictures)
+    with atomic(path) as temporary, zipfile.ZipFile(temporary, "w") as file:
+        _store(file, "meta.json", json.dumps(meta).encode())
+        for name, pixels in pictures.items():
+            _store(file, name, _lossless(pixels))
+
+
+def _store(file: zipfile.ZipFile, name: str, data: bytes) -> None:
+    """Without the time, so that the same splats make the same file."""
+    file.writestr(zipfile.ZipInfo(name), data)
+
+
+def _lossless(pixels: Pixels) -> bytes:
+    order = [2, 1, 0, 3][: pixels.shape[2]]
+    done, data = cv2.imencode(".webp", pixels[..., order], [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert done
+    return data.tobytes()
+
+
+def _picture(values: Tensor, width: int) -> Pixels:
+    """Rows [N, 3 or 4] of bytes as a picture [H, width, 4]; opaque where there is no fourth."""
+    count, channels = values.shape
+    pixels = np.zeros((math.ceil(count / width) * width, 4), dtype=np.uint8)
+    pixels[:, 3] = 255
+    pixels[:count, :channels] = values.to(torch.uint8).numpy()
+    return pixels.reshape(-1, width, 4)
+
+
+def _bytes(values: Tensor) -> Tensor:
+    """[0, 1] to [0, 255]."""
+    return (values.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _means(means: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[str, Any]:
+    logs = means.double().sign() * torch.log1p(means.double().abs())
+    low, high = logs.min(dim=0).values, logs.max(dim=0).values
+    codes = ((logs - low) / (high - low).clamp(min=1e-12) * 65535).round().to(torch.int32)
+    files = ["means_l.webp", "means_u.webp"]
+    for name, part in zip(files, (codes & 255, codes >> 8), strict=True):
+        pictures[name] = _picture(part, width)
+    return {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
+
+
+def _smallest_three(quaternions: Tensor) -> Tensor:
+    """[N, 4] (w, x, y, z) as three components and which one was left out, the largest, made positive."""
+    unit = torch.nn.functional.normalize(quaternions.double(), dim=1)
+    largest = unit.abs().argmax(dim=1, keepdim=True)
+    unit = torch.where(unit.gather(1, largest) < 0, -unit, unit)
+    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest[:, 0]]
+    three = _bytes(unit.gather(1, others) / math.sqrt(2) + 0.5)
+    return torch.cat((three, (252 + largest).to(torch.uint8)), dim=1)
+
+
+def _coded(
+    name: str, values: Tensor, alpha: Tensor | None, width: int, pictures: dict[str, Pixels]
+) -> dict[str, Any]:
+    """Values [N, 3] by a common code, and alpha [N, 1] beside."""
+    codes, book = _codebook(values)
+    pictures[name] = _picture(codes if alpha is None else torch.cat((codes, alpha), dim=1), width)
+    return {"codebook": book.tolist(), "files": [name]}
+
+
+def _codebook(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Codes of the same shape, and the 256 values that they stand for, ascending (Lloyd's algorithm from quantiles)."""
+    flat = values.double().flatten()
+    ranks = (torch.arange(CODES, dtype=torch.float64) + 0.5) / CODES * len(flat)
+    book = flat.sort().values[ranks.long().clamp(max=len(flat) - 1)]
+    for _ in range(ROUNDS):
+        codes = torch.bucketize(flat, 0.5 * (book[1:] + book[:-1]))
+        count = torch.bincount(codes, minlength=CODES)
+        sums = torch.bincount(codes, weights=flat, minlength=CODES)
+        book = torch.where(count > 0, sums / count.clamp(min=1), book).sort().values
+    codes = torch.bucketize(flat, 0.5 * (book[1:] + book[:-1]))
+    return codes.reshape(values.shape).to(torch.uint8), book
+
+
+def _harmonics(rest: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[str, Any]:
+    """A palette of the harmonics [N, 15, 3], and each Gaussian's place in it."""
+    count, coefficients, _ = rest.shape
+    size = min(LARGEST_PALETTE, count, 1024 * 2 ** max(0, int(math.log2(max(count, 1024) / 1024))))
+    labels, palette = _clusters(rest.flatten(1), size)
+    codes, book = _codebook(palette)
+    rows = math.ceil(size / PALETTE_ROW)
+    pixels = np.zeros((rows * PALETTE_ROW, coefficients, 3), dtype=np.uint8)
+    pixels[:size] = codes.reshape(size, coefficients, 3).numpy()
+    files = ["shN_centroids.webp", "shN_labels.webp"]
+    pictures[files[0]] = pixels.reshape(rows, PALETTE_ROW * coefficients, 3)
+    split = torch.stack((labels & 255, labels >> 8, torch.zeros_like(labels)), dim=1)
+    pictures[files[1]] = _picture(split, width)
+    return {
+        "count": size,
+        "bands": math.isqrt(coefficients + 1) - 1,
+        "codebook": book.tolist(),
+        "files": files,
+    }
+
+
+def _clusters(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Which of ``count`` means each point [N, D] belongs to, [N] int64, and the means (Lloyd's algorithm)."""
+    generator = torch.Generator().manual_seed(SEED)
+    means = points[torch.randperm(len(points), generator=generator)[:count]].clone()
+    for _ in range(ROUNDS):
+        labels = _nearest(points, means)
+        sums = torch.zeros_like(means).index_add_(0, labels, points)
+        members = torch.bincount(labels, minlength=count)[:, None]
+        means = torch.where(members > 0, sums / members.clamp(min=1), means)
+    return _nearest(points, means), means
+
+
+def _nearest(points: Tensor, means: Tensor) -> Tensor:
+    half = 0.5 * means.square().sum(dim=1)
+    return torch.cat([(part @ means.T - half).argmax(dim=1) for part in points.split(4096)])
+
+
+def _morton_order(means: Tensor) -> Tensor:
+    """Indices that put neighbours in space side by side, so that the pictures compress."""
+    ranks = means.argsort(dim=0).argsort(
+        dim=0
+    )  # ranks, not places: far Gaussians would squeeze all others into one cell
+    cells = (ranks * 1024) // max(1, len(means))
+    code = torch.zeros(len(means), dtype=torch.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code.argsort(stable=True)
