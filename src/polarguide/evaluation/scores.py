@@ -150,7 +150,7 @@ def _measures_against_scene(
 
 def _numbers(measures: Mapping[str, Tensor]) -> dict[str, float]:
     """What tensors [] hold; the only place where scoring waits for their device."""
-    values: list[float] = torch.stack([t.to(torch.float64) for t in measures.values()]).tolist()
+    values: list[float] = torch.stack([t.to(torch.float64) for t in measures.values()]).cpu().tolist()
     return dict(zip(measures, values, strict=True))
 
 
