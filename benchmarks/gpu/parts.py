@@ -96,7 +96,7 @@ def mean_psnr(scene: Scene, state: TrainingState, backend: Backend) -> float:
         light = environment.parameters if environment else None
         shading = RECIPE.shading(1.5)
         picture = render(state.rows, view.camera, backend.rasterise, environment=light, shading=shading).final
-        values.append(psnr(picture.cpu(), view.photograph(), ~view.invalid))
+        values.append(psnr(picture, view.photograph(), ~view.invalid))
     return sum(values) / len(values)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import metrics, record, scores
+from polarguide.evaluation import ViewTarget, metrics, record, scores
 
 PROVENANCE = {
     "recipe": "polarguide",
@@ -25,11 +25,17 @@ def rand(seed, *shape):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
+def score(photograph, invalid, truth, rendered):
+    target = ViewTarget.of(photograph, invalid, truth, torch.device("cpu"))
+    return scores.score_view(target, rendered)
+
+
 def scene(seed=0, height=36, width=40):
     specular, diffuse = rand(seed, height, width, 3) * 0.5, rand(seed + 1, height, width, 3) * 0.5
     mask = torch.zeros(height, width, dtype=torch.bool)
     mask[5:30, 5:30] = True
     normal = torch.nn.functional.normalize(rand(seed + 2, height, width, 3) - 0.5, dim=-1)
+    normal[8:11, 8:11] = 0  # foreground without a true normal
     truth = SimpleNamespace(normal=normal, mask=mask, specular=specular, diffuse=diffuse)
     return (specular + diffuse) / 2, truth
 
@@ -46,17 +52,19 @@ def rendering(photograph, truth):
 def test_every_key_has_its_definition():
     photograph, truth = scene()
     rendered = rendering(photograph, truth)
-    got = scores.score_view(photograph, None, truth, rendered)
+    got = score(photograph, None, truth, rendered)
     reflective = metrics.reflective_mask(truth.specular, 2 * photograph, truth.mask)
     assert 0 < reflective.sum() < truth.mask.sum()
     expected = {
         "psnr": metrics.psnr(rendered.final, photograph),
         "psnr_foreground": metrics.psnr(rendered.final, photograph, truth.mask),
         "psnr_reflective": metrics.psnr(rendered.final, photograph, reflective),
-        "ssim": metrics.ssim(rendered.final, photograph),
-        "normal_mae_deg": metrics.normal_mae_deg(rendered.normal, truth.normal, truth.mask),
-        "normal_within_11": metrics.normal_within_11(rendered.normal, truth.normal, truth.mask),
-        "specular_psnr": metrics.layer_psnr(rendered.specular, truth.specular, truth.mask),
+        "ssim": float(metrics.ssim(rendered.final, photograph)),
+        "normal_mae_deg": float(metrics.normal_mae_deg(rendered.normal, truth.normal, truth.mask)),
+        "normal_within_11": float(metrics.normal_within_11(rendered.normal, truth.normal, truth.mask)),
+        "specular_psnr": metrics.decibels(
+            float(metrics.layer_error(rendered.specular, truth.specular, truth.mask))
+        ),
         "specular_psnr_aligned": scores.PERFECT_PSNR,
         "diffuse_psnr": scores.PERFECT_PSNR,
         "diffuse_psnr_aligned": scores.PERFECT_PSNR,
@@ -71,26 +79,26 @@ def test_invalid_pixels_count_in_no_score():
     rendered = rendering(photograph, truth)
     invalid = torch.zeros(photograph.shape[:2], dtype=torch.bool)
     invalid[8:20, 12:22] = True
-    before = scores.score_view(photograph, invalid, truth, rendered)
-    assert before != scores.score_view(photograph, None, truth, rendered)
+    before = score(photograph, invalid, truth, rendered)
+    assert before != score(photograph, None, truth, rendered)
     spoiled = SimpleNamespace(
         **{k: torch.where(invalid[..., None], 0.3, v) for k, v in vars(rendered).items()}
     )
     photograph = torch.where(invalid[..., None], 1.0, photograph)
-    assert scores.score_view(photograph, invalid, truth, spoiled) == before
+    assert score(photograph, invalid, truth, spoiled) == before
 
 
 def test_what_is_missing_is_none():
     photograph, truth = scene()
     plain = SimpleNamespace(final=photograph * 0.9, normal=None, specular=None, diffuse=None)
-    without_truth = scores.score_view(photograph, None, None, plain)
+    without_truth = score(photograph, None, None, plain)
     assert {k for k in scores.MEAN_KEYS if without_truth[k] is not None} <= {"psnr", "ssim", "lpips"}
-    without_layers = scores.score_view(photograph, None, truth, plain)
+    without_layers = score(photograph, None, truth, plain)
     assert without_layers["psnr_reflective"] is not None
     for key in ("normal_mae_deg", "normal_within_11", "specular_psnr", "diffuse_psnr_aligned"):
         assert without_layers[key] is None
     truth.mask = torch.zeros_like(truth.mask)
-    assert scores.score_view(photograph, None, truth, rendering(photograph, truth))["psnr_foreground"] is None
+    assert score(photograph, None, truth, rendering(photograph, truth))["psnr_foreground"] is None
 
 
 def test_broken_pixels_are_scored_and_counted():
@@ -99,12 +107,12 @@ def test_broken_pixels_are_scored_and_counted():
     rendered.final[10, 10, 1] = math.nan
     rendered.specular[10, 10] = math.inf
     rendered.normal[7, 7, 0] = math.nan
-    got = scores.score_view(photograph, None, truth, rendered)
+    got = score(photograph, None, truth, rendered)
     assert got["nonfinite_pixels"] == 2
     rendered.final[10, 10] = 0
     rendered.specular[10, 10] = 0
     rendered.normal[7, 7] = 0
-    clean = scores.score_view(photograph, None, truth, rendered)
+    clean = score(photograph, None, truth, rendered)
     assert "nonfinite_pixels" not in clean
     assert {k: v for k, v in got.items() if k != "nonfinite_pixels"} == clean
 
@@ -147,8 +155,8 @@ def views():
     perfect = rendering(photograph, truth)
     perfect.final = photograph
     return {
-        "v1": scores.score_view(photograph, None, truth, rendering(photograph, truth)),
-        "v2": scores.score_view(photograph, None, truth, perfect),
+        "v1": score(photograph, None, truth, rendering(photograph, truth)),
+        "v2": score(photograph, None, truth, perfect),
     }
 
 

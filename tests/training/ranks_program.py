@@ -1,4 +1,7 @@
-"""Run by torchrun: trains the tiny scene and writes every rank's state to OUT/RANK. Arguments: OUT, STEPS, VIEWS."""
+"""Run by torchrun: trains the tiny scene and writes every rank's state to OUT/RANK.
+
+Arguments: OUT, STEPS, VIEWS, and where to stop and a folder with a checkpoint to go on from ("" for none).
+"""
 
 from __future__ import annotations
 
@@ -11,16 +14,18 @@ from tiny import make_busy_recipe, make_scene
 
 from polarguide.raster import choose_backend
 from polarguide.training.ranks import SeveralRanks
-from polarguide.training.run import save_checkpoint
+from polarguide.training.run import load_checkpoint, save_checkpoint
 from polarguide.training.trainer import Trainer, TrainSettings
 
 torch.set_num_threads(1)
-out, steps, views = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+out, steps, views, until = Path(sys.argv[1]), *(int(number) for number in sys.argv[2:5])
 dist.init_process_group("gloo")
 ranks = SeveralRanks()
 settings = TrainSettings(steps, 3, views_per_step=views)
-trainer = Trainer(make_scene(), make_busy_recipe(), settings, choose_backend("cpu"), ranks=ranks)
-trainer.run(lambda _: None)
+recipe, backend = make_busy_recipe(), choose_backend("cpu")
+state = load_checkpoint(Path(sys.argv[5]), recipe) if sys.argv[5] else None
+trainer = Trainer(make_scene(), recipe, settings, backend, state, ranks)
+trainer.run(lambda _: None, until=until)
 trainer.exchange_statistics()
 folder = out / str(ranks.rank)
 folder.mkdir(parents=True)

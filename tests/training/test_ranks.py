@@ -23,10 +23,12 @@ PROGRAM = Path(__file__).with_name("ranks_program.py")
 PATIENCE = 300.0
 
 
-def shared(out: Path, *, ranks: int, steps: int, views: int) -> list[dict[str, Tensor]]:
-    """The state of every rank at the end."""
+def shared(
+    out: Path, *, ranks: int, steps: int, views: int, until: int | None = None, begun: Path | None = None
+) -> list[dict[str, Tensor]]:
+    """The state of every rank at the end, or before the step ``until``, from the beginning or a checkpoint on."""
     command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(ranks), "--standalone"]
-    command += [str(PROGRAM), str(out), str(steps), str(views)]
+    command += [str(PROGRAM), str(out), str(steps), str(views), str(until or steps), str(begun or "")]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
@@ -35,10 +37,12 @@ def shared(out: Path, *, ranks: int, steps: int, views: int) -> list[dict[str, T
     return [load_file(out / str(rank) / CHECKPOINT) for rank in range(ranks)]
 
 
-def alone(scene: Scene, recipe: Recipe, *, steps: int, views: int) -> tuple[Trainer, list[StepReport]]:
+def alone(
+    scene: Scene, recipe: Recipe, *, steps: int, views: int, until: int | None = None
+) -> tuple[Trainer, list[StepReport]]:
     settings = TrainSettings(steps, 3, views_per_step=views)
     trainer, reports = Trainer(scene, recipe, settings, choose_backend("cpu")), list[StepReport]()
-    trainer.run(reports.append)
+    trainer.run(reports.append, until=until)
     return trainer, reports
 
 
@@ -91,6 +95,32 @@ def test_several_views_a_step_are_resumed_bit_by_bit(
     resumed = Trainer(tiny_scene, busy_recipe, settings, backend, load_checkpoint(tmp_path, busy_recipe))
     resumed.run(lambda _: None)
     assert different(resumed.state.tensors(), whole.state.tensors()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("before", "after"), [(2, 1), (1, 2)])
+def test_another_number_of_ranks_goes_on_bit_by_bit(
+    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, before: int, after: int
+) -> None:
+    """Stopped between two rounds of the density control, when every rank has seen other views than the others."""
+    steps, until, views = 30, 21, 2
+    whole, reports = alone(tiny_scene, busy_recipe, steps=steps, views=views)
+    assert len({report.gaussians for report in reports[until:]}) > 1, "the density control did nothing after"
+    if before > 1:
+        first = shared(tmp_path, ranks=before, steps=steps, views=views, until=until)
+        assert int(first[0]["scalars"][0]) == until
+        settings, state = (
+            TrainSettings(steps, 3, views_per_step=views),
+            load_checkpoint(tmp_path / "0", busy_recipe),
+        )
+        resumed = Trainer(tiny_scene, busy_recipe, settings, choose_backend("cpu"), state)
+        resumed.run(lambda _: None)
+        ends = [resumed.state.tensors()]
+    else:
+        begun, _ = alone(tiny_scene, busy_recipe, steps=steps, views=views, until=until)
+        save_checkpoint(tmp_path, begun.state)
+        ends = shared(tmp_path / "end", ranks=after, steps=steps, views=views, begun=tmp_path)
+    assert [different(end, whole.state.tensors()) for end in ends] == [[]] * after
 
 
 @pytest.mark.parametrize("world", [1, 2, 3, 5])

@@ -17,7 +17,7 @@ from polarguide import _native
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, console, open_run, use_threads
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import score_view, write_metrics
+from polarguide.evaluation import ViewTarget, score_view, write_metrics
 from polarguide.evaluation.record import RUN_KEYS, validate_metrics
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.speed import frames_per_second
@@ -64,9 +64,9 @@ def evaluate_run(opened: OpenRun, *, speed: bool = True) -> dict[str, Any]:
     """Score, write ``metrics.json``, print the table; returns the record. Without ``speed`` its keys are null."""
     views = {}
     for view in opened.scene.test_views:
-        result = opened.render(view)
-        invalid = view.invalid if bool(view.invalid.any()) else None
-        views[view.name] = score_view(view.photograph(), invalid, view.truth, result)
+        # First what is known of it: copied later, it would have to wait until the rendering is done.
+        target = ViewTarget.of(view.photograph(), view.invalid, view.truth, opened.backend.device)
+        views[view.name] = score_view(target, opened.draw(view))
     seconds, alone = RunLog(opened.folder).elapsed()
     record = write_metrics(
         opened.folder / METRICS,

@@ -91,7 +91,8 @@ def relight(opened: OpenRun, panorama: Path | None, degrees: float) -> None:
     assert learned is not None
     around = surroundings(list(opened.cameras.values()))
     if panorama is not None:
-        learned["texels"] = texels_of(read_panorama(panorama), shading, around, RELIT_RESOLUTION)
+        texels = texels_of(read_panorama(panorama), shading, around, RELIT_RESOLUTION)
+        learned["texels"] = texels.to(learned["texels"].device)
     learned["texels"] = turned_cubemap(learned["texels"].detach(), around.turn(degrees), RELIT_RESOLUTION)
     if shading.local:
         console.print(

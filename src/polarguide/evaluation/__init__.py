@@ -2,5 +2,6 @@
 
 from .record import validate_metrics, write_metrics
 from .scores import ViewScores, score_view, summarise
+from .target import ViewTarget
 
-__all__ = ["ViewScores", "score_view", "summarise", "validate_metrics", "write_metrics"]
+__all__ = ["ViewScores", "ViewTarget", "score_view", "summarise", "validate_metrics", "write_metrics"]

@@ -2,7 +2,8 @@
 
 Pictures are linear radiance [H, W, 3] on the exposure of the photograph (S0/2). "Shown" means clipped to [0,
 1] and sRGB-encoded; every picture metric compares shown pictures with peak 1. Pixels outside ``keep`` are
-left out of every metric, whatever they hold. All arithmetic is float64, on the device of the prediction.
+left out of every metric, whatever they hold. All arithmetic is float64, on the device of the prediction, and
+results stay there, as tensors [] of float64: whoever wants several asks for them at once.
 """
 
 from __future__ import annotations
@@ -13,12 +14,17 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .selection import Selection
+
+Keep = Tensor | Selection | None
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 REFLECTIVE_SHARE = 0.3
 CLOSE_NORMAL_DEG = 11.25
+SHORTEST = 1e-12
+"""Vectors that are not longer have no direction."""
 
 
 def shown(linear: Tensor) -> Tensor:
@@ -36,63 +42,64 @@ def shown(linear: Tensor) -> Tensor:
     return torch.where(clipped <= 0.0031308, 12.92 * clipped, curve)
 
 
-def psnr(pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio of shown pictures, ``-10 log10(mean squared error)``.
+def psnr(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -> float:
+    """Peak signal-to-noise ratio of shown pictures: ``decibels`` of their ``squared_error``, waited for."""
+    return decibels(float(squared_error(pred_linear, true_linear, keep)))
+
+
+def decibels(error: float) -> float:
+    """``-10 log10`` of a mean squared error: infinity for 0, NaN for NaN."""
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def squared_error(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -> Tensor:
+    """Mean squared error of shown pictures.
 
     Args:
         pred_linear, true_linear: [H, W, C] linear radiance.
-        keep: [H, W] bool, the pixels that count; None counts all.
+        keep: [H, W] bool or a selection, the pixels that count; None counts all.
 
     Returns:
-        Decibels; infinity for equal pictures, NaN where no pixel counts.
+        [], NaN where no pixel counts.
 
     Raises:
         ValueError: shapes that do not fit.
     """
-    pred, true = _kept(pred_linear, true_linear, keep)
-    if pred.numel() == 0:
-        return math.nan
-    error = float(((shown(pred) - shown(true)) ** 2).mean())
-    return math.inf if error == 0 else -10 * math.log10(error)
+    return _shown_error(*_kept(pred_linear, true_linear, keep))
 
 
-def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None) -> float:
+def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: Keep = None) -> Tensor:
     """Structural similarity of shown pictures (Wang et al. 2004).
 
-    Gaussian window of 11 x 11 pixels, sigma 1.5, K1 = 0.01, K2 = 0.03, population covariance, windows
-    entirely inside the picture, mean over windows and channels: what scikit-image computes with
-        ``gaussian_weights=True, sigma=1.5,
+    Gaussian window of 11 x 11 pixels, sigma 1.5, K1 = 0.01, K2 = 0.03, population covariance, windows entirely inside
+    the picture, mean over windows and channels: what scikit-image computes with ``gaussian_weights=True, sigma=1.5,
     use_sample_covariance=False, data_range=1``.
 
-    A pixel outside ``keep`` has no weight in any window (the weights of the others are normalised to one) and
-    the window around it does not count. Without such pixels this is the plain definition.
+    A pixel outside ``keep`` has no weight in any window (the weights of the others are normalised to one) and the
+    window around it does not count. Without such pixels this is the plain definition.
 
     Args:
         pred_linear, true_linear: [H, W, C] linear radiance, H and W at least 11.
-        keep: [H, W] bool, the pixels that count; None counts all.
+        keep: [H, W] bool or a selection, the pixels that count; None counts all.
+        windows: ``window_centres`` of ``keep``, where they are known already.
 
     Returns:
-        At most 1; NaN where no window counts.
+        [], at most 1; NaN where no window counts.
 
     Raises:
         ValueError: shapes that do not fit, or a picture smaller than the window.
     """
-    _check_pair(pred_linear, true_linear, keep)
+    _check_pair(pred_linear, true_linear)
     height, width = pred_linear.shape[:2]
     if min(height, width) < SSIM_WINDOW:
         raise ValueError(
             f"SSIM: expected at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, found {width} x {height}"
         )
-    device = pred_linear.device
-    kept = torch.ones(height, width, dtype=torch.bool, device=device) if keep is None else keep.to(device)
+    kept = _selected(keep, pred_linear).mask
     x, y = (
-        torch.where(kept, shown(picture.to(device, torch.float64)).movedim(-1, 0), 0.0)
+        torch.where(kept, shown(picture.to(kept.device, torch.float64)).movedim(-1, 0), 0.0)
         for picture in (pred_linear, true_linear)
     )
-    margin = SSIM_WINDOW // 2
-    counted = kept[margin:-margin, margin:-margin]
-    if not counted.any():
-        return math.nan
     weight = _blur(kept.to(torch.float64)[None]).clamp(min=torch.finfo(torch.float64).tiny)
     mean_x, mean_y = _blur(x) / weight, _blur(y) / weight
     variance_x = _blur(x * x) / weight - mean_x**2
@@ -101,7 +108,14 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None) -
     similarity = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
         (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
     )
-    return float(similarity[:, counted].mean())
+    counted = _selected(window_centres(kept) if windows is None else windows, similarity[0])
+    return similarity.flatten(1).index_select(1, counted.places).mean()
+
+
+def window_centres(keep: Tensor) -> Tensor:
+    """Of a mask [H, W] of pixels, the centres of SSIM's windows: [H - 10, W - 10]."""
+    margin = SSIM_WINDOW // 2
+    return keep[margin:-margin, margin:-margin]
 
 
 def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
@@ -123,47 +137,49 @@ def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
     # atan2 of sine and cosine: accurate to the last digit near 0 and 180 degrees, where acos is not.
     sine = torch.linalg.vector_norm(torch.linalg.cross(a, b, dim=-1), dim=-1)
     angle = torch.rad2deg(torch.atan2(sine, (a * b).sum(-1)))
-    angle = torch.where(torch.linalg.vector_norm(a, dim=-1) > 1e-12, angle, 90.0)
-    return torch.where(torch.linalg.vector_norm(b, dim=-1) > 1e-12, angle, math.nan)
+    angle = torch.where(has_direction(a), angle, 90.0)
+    return torch.where(has_direction(b), angle, math.nan)
 
 
-def normal_mae_deg(pred: Tensor, true: Tensor, keep: Tensor | None = None) -> float:
+def has_direction(vectors: Tensor) -> Tensor:
+    """Whether vectors [..., 3] are long enough to point anywhere, [...] bool."""
+    return torch.linalg.vector_norm(vectors.to(torch.float64), dim=-1) > SHORTEST
+
+
+def normal_mae_deg(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
     """Mean angle between rendered and true normals in degrees (see ``normal_angles_deg``).
 
     Args:
         pred, true: [H, W, 3] in the same axes.
-        keep: [H, W] bool, the pixels that count; None counts all. Pixels without a true normal never count.
+        keep: [H, W] bool, the pixels that count, of which those without a true normal are left out, or a selection
+            without those; None counts all.
 
     Returns:
-        Degrees; NaN where no pixel counts.
+        [] degrees; NaN where no pixel counts.
     """
-    angles = _kept_angles(pred, true, keep)
-    return float(angles.mean()) if angles.numel() else math.nan
+    return _kept_angles(pred, true, keep).mean()
 
 
-def normal_within_11(pred: Tensor, true: Tensor, keep: Tensor | None = None) -> float:
-    """Share in [0, 1] of the pixels whose normal is under 11.25 degrees off; NaN where no pixel counts."""
-    angles = _kept_angles(pred, true, keep)
-    return float((angles < CLOSE_NORMAL_DEG).to(torch.float64).mean()) if angles.numel() else math.nan
+def normal_within_11(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
+    """Share in [0, 1] of the pixels whose normal is under 11.25 degrees off, else as ``normal_mae_deg``."""
+    return (_kept_angles(pred, true, keep) < CLOSE_NORMAL_DEG).to(torch.float64).mean()
 
 
-def layer_psnr(contribution: Tensor, true_s0: Tensor, keep: Tensor | None, *, aligned: bool = False) -> float:
-    """PSNR of one layer: what it adds to the final picture against half its true S0, both shown.
+def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: bool = False) -> Tensor:
+    """Mean squared error of one layer: what it adds to the final picture against half its true S0, both shown.
 
     Args:
         contribution: [H, W, 3] linear, the layer as it is added to the final picture (an S0/2).
         true_s0: [H, W, 3] linear, the true S0 of the lobe.
-        keep: [H, W] bool, the pixels that count; None counts all.
+        keep: [H, W] bool or a selection, the pixels that count; None counts all.
         aligned: first multiply each channel by the one factor that brings it closest to the truth in linear
             least squares, so that a wrong overall brightness or tint costs nothing.
 
     Returns:
-        Decibels, as ``psnr``.
+        [], as ``squared_error``.
     """
     pred, true = _kept(contribution, true_s0 / 2, keep)
-    if aligned:
-        pred = pred * _channel_scales(pred, true)
-    return psnr(pred[:, None], true[:, None])
+    return _shown_error(pred * _channel_scales(pred, true) if aligned else pred, true)
 
 
 def reflective_mask(specular: Tensor, s0: Tensor, mask: Tensor) -> Tensor:
@@ -187,30 +203,39 @@ def _channel_scales(pred: Tensor, true: Tensor) -> Tensor:
     return torch.where(live, (pred * true).sum(0) / torch.where(live, energy, 1.0), 1.0)
 
 
-def _kept_angles(pred: Tensor, true: Tensor, keep: Tensor | None) -> Tensor:
-    angles = normal_angles_deg(pred, true)
-    if keep is not None:
-        angles = angles[keep.to(angles.device)]
-    return angles[~angles.isnan()]
+def _shown_error(pred: Tensor, true: Tensor) -> Tensor:
+    return ((shown(pred) - shown(true)) ** 2).mean()
 
 
-def _kept(pred: Tensor, true: Tensor, keep: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The pixels that count as [P, C] float64."""
-    _check_pair(pred, true, keep)
-    pred, true = pred.to(torch.float64), true.to(pred.device, torch.float64)
-    if keep is None:
-        return pred.flatten(0, 1), true.flatten(0, 1)
-    keep = keep.to(pred.device)
-    return pred[keep], true[keep]
+def _kept_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
+    if not isinstance(keep, Selection):
+        known = has_direction(true)
+        keep = known if keep is None else known & keep.to(known.device)
+    return _selected(keep, pred).pick(normal_angles_deg(pred, true))
 
 
-def _check_pair(pred: Tensor, true: Tensor, keep: Tensor | None) -> None:
+def _kept(pred: Tensor, true: Tensor, keep: Keep) -> tuple[Tensor, Tensor]:
+    """The pixels that count as [P, C] float64, on the device of the prediction."""
+    _check_pair(pred, true)
+    kept = _selected(keep, pred)
+    return kept.pick(pred.to(torch.float64)), kept.pick(true.to(pred.device, torch.float64))
+
+
+def _selected(keep: Keep, picture: Tensor) -> Selection:
+    """The pixels of a picture [H, W, ...] that count, on its device."""
+    size = picture.shape[:2]
+    mask = torch.ones(size, dtype=torch.bool) if keep is None else keep
+    found = mask.mask if isinstance(mask, Selection) else mask
+    if found.dtype != torch.bool or found.shape != size:
+        raise ValueError(f"keep: expected bool {list(size)}, found {found.dtype} {list(found.shape)}")
+    return mask if isinstance(mask, Selection) else Selection.of(mask, picture.device)
+
+
+def _check_pair(pred: Tensor, true: Tensor) -> None:
     if pred.ndim != 3 or pred.shape != true.shape:
         raise ValueError(
             f"pictures: expected equal shapes [H, W, C], found {list(pred.shape)} and {list(true.shape)}"
         )
-    if keep is not None and (keep.dtype != torch.bool or keep.shape != pred.shape[:2]):
-        raise ValueError(f"keep: expected bool {list(pred.shape[:2])}, found {keep.dtype} {list(keep.shape)}")
 
 
 def _blur(channels: Tensor) -> Tensor:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, TypedDict
+from typing import Any, TypedDict, cast
 
 import torch
 from torch import Tensor
 
 from .lpips import lpips
-from .metrics import layer_psnr, normal_mae_deg, normal_within_11, psnr, reflective_mask, ssim
+from .metrics import decibels, layer_error, normal_mae_deg, normal_within_11, squared_error, ssim
+from .target import ViewTarget
 
 PERFECT_PSNR = 100.0
 """What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
@@ -56,15 +57,13 @@ class ViewScores(TypedDict, total=False):
     nonfinite_pixels: int
 
 
-def score_view(truth: Tensor, invalid: Tensor | None, ground_truth: Any, rendered: Any) -> ViewScores:
-    """Score one rendered view.
+def score_view(target: ViewTarget, rendered: Any) -> ViewScores:
+    """Score one rendered view, on the device where it was rendered, which is waited for once.
+
+    (LPIPS, where its network is at hand, waits by itself: torchmetrics looks at the pictures' values.)
 
     Args:
-        truth: [H, W, 3] linear, the photograph S0/2.
-        invalid: [H, W] bool, pixels of the photograph that do not count (saturated, dark, no data); None: all
-            count. It applies to every score.
-        ground_truth: None, or an object whose attributes may each be None: ``mask`` [H, W] bool, ``normal``
-            [H, W, 3] world, ``specular`` and ``diffuse`` [H, W, 3] linear S0 of the lobes.
+        target: what it is compared with, on the same device.
         rendered: an object with ``final`` [H, W, 3] linear, and, each None where the recipe has no such
             layer, ``normal`` [H, W, 3] world of any length, ``specular`` and ``diffuse`` [H, W, 3] linear
             contributions to the final picture.
@@ -75,27 +74,32 @@ def score_view(truth: Tensor, invalid: Tensor | None, ground_truth: Any, rendere
     Raises:
         ValueError: shapes that do not fit.
     """
-    valid = torch.ones(truth.shape[:2], dtype=torch.bool) if invalid is None else ~invalid.cpu()
-    truth = _plain(truth)
     layers = {name: _plain(getattr(rendered, name)) for name in ("final", "normal", "specular", "diffuse")}
-    broken = torch.zeros_like(valid)
+    broken = torch.zeros_like(target.valid.mask)
     for name, layer in layers.items():
         if layer is not None:
             lost = ~layer.isfinite().all(-1)
             broken |= lost
             layers[name] = torch.where(lost[..., None], 0.0, layer)
     final = layers["final"]
-    distance, reason = lpips(final, truth, None if invalid is None else valid)
-    scores: ViewScores = {
-        "psnr": finite_psnr(psnr(final, truth, valid)),
-        "ssim": _number(ssim(final, truth, valid)),
-        "lpips": distance,
-        "lpips_reason": reason,
-    }
-    scores.update(_scores_against_scene(truth, valid, ground_truth, layers))
-    if broken.any():
-        scores["nonfinite_pixels"] = int(broken.sum())
-    return scores
+    assert final is not None
+    distance, reason = lpips(final, target.photograph, target.valid.mask)
+    found = _numbers(
+        {
+            "psnr": squared_error(final, target.photograph, target.valid),
+            "ssim": ssim(final, target.photograph, target.valid, target.windows),
+            **_measures_against_scene(target, final, layers),
+            "nonfinite_pixels": broken.sum(),
+        }
+    )
+    lost_pixels = int(found.pop("nonfinite_pixels"))
+    scores: dict[str, Any] = {"psnr": None, "ssim": None, "lpips": distance, "lpips_reason": reason}
+    scores |= {key: None for key in MEAN_KEYS if key not in PICTURE_KEYS}
+    for key, value in found.items():
+        scores[key] = finite_psnr(decibels(value)) if "psnr" in key else _number(value)
+    if lost_pixels:
+        scores["nonfinite_pixels"] = lost_pixels
+    return cast(ViewScores, scores)
 
 
 def summarise(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | None]:
@@ -122,39 +126,36 @@ def finite_psnr(value: float) -> float | None:
     return None if math.isnan(value) else min(value, PERFECT_PSNR)
 
 
-def _scores_against_scene(
-    truth: Tensor, valid: Tensor, ground_truth: Any, layers: Mapping[str, Tensor | None]
-) -> ViewScores:
-    """The keys that need more than the photograph."""
-    final = layers["final"]
-    assert final is not None
-    mask, normal, specular, diffuse = (
-        _plain(getattr(ground_truth, name, None)) for name in ("mask", "normal", "specular", "diffuse")
-    )
-    scores: ViewScores = {key: None for key in MEAN_KEYS if key not in PICTURE_KEYS}  # type: ignore
-    if mask is None:
-        return scores
-    keep = mask.to(torch.bool) & valid
-    scores["psnr_foreground"] = finite_psnr(psnr(final, truth, keep))
-    if specular is not None:
-        reflective = reflective_mask(specular, 2 * truth, keep)
-        scores["psnr_reflective"] = finite_psnr(psnr(final, truth, reflective))
-    if normal is not None and layers["normal"] is not None:
-        scores["normal_mae_deg"] = _number(normal_mae_deg(layers["normal"], normal, keep))
-        scores["normal_within_11"] = _number(normal_within_11(layers["normal"], normal, keep))
-    for name, true in (("specular", specular), ("diffuse", diffuse)):
+def _measures_against_scene(
+    target: ViewTarget, final: Tensor, layers: Mapping[str, Tensor | None]
+) -> dict[str, Tensor]:
+    """The measures that need more than the photograph, each where it is defined; errors in place of PSNRs."""
+    found: dict[str, Tensor] = {}
+    if target.foreground is None:
+        return found
+    found["psnr_foreground"] = squared_error(final, target.photograph, target.foreground)
+    if target.reflective is not None:
+        found["psnr_reflective"] = squared_error(final, target.photograph, target.reflective)
+    normal = layers["normal"]
+    if target.normal is not None and normal is not None:
+        found["normal_mae_deg"] = normal_mae_deg(normal, target.normal, target.surface)
+        found["normal_within_11"] = normal_within_11(normal, target.normal, target.surface)
+    for name, true in (("specular", target.specular), ("diffuse", target.diffuse)):
         layer = layers[name]
-        if true is None or layer is None:
-            continue
-        scores[f"{name}_psnr"] = finite_psnr(layer_psnr(layer, true, keep))  # type: ignore[literal-required]
-        aligned = finite_psnr(layer_psnr(layer, true, keep, aligned=True))
-        scores[f"{name}_psnr_aligned"] = aligned  # type: ignore[literal-required]
-    return scores
+        if true is not None and layer is not None:
+            found[f"{name}_psnr"] = layer_error(layer, true, target.foreground)
+            found[f"{name}_psnr_aligned"] = layer_error(layer, true, target.foreground, aligned=True)
+    return found
 
 
-def _plain(value: Any) -> Any:
-    """A tensor on the CPU in float64, so that every device gives one number; None stays None."""
-    return None if value is None else torch.as_tensor(value).detach().to("cpu", torch.float64)
+def _numbers(measures: Mapping[str, Tensor]) -> dict[str, float]:
+    """What tensors [] hold; the only place where scoring waits for their device."""
+    values: list[float] = torch.stack([t.to(torch.float64) for t in measures.values()]).cpu().tolist()
+    return dict(zip(measures, values, strict=True))
+
+
+def _plain(layer: Tensor | None) -> Tensor | None:
+    return None if layer is None else layer.detach().to(torch.float64)
 
 
 def _number(value: object) -> float | None:

@@ -32,6 +32,8 @@ SCORED_BY = (
     "trained.py",
     "evaluation/metrics.py",
     "evaluation/scores.py",
+    "evaluation/selection.py",
+    "evaluation/target.py",
     "evaluation/lpips.py",
     "cli/evaluate.py",
 )

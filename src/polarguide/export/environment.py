@@ -85,7 +85,7 @@ def texels_of(picture: Tensor, shading: Shading, around: Surroundings, resolutio
 def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
     """Raw texels [6, R, R, C] after turning what they show by a rotation [3, 3] of the world."""
     directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
-    found = cubemap_lookup(texels, directions.to(texels.dtype))
+    found = cubemap_lookup(texels, directions.to(texels))
     return found.reshape(6, resolution, resolution, -1)
 
 

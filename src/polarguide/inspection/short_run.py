@@ -66,7 +66,7 @@ def short_run(
     """
     recipe = recipe_named(RECIPE)
     wanted = {"photographs": photograph_digest(scene), "steps": steps, "recipe": RECIPE}
-    state = load_checkpoint(folder, recipe) if _same(folder, wanted) else None
+    state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
     trainer = Trainer(scene, recipe, TrainSettings(steps, 0), backend, state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -94,8 +94,9 @@ def _same(folder: Path, wanted: dict[str, object]) -> bool:
 
 @torch.no_grad()
 def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
-    """What the trained Gaussians say of the surface in one view."""
+    """What the trained Gaussians say of the surface in one view, on the CPU, where pictures are compared with it."""
     result = render(state.rows, view.camera, backend.rasterise, sh_degree=0, normals=True, depth=True)
+    result = result.to("cpu")
     if result.normal is None or result.depth is None:
         raise PolarguideError(
             view.name, expected="normals and depth", found="none", remedy="Report this: it is a fault here."

@@ -1,0 +1,88 @@
+"""Verbs on a device that is not the CPU, with values: scores, pictures, other light, and the inspection's training."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from other_device import BACKEND, OtherDevice
+
+from polarguide.capture import load_scene
+from polarguide.cli.common import open_run
+from polarguide.cli.evaluate import evaluate_run
+from polarguide.cli.render import render_views
+from polarguide.evaluation import ViewTarget, score_view
+from polarguide.inspection.short_run import short_run, surface_of
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run folder, which is opened on the other device unless the CPU is asked for."""
+    from polarguide import trained as opening
+
+    choose = opening.choose_backend
+    monkeypatch.setattr(
+        opening, "choose_backend", lambda name, **more: choose(name, **more) if name == "cpu" else BACKEND
+    )
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def test_scores_are_made_there_and_read_once_a_view(run: Path) -> None:
+    with OtherDevice() as device:
+        opened = open_run(run)
+        before = device.waits
+        record = evaluate_run(opened, speed=False)
+        assert device.waits - before == len(record["views"]) > 1
+        view = opened.scene.test_views[0]
+        given = view.photograph(), view.invalid, view.truth
+        result = opened.draw(view)
+        there = score_view(ViewTarget.of(*given, BACKEND.device), result)
+        here = score_view(ViewTarget.of(*given, torch.device("cpu")), result.to("cpu"))
+        with pytest.raises(RuntimeError, match="mixes devices"):
+            score_view(ViewTarget.of(*given, torch.device("cpu")), result)
+    assert there == here == record["views"][view.name]
+    by_cpu = evaluate_run(open_run(run, device="cpu"), speed=False)
+    assert record["psnr"] == pytest.approx(by_cpu["psnr"], abs=0.01)
+    assert record["specular_psnr"] == pytest.approx(by_cpu["specular_psnr"], abs=0.01)
+
+
+def test_pictures_by_other_light_and_along_a_path(run: Path, tmp_path: Path) -> None:
+    light = tmp_path / "light.hdr"
+    cv2.imwrite(str(light), np.full((16, 32, 3), 0.4, np.float32))
+    layers = "final,reflection,specular,normal,depth,strength"
+
+    def shown(device: str, out: Path) -> np.ndarray:
+        render_views(run, layers=layers, environment=light, rotate_environment=30, out=out, device=device)
+        return cv2.imread(str(out / "contact_sheet.png")).astype(int)
+
+    with OtherDevice():
+        there = shown("auto", tmp_path / "there")
+        render_views(run, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path)
+    assert len(list(tmp_path.glob("path_*.png"))) == 2
+    # Depth's colours jump where nothing is seen, so a few pixels may differ by much.
+    assert float((np.abs(there - shown("cpu", tmp_path / "here")) > 2).mean()) < 0.01
+
+
+def test_the_inspection_trains_there_and_compares_here(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    adam = torch.optim.Adam
+    monkeypatch.setattr(torch.optim, "Adam", lambda groups, eps, fused: adam(groups, eps=eps, foreach=True))
+    scene = load_scene(demo_scene, downscale=8)
+
+    def stop(report: object) -> None:
+        raise KeyboardInterrupt
+
+    with OtherDevice():
+        with pytest.raises(KeyboardInterrupt):
+            short_run(scene, tmp_path, steps=2, backend=BACKEND, on_step=stop)
+        state = short_run(scene, tmp_path, steps=2, backend=BACKEND, on_step=lambda _: None)
+        surface = surface_of(state, scene.views[0], BACKEND)
+    assert json.loads((tmp_path / "short_run.json").read_text())["steps"] == 2
+    assert state.step == 2
+    assert {t.device.type for t in (surface.normal, surface.depth, surface.known)} == {"cpu"}
