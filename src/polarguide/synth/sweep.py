@@ -14,6 +14,7 @@ from polarguide.errors import PolarguideError
 from polarguide.synth import folder
 from polarguide.synth.build import build_scene
 from polarguide.synth.cameras import place_cameras
+from polarguide.synth.manifest import verify_scene, write_manifest
 from polarguide.synth.run import synthesise
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, SynthSettings
@@ -112,6 +113,7 @@ def _fewer_views(
         member = _member(out, sweep, value)
         done.append(member)
         if (member / "scene.json").exists():
+            verify_scene(member)
             continue
         chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, int(value)).round().astype(int))]
         names = sorted([*chosen, *tests])
@@ -127,7 +129,7 @@ def _fewer_views(
             find_points(built, some, pictures, settings.points, settings.seed),
         )
         folder.write_file(member / "split.json", json.dumps({"test": tests}).encode())
-        smaller = {**record, "views": names, "train": chosen, "sha256": folder.checksum(member)}
+        smaller = {**record, "views": names, "train": chosen, "sha256": write_manifest(member)}
         folder.write_file(member / "scene.json", json.dumps(smaller, indent=1).encode())
         _note(member, "views", value)
         reporter.say(f"{member}: {len(chosen)} training views")
