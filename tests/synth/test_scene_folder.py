@@ -19,7 +19,8 @@ from polarguide.capture.prepare import Reporter
 from polarguide.cli.app import run
 from polarguide.errors import PolarguideError
 from polarguide.synth import run as runner
-from polarguide.synth.manifest import MANIFEST, scene_digest
+from polarguide.synth import sweep as sweeps
+from polarguide.synth.manifest import MANIFEST, scene_digest, verify_scene
 from polarguide.synth.run import synthesise
 from polarguide.synth.schema import SceneSpec, parse_scene
 from polarguide.synth.sensor import Sensor
@@ -192,6 +193,22 @@ def test_a_sweep_over_views_shares_its_test_views(spec: SceneSpec, variant: Vari
     assert (scenes[0].test_views[0].codes == scenes[1].test_views[0].codes).all()
     study = json.loads((folders[0] / "scene.json").read_text())["study"]
     assert study == {"parameter": "views", "value": 2.0}
+    for folder in folders:
+        verify_scene(folder)
+
+
+def test_members_of_a_sweep_sort_like_their_numbers(
+    spec: SceneSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def written(spec: SceneSpec, out: Path, *_: object, **__: object) -> Path:
+        out.mkdir()
+        (out / "scene.json").write_text("{}")
+        return out
+
+    monkeypatch.setattr(sweeps, "synthesise", written)
+    family = Sweep("noise", (0.0, 1.5, 12.0))
+    folders = sweep_scenes(spec, tmp_path, SETTINGS, Overrides(), family, Reporter())
+    assert [folder.name for folder in folders] == ["noise-00", "noise-01.5", "noise-12"]
 
 
 def test_without_mitsuba_the_extra_is_named(

@@ -58,7 +58,7 @@ def sweep_scenes(
     spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep, reporter: Reporter, *,
     threads: int = 0,
 ) -> list[Path]:  # fmt: skip
-    """Write ``out/<parameter>-<value>`` for every value.
+    """Write ``out/<parameter>-<value>`` for every value, such as ``views-06`` and ``views-12``.
 
     A sweep over ``views`` (their number in training) renders the scene once, as it is, and makes the smaller scenes by
     leaving out training views evenly, so that all share their test views and even their pictures.
@@ -82,7 +82,10 @@ def sweep_scenes(
 
 
 def _member(out: Path, sweep: Sweep, value: float) -> Path:
-    return out / f"{sweep.parameter}-{value:g}"
+    """The folder of one value; zeros before it, so that names sort like numbers: views-06, views-12."""
+    digits = max(len(str(int(other))) for other in sweep.values)
+    whole, *rest = f"{value:g}".split(".")
+    return out / f"{sweep.parameter}-{'.'.join([whole.zfill(digits), *rest])}"
 
 
 def _note(scene: Path, parameter: str, value: float) -> None:
