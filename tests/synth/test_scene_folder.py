@@ -6,6 +6,7 @@ import hashlib
 import json
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,17 @@ def test_rendering_goes_on_to_the_same_files(
     synthesise(spec, out, SETTINGS, Reporter(), threads=1)
     for name in (MANIFEST, "scene.json"):
         assert (scene / name).read_text() == (out / name).read_text()
+
+
+def test_the_files_do_not_depend_on_the_threads(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
+    settings = SynthSettings(width=64, height=48, samples=16, points=60)
+    two = replace(spec, camera=replace(spec.camera, views=2))
+    digests = []
+    for threads in (1, 2):
+        out = synthesise(two, tmp_path / str(threads), settings, Reporter(), threads=threads)
+        digests.append(scene_digest(out))
+    choose_variant("rgb", threads=1)
+    assert digests[0] == digests[1]
 
 
 def test_the_checksums_are_those_of_all_files(scene: Path) -> None:

@@ -83,9 +83,8 @@ def picture_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np
 def clipped_share(out: Path, names: Sequence[str]) -> float:
     """Share of the samples of these views' pictures that stand at full scale."""
     files = [file for name in names for file in view_files(out, name, truth=False, raw=False)]
-    return float(
-        np.mean([(cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == TOP * STEP).mean() for file in files])
-    )
+    pictures = (np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files)
+    return float(np.mean([(picture == TOP * STEP).mean() for picture in pictures]))
 
 
 def view_files(out: Path, name: str, *, truth: bool, raw: bool) -> list[Path]:
