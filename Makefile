@@ -1,5 +1,6 @@
 # make demo    train, score and render the demo scene that ships with the package
-# make dataset    render the five scenes of docs/dataset.md into scenes/ (hours on few cores; goes on where it stopped)
+# make dataset    render the five scenes of docs/dataset.md into scenes/ (hours on few cores; goes on where it stopped),
+#                 check the files of those that are finished, and print a SHA-256 of each
 # make test    linter, formatter, types and tests, on the package as it is installed
 # make cross-check    compile the kernels for aarch64 (needs aarch64-linux-gnu-g++ and cmake)
 # make gpu-check    build, test and measure on a machine with a GPU; in parts: call it again until it says complete

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from polarguide.evaluation.study import read_study, study_svg
+from polarguide.evaluation.study import LEFT, read_study, study_svg
 
 
 def results() -> dict[str, Any]:
@@ -30,6 +30,20 @@ def test_a_family_is_drawn() -> None:
     assert len(root.findall(f"{name}circle")) == 6
     titles = [title.text for title in root.iter(f"{name}title")]
     assert "a<b, views 36: 56.00" in titles
+    assert "training views" in [text.text for text in root.iter(f"{name}text")]
+
+
+def test_the_axis_starts_at_zero_only_where_that_is_near() -> None:
+    def left_ends(*values: float) -> list[float]:
+        text = study_svg(
+            results(), {f"views-{n}": ("index", v) for n, v in zip((9, 18, 36), values, strict=True)}
+        )
+        assert text is not None
+        root = ElementTree.fromstring(text)
+        return [float(line.get("points", "").split(",")[0]) for line in root if line.tag.endswith("polyline")]
+
+    assert left_ends(1.3, 1.5, 1.7) == [LEFT, LEFT]
+    assert min(left_ends(0.1, 1.5, 1.7)) > LEFT
 
 
 def test_what_is_no_family_is_not_drawn() -> None:

@@ -10,7 +10,14 @@ from typing import Any
 
 from .curves import ticks
 
-SCORES = (("psnr", "PSNR (dB)"), ("normal_mae_deg", "normal error (degrees)"))
+SCORES = (("psnr", "PSNR (dB) ↑"), ("normal_mae_deg", "normal error (degrees) ↓"))
+NAMES = {
+    "views": "training views",
+    "noise": "noise (1: exposed to full scale, 2: a quarter of that light)",
+    "index": "refractive index",
+    "spacing": "degrees between neighbouring views",
+}
+"""What the parameters of a sweep are called at the axis, where their name does not say it."""
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM, ROW = 430, 330, 52, 14, 26, 44, 18
 PALETTE = ("#3366cc", "#dc3912", "#109618", "#ff9900", "#990099", "#0099c6", "#dd4477", "#66aa00")
 
@@ -73,7 +80,8 @@ def _panel(
     lines: Mapping[str, Sequence[Point]], recipes: Sequence[str], label: str, parameter: str, left: int
 ) -> str:
     points = [point for line in lines.values() for point in line]
-    x_ticks = ticks(min(0.0, *(x for x, _ in points)), max(x for x, _ in points))
+    first, last = min(x for x, _ in points), max(x for x, _ in points)
+    x_ticks = ticks(first if first > last / 2 else 0.0, last)
     y_ticks = ticks(min(y for _, y in points), max(y for _, y in points))
 
     def place(x: float, y: float) -> Point:
@@ -90,8 +98,8 @@ def _panel(
         x, y = place(tick, y_ticks[0])
         parts.append(f'<text text-anchor="middle" x="{x:.1f}" y="{y + 16:.1f}">{tick:g}</text>')
     middle = left + (LEFT + WIDTH - RIGHT) / 2
-    name = html.escape(parameter)
-    parts.append(f'<text text-anchor="middle" x="{middle:.1f}" y="{HEIGHT - 8}">{name}</text>')
+    name, axis = html.escape(parameter), html.escape(NAMES.get(parameter, parameter))
+    parts.append(f'<text text-anchor="middle" x="{middle:.1f}" y="{HEIGHT - 8}">{axis}</text>')
     for number, recipe in enumerate(recipes):
         colour = PALETTE[number % len(PALETTE)]
         path = " ".join("{:.1f},{:.1f}".format(*place(x, y)) for x, y in lines[recipe])

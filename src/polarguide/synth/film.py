@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 
 from polarguide.camera import Camera
 from polarguide.synth.draws import Draws
+from polarguide.synth.rays import lens_stokes, number, pinhole, primary_rays
 from polarguide.synth.transport import Walk, follow
 
-PATHS_AT_ONCE = 1 << 19
+PATHS_AT_ONCE = 1 << 20
 """Bounds memory, and the time until Ctrl-C is heard."""
 SCATTER = 0x9E3779B1
 
@@ -47,7 +49,6 @@ def expose(
     *,
     seed: int,
     walk: Walk,
-    tick: Callable[[int], None] | None = None,
     centre: bool = False,
 ) -> Light:
     """Render a view.
@@ -59,25 +60,21 @@ def expose(
         samples: paths per pixel and lobe.
         seed: of the view.
         walk: limits of the paths.
-        tick: called with the number of samples done, after each pass.
         centre: send all rays through the centres of pixels.
     """
     pixels = camera.width * camera.height
-    passes = -(-samples * pixels // PATHS_AT_ONCE)
-    batch = -(-samples // passes)
+    passes = min(samples, -(-samples * pixels // PATHS_AT_ONCE))
+    while samples % passes:  # passes of one size are traced once
+        passes += 1
+    batch = samples // passes
     total = np.zeros((pixels, 7, 3))
-    done = 0
-    while done < samples:
-        count = min(batch, samples - done)
+    for done in range(0, samples, batch):
         for channel, scene in enumerate(scenes):
-            found = _expose_once(scene, camera, (done, count), seed, walk, centre)
+            found = _expose_once(scene, camera, (done, batch), seed, walk, centre)
             if len(scenes) == 1:
                 total += found
             else:
                 total[..., channel] += found[..., 0]
-        done += count
-        if tick is not None:
-            tick(done)
     grid = (total / samples).reshape(camera.height, camera.width, 7, 3).transpose(2, 0, 1, 3)
     return Light(grid[0:3], grid[3:6], grid[6])
 
@@ -89,38 +86,57 @@ def _expose_once(
     import mitsuba as mi
 
     pixels = camera.width * camera.height
+    first, count = part
+    lens, start = pinhole(camera), number(mi.UInt32, seed * SCATTER % 2**32)
     if mi.variant().startswith("scalar"):
-        first, count = part
         sums = np.zeros((pixels, 7, 3))
         for pixel in range(pixels):
             for sample in range(first, first + count):
-                parts = _path(scene, camera, pixel, sample, seed, walk, centre)
+                parts = _path(scene, lens, pixel, sample, start, walk, centre)
                 sums[pixel] += np.array([[float(v) for v in colour] for colour in parts])
         return sums
+    opaque = [number(mi.UInt32, value) for value in (first, count)]
+    found = _compiled()(scene, lens, opaque, pixels, count, start, walk, centre)
+    return np.stack([column.numpy() for column in found], -1).reshape(pixels, 7, -1).astype(np.float64)
+
+
+@functools.cache
+def _compiled() -> Callable[..., list[Any]]:
+    """``_sums``, traced once for a scene and a size of picture, not once a pass: tracing takes as long as
+    a hundred thousand paths."""
     import drjit as dr
 
-    count = dr.opaque(mi.UInt32, part[1])
-    index = dr.arange(mi.UInt32, pixels * part[1])
-    pixel = index // count
-    sample = index - pixel * count + dr.opaque(mi.UInt32, part[0])
-    parts = _path(scene, camera, pixel, sample, seed, walk, centre)
+    return dr.freeze(_sums, warn_after=1 << 30)
+
+
+def _sums(
+    scene: Any, lens: list[Any], part: list[Any], pixels: int, count: int, seed: Any, walk: Walk, centre: bool
+) -> list[Any]:
+    """Sums over ``count`` samples of each pixel, all at once."""
+    import drjit as dr
+    import mitsuba as mi
+
+    first, per_pixel = part
+    index = dr.arange(mi.UInt32, pixels * count)
+    pixel = index // per_pixel
+    sample = index - pixel * per_pixel + first
+    parts = _path(scene, lens, pixel, sample, seed, walk, centre)
     flat = [value for colour in parts for value in colour]
     dr.eval(flat)
-    columns = [dr.block_reduce(dr.ReduceOp.Add, value, part[1]).numpy() for value in flat]
-    return np.stack(columns, -1).reshape(pixels, 7, -1).astype(np.float64)
+    return [dr.block_reduce(dr.ReduceOp.Add, value, count) for value in flat]
 
 
 def _path(
-    scene: Any, camera: Camera, pixel: Any, sample: Any, seed: int, walk: Walk, centre: bool
+    scene: Any, lens: list[Any], pixel: Any, sample: Any, seed: Any, walk: Walk, centre: bool
 ) -> list[list[Any]]:
     """The colours of one sample: S0, S1, S2 of the specular and of the diffuse lobe, and what is seen directly."""
     import mitsuba as mi
 
-    draws = Draws(mi.UInt32(pixel), mi.UInt32(sample), _number(mi.UInt32, seed * SCATTER % 2**32))
+    draws = Draws(mi.UInt32(pixel), mi.UInt32(sample), seed)
     spread, place = draws.next(), draws.pair()
     if centre:
         place = mi.Point2f(0.5, 0.5)
-    ray, x_ref = primary_rays(camera, mi.UInt32(pixel), place)
+    ray, x_ref = primary_rays(lens, mi.UInt32(pixel), place)
     weight: Any = 1.0
     if mi.is_spectral:
         ray.wavelengths, weight = mi.sample_rgb_spectrum(_shifted(spread))
@@ -130,58 +146,6 @@ def _path(
         return [[part.x] for part in parts]
     colours = [mi.spectrum_to_srgb(part * weight, ray.wavelengths, True) for part in parts]
     return [[colour.x, colour.y, colour.z] for colour in colours]
-
-
-def primary_rays(camera: Camera, pixel: Any, place: Any) -> tuple[Any, Any]:
-    """Rays through points of pixels.
-
-    Args:
-        camera: pose and intrinsics.
-        pixel: index of the pixel, row by row.
-        place: point in the pixel, [0, 1)^2.
-
-    Returns:
-        Mitsuba's rays, and image right in the lens frame of each ray (see ``optics.lens_frame``), in world axes.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    inner = (camera.fx, camera.fy, camera.cx, camera.cy)
-    fx, fy, cx, cy = (_number(mi.Float, value) for value in inner)
-    width = _number(mi.UInt32, camera.width)
-    row = pixel // width
-    x = (mi.Float(pixel - row * width) + place.x - cx) / fx
-    y = (mi.Float(row) + place.y - cy) / fy
-    d = dr.normalize(mi.Vector3f(x, y, mi.Float(1.0)))
-    scale = 1 / (1 + d.z)
-    x_ref = mi.Vector3f(1 - d.x * d.x * scale, -d.x * d.y * scale, -d.x)
-    axes = [mi.Vector3f(*(_number(mi.Float, float(v)) for v in row)) for row in camera.rotation]
-    origin = mi.Point3f(*(_number(mi.Float, float(v)) for v in camera.centre))
-    # The rows of the world-to-camera rotation are the camera's axes in the world.
-    ray, right = (axes[0] * v.x + axes[1] * v.y + axes[2] * v.z for v in (d, x_ref))
-    return mi.Ray3f(origin, ray), right
-
-
-def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
-    """S0, S1, S2 in the project's lens frame of light that arrives along rays, from Mitsuba's frame of ``-ray.d``.
-
-    Mitsuba counts angles from its basis counter-clockwise as seen against the light, that is in the picture, as the
-    project does; only the basis itself has to be turned.
-    """
-    import mitsuba as mi
-
-    forward = -ray.d
-    turn = mi.mueller.rotate_stokes_basis(forward, mi.mueller.stokes_basis(forward), x_ref)
-    s0, s1, s2 = light
-    return [s0, s1 * turn[1, 1] + s2 * turn[1, 2], s1 * turn[2, 1] + s2 * turn[2, 2]]
-
-
-def _number(kind: Any, value: float) -> Any:
-    """A number that is no literal of the compiled code, so that one kernel serves all views."""
-    import drjit as dr
-    import mitsuba as mi
-
-    return kind(value) if mi.variant().startswith("scalar") else dr.opaque(kind, value)
 
 
 def _shifted(sample: Any) -> Any:

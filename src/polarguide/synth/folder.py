@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from polarguide.synth.mesh import Array
 REQUEST = "request.json"
 STEP = 16
 """Pictures have 12 bits in 16, as cameras give them: 0, 16, 32, ..."""
+TOP = 65535 // STEP
 
 
 def open_folder(out: Path, request: dict[str, Any]) -> bool:
@@ -68,8 +68,8 @@ def write_picture(path: Path, values: NDArray[Any]) -> None:
     write_file(path, data.tobytes())
 
 
-def picture_codes(stokes: Array, change: Callable[[Array], Array]) -> tuple[NDArray[np.uint16], float]:
-    """The four pictures behind a polarizer, [4, H, W, 3], and the share of their samples that clip.
+def picture_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.uint16]:
+    """The four pictures behind a polarizer, [4, H, W, 3].
 
     Args:
         stokes: [3, H, W, 3], full scale 1.
@@ -77,9 +77,14 @@ def picture_codes(stokes: Array, change: Callable[[Array], Array]) -> tuple[NDAr
     """
     twice = [2 * np.radians(angle) for angle in ANGLES]
     light = np.stack([(stokes[0] + stokes[1] * np.cos(a) + stokes[2] * np.sin(a)) / 2 for a in twice])
-    light = change(light)
-    codes = np.clip(np.round(light * (65535 / STEP)), 0, 65535 // STEP).astype(np.uint16) * STEP
-    return codes, float((light >= 1).mean())
+    return np.clip(np.round(change(light) * (65535 / STEP)), 0, TOP).astype(np.uint16) * STEP
+
+
+def clipped_share(out: Path, names: Sequence[str]) -> float:
+    """Share of the samples of these views' pictures that stand at full scale."""
+    files = [file for name in names for file in view_files(out, name, truth=False, raw=False)]
+    pictures = (np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files)
+    return float(np.mean([(picture == TOP * STEP).mean() for picture in pictures]))
 
 
 def view_files(out: Path, name: str, *, truth: bool, raw: bool) -> list[Path]:
@@ -101,14 +106,3 @@ def shown(linear: Array) -> NDArray[np.uint8]:
     linear = np.clip(linear, 0, 1)
     curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.asarray(np.round(255 * curve), np.uint8)
-
-
-def checksum(out: Path) -> str:
-    """SHA-256 over the names and contents of the pictures, ground truth, model and split of a scene."""
-    total = hashlib.sha256()
-    for folder in ("gt", "polar", "raw", "sparse"):
-        for path in sorted((out / folder).rglob("*")):
-            if path.is_file():
-                total.update(f"{path.relative_to(out).as_posix()} ".encode())
-                total.update(hashlib.sha256(path.read_bytes()).hexdigest().encode())
-    return total.hexdigest()

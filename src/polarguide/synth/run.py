@@ -17,6 +17,7 @@ from polarguide.synth.build import Built, build_scene
 from polarguide.synth.cameras import held_out_names, place_cameras, view_names
 from polarguide.synth.film import Light, expose
 from polarguide.synth.geometry import pixel_truth
+from polarguide.synth.manifest import verify_scene, write_manifest
 from polarguide.synth.mesh import Array
 from polarguide.synth.record import scene_record
 from polarguide.synth.schema import SceneSpec
@@ -76,7 +77,8 @@ def synthesise(
     """
     settings.check()
     if folder.open_folder(out, {"scene": spec.data(), "settings": settings.data()}):
-        reporter.say(f"{out} is finished already.")
+        verify_scene(out)
+        reporter.say(f"{out} is finished already; all its files have their checksums.")
         return out
     variant = choose_variant(settings.colour, threads=threads)
     names = view_names(spec.camera.views)
@@ -93,9 +95,10 @@ def synthesise(
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     exposure = spec.exposure or _metered(built, cameras, settings.seed)
     job = Job(built, settings, out, names, tests, cameras, exposure, Sensor())
-    clipped = _render_all(job, reporter)
+    _render_all(job, reporter)
     _write_model(job, names)
     folder.write_file(out / "split.json", json.dumps({"test": tests}).encode())
+    clipped = folder.clipped_share(out, names)
     record = scene_record(spec, settings, variant, names, tests, exposure=exposure, clipped=clipped)
     if job.mosaics:
         gains = {str(45 * k): gain for k, gain in enumerate(job.sensor.gains)}
@@ -104,27 +107,25 @@ def synthesise(
     with_truth = [number for number, name in enumerate(names) if job.has_truth(name)]
     if with_truth:
         write_sheet(out, [names[k] for k in with_truth], [cameras[k] for k in with_truth])
-    record["sha256"] = folder.checksum(out)
+    record["sha256"] = write_manifest(out)
     folder.write_file(out / "scene.json", json.dumps(record, indent=1).encode())
     return out
 
 
-def _render_all(job: Job, reporter: Reporter) -> float:
-    """Render the views that are not finished; the share of samples that clip in those."""
-    shares = []
+def _render_all(job: Job, reporter: Reporter) -> None:
+    """Render the views that are not finished."""
     left = [number for number, name in enumerate(job.names) if not all(f.exists() for f in job.files(name))]
     if len(left) < len(job.names):
         reporter.say(f"Going on: {len(job.names) - len(left)} of {len(job.names)} views are finished.")
     with reporter.track(f"rendering {job.built.spec.name}", len(job.names)) as progress:
         progress(len(job.names) - len(left))
         for done, number in enumerate(left, 1):
-            shares.append(_render_view(job, number))
+            _render_view(job, number)
             progress(len(job.names) - len(left) + done)
-    return float(np.mean(shares)) if shares else 0.0
 
 
-def _render_view(job: Job, number: int) -> float:
-    """Render one view and write its files; the share of its samples that clip."""
+def _render_view(job: Job, number: int) -> None:
+    """Render one view and write its files."""
     settings, name, camera = job.settings, job.names[number], job.cameras[number]
     samples = settings.samples * (TEST_SAMPLES if name in job.tests else 1)
     big = _doubled(camera) if job.mosaics else camera
@@ -148,10 +149,9 @@ def _render_view(job: Job, number: int) -> float:
         folder.write_file(job.out / "gt" / f"{name}.npz", data.getvalue())
     # With a sensor the noise is in its mosaics, and these pictures are what they should lead to.
     noise = 0.0 if job.mosaics else settings.noise
-    codes, clipped = folder.picture_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
+    codes = folder.picture_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
     for path, picture in zip(folder.view_files(job.out, name, truth=False, raw=False), codes, strict=True):
         folder.write_picture(path, picture)
-    return clipped
 
 
 def _write_model(job: Job, names: list[str]) -> None:

@@ -14,6 +14,7 @@ from polarguide.errors import PolarguideError
 from polarguide.synth import folder
 from polarguide.synth.build import build_scene
 from polarguide.synth.cameras import place_cameras
+from polarguide.synth.manifest import verify_scene, write_manifest
 from polarguide.synth.run import synthesise
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, SynthSettings
@@ -57,7 +58,7 @@ def sweep_scenes(
     spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep, reporter: Reporter, *,
     threads: int = 0,
 ) -> list[Path]:  # fmt: skip
-    """Write ``out/<parameter>-<value>`` for every value.
+    """Write ``out/<parameter>-<value>`` for every value, such as ``views-06`` and ``views-12``.
 
     A sweep over ``views`` (their number in training) renders the scene once, as it is, and makes the smaller scenes by
     leaving out training views evenly, so that all share their test views and even their pictures.
@@ -81,7 +82,10 @@ def sweep_scenes(
 
 
 def _member(out: Path, sweep: Sweep, value: float) -> Path:
-    return out / f"{sweep.parameter}-{value:g}"
+    """The folder of one value; zeros before it, so that names sort like numbers: views-06, views-12."""
+    digits = max(len(str(int(other))) for other in sweep.values)
+    whole, *rest = f"{value:g}".split(".")
+    return out / f"{sweep.parameter}-{'.'.join([whole.zfill(digits), *rest])}"
 
 
 def _note(scene: Path, parameter: str, value: float) -> None:
@@ -112,6 +116,7 @@ def _fewer_views(
         member = _member(out, sweep, value)
         done.append(member)
         if (member / "scene.json").exists():
+            verify_scene(member)
             continue
         chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, int(value)).round().astype(int))]
         names = sorted([*chosen, *tests])
@@ -127,7 +132,7 @@ def _fewer_views(
             find_points(built, some, pictures, settings.points, settings.seed),
         )
         folder.write_file(member / "split.json", json.dumps({"test": tests}).encode())
-        smaller = {**record, "views": names, "train": chosen, "sha256": folder.checksum(member)}
+        smaller = {**record, "views": names, "train": chosen, "sha256": write_manifest(member)}
         folder.write_file(member / "scene.json", json.dumps(smaller, indent=1).encode())
         _note(member, "views", value)
         reporter.say(f"{member}: {len(chosen)} training views")

@@ -1,0 +1,71 @@
+"""``checksums.txt`` of a rendered scene: SHA-256 of all its files, as ``sha256sum -c`` reads them.
+
+``scene.json`` is not among them, since it names the digest of the list itself: one number for the whole scene.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from polarguide.errors import PolarguideError
+from polarguide.synth.folder import write_file
+
+MANIFEST = "checksums.txt"
+_FOLDERS = ("gt", "mesh", "polar", "raw", "sparse")
+_FILES = ("calibration.json", "environment.hdr", "request.json", "sheet.jpg", "split.json")
+
+
+def write_manifest(out: Path) -> str:
+    """Write the list of a scene that is complete but for ``scene.json``; the SHA-256 of the list."""
+    lines = [f"{_digest(path)}  {path.relative_to(out).as_posix()}\n" for path in sorted(_written(out))]
+    data = "".join(lines).encode()
+    write_file(out / MANIFEST, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def verify_scene(out: Path) -> str:
+    """Compare a finished scene with its list; the SHA-256 of the list.
+
+    Raises:
+        PolarguideError: a file is missing or has changed, or the list has.
+    """
+    try:
+        data = (out / MANIFEST).read_bytes()
+    except OSError:
+        data = b""
+    if hashlib.sha256(data).hexdigest() != scene_digest(out):
+        raise _changed(out / MANIFEST, "the list of checksums whose digest scene.json names")
+    for line in data.decode().splitlines():
+        expected, _, name = line.partition("  ")
+        path = out / name
+        if not path.is_file() or _digest(path) != expected:
+            raise _changed(path, f"the file that {MANIFEST} lists")
+    return scene_digest(out)
+
+
+def scene_digest(out: Path) -> str:
+    """The digest that ``scene.json`` names; empty where it names none."""
+    return str(json.loads((out / "scene.json").read_text(encoding="utf-8")).get("sha256", ""))
+
+
+def _written(out: Path) -> Iterator[Path]:
+    """The files that rendering writes; others in the folder are the user's."""
+    for name in _FOLDERS:
+        yield from (path for path in (out / name).rglob("*") if path.is_file())
+    yield from (out / name for name in _FILES if (out / name).is_file())
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _changed(path: Path, expected: str) -> PolarguideError:
+    return PolarguideError(
+        path,
+        expected=expected,
+        found="another" if path.is_file() else "no file",
+        remedy="Remove the folder to render the scene again, or give another --out.",
+    )
