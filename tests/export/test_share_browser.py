@@ -6,7 +6,6 @@ Needs Playwright (``pip install polarguide[browser]``) and a Chromium of the sys
 from __future__ import annotations
 
 import base64
-import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from browsers import PATIENCE, chromium
 from random_runs import KINDS, random_state, ring
 
 from polarguide.camera import Camera
@@ -24,26 +24,14 @@ from polarguide.export.share import share_page, write_page
 from polarguide.raster.cpu import rasterise_cpu
 from polarguide.shading.render import render
 
-playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system"),
-    pytest.mark.slow,
-]
-FLAGS = (
-    "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--ignore-gpu-blocklist"
-)
-PATIENCE = 240  # seconds; software rendering on a busy machine is slow
+pytestmark = pytest.mark.slow
 LEAST = 40.0  # dB; the promise is 30, what is seen is above 55
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as running:
-        chromium = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
-        yield chromium
-        chromium.close()
+    with chromium() as opened:
+        yield opened
 
 
 class Opened:

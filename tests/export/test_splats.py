@@ -6,19 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
+from random_runs import random_state
 from torch.nn.functional import normalize
 
 from polarguide.export import write_run_ply
 from polarguide.export.splats import shown_colours
-from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import read_ply
-from polarguide.gaussians.rows import GaussianRows
-from polarguide.recipes import RECIPES
 from polarguide.shading.display import srgb_encode
-from polarguide.shading.model import ShadingModel
-from polarguide.training.state import Environment, TrainingState
 
 COUNT = 7
 FIELDS = {
@@ -28,37 +23,9 @@ FIELDS = {
 }
 
 
-def trained(name: str) -> tuple[TrainingState, ShadingModel]:
-    """A state as the recipe's training would leave, of seven random Gaussians."""
-    generator = torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    recipe = RECIPES[name]
-    rows = {
-        "means": normal(COUNT, 3),
-        "quaternions": normal(COUNT, 4),
-        "log_scales": normal(COUNT, 3) - 2,
-        "opacity_logits": normal(COUNT),
-        "sh_dc": 0.3 * normal(COUNT, 3),
-        "sh_rest": 0.05 * normal(COUNT, 15, 3),
-    }
-    light = None
-    if recipe.directional is not None:
-        rows |= recipe.directional.first_rows(0.5 + 0.28 * rows["sh_dc"], generator)
-        light = recipe.directional.first_light_values(8, 0.5, generator)
-    elif recipe.reflects:
-        rows["strength_logits"] = normal(COUNT)
-        light = {"texels": normal(6, 8, 8, 3)}
-    environment = Environment(light, recipe.environment_rates) if light else None
-    state = TrainingState(0, GaussianRows(rows, recipe.rates), environment, DensityStatistics(COUNT))
-    return state, recipe.shading(1.5)
-
-
 @pytest.mark.parametrize("name", FIELDS)
 def test_the_file_holds_display_colours_and_the_fields_of_the_model(name: str, tmp_path: Path) -> None:
-    state, shading = trained(name)
+    state, shading = random_state(name, COUNT)
     write_run_ply(tmp_path / "run.ply", state, shading)
     read = read_ply(tmp_path / "run.ply")
     assert set(read["extra"]) == FIELDS[name]
@@ -69,7 +36,7 @@ def test_the_file_holds_display_colours_and_the_fields_of_the_model(name: str, t
 
 @pytest.mark.parametrize("name", FIELDS)
 def test_colours_are_in_range_and_change_with_the_view(name: str) -> None:
-    state, shading = trained(name)
+    state, shading = random_state(name, COUNT)
     directions = normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
     colours = shown_colours(state, shading, directions)
     assert colours.shape == (COUNT, 5, 3)
@@ -78,7 +45,7 @@ def test_colours_are_in_range_and_change_with_the_view(name: str) -> None:
 
 
 def test_a_directional_gaussian_shows_its_albedo_and_the_light_in_its_mirror() -> None:
-    state, shading = trained("ref-gs")
+    state, shading = random_state("ref-gs", COUNT)
     assert state.environment is not None
     rows, ray = state.rows, torch.tensor([[0.0, 0.6, 0.8]])
     normals = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], torch.zeros(3))

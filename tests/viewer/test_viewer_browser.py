@@ -5,7 +5,6 @@ Needs Playwright (``pip install polarguide[browser]``) and a Chromium of the sys
 
 from __future__ import annotations
 
-import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,23 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from browsers import PATIENCE, chromium
 from random_runs import ring
 from sights import photograph, shown
 
 from polarguide.evaluation import figures
 from polarguide.viewer import Viewer
 
-playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system"),
-    pytest.mark.slow,
-]
-FLAGS = (
-    "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--ignore-gpu-blocklist"
-)
-PATIENCE = 120  # seconds; software rendering on a busy machine is slow
+pytestmark = pytest.mark.slow
 WIDTH, HEIGHT = 960, 600
 FREE = np.s_[200:, : WIDTH - 350]  # neither under the panel nor under what viser says of software rendering
 HOSTILE = '<img src=x onerror="window.hurt=1">{window.hurt=1}'
@@ -102,12 +92,10 @@ def psnr(picture: np.ndarray, expected: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def opened() -> Iterator[Opened]:
-    with playwright.sync_playwright() as running:
-        chromium = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
-        viewing = Opened(chromium)
+    with chromium() as browser:
+        viewing = Opened(browser)
         yield viewing
         viewing.close()
-        chromium.close()
 
 
 @pytest.mark.parametrize("layer", ["final", "specular", "normal", "diffuse"])

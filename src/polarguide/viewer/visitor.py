@@ -5,53 +5,27 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
 from polarguide.camera import Camera
-from polarguide.capture import View
 from polarguide.evaluation.figures import Picture
 from polarguide.surroundings import Surroundings
 from polarguide.viewer.appearance import Painter
 from polarguide.viewer.frusta import Frusta
 from polarguide.viewer.keys import FRAMES_PER_SECOND, Keys
-from polarguide.viewer.lens import free_camera, quaternion, window_fov
+from polarguide.viewer.lens import free_camera, quaternion
 from polarguide.viewer.pace import Pace
 from polarguide.viewer.panel import NOWHERE, Offer, Panel
 from polarguide.viewer.photographs import Photograph
+from polarguide.viewer.place import Place, stand
 from polarguide.viewer.shown import Shown
 
 PATH_FILE, PICTURE_FILE = "camera_path.json", "polarguide.png"
-ARRIVAL = 5.0  # seconds that a browser has to reach a pose
 JPEG_QUALITY = 75
 NO_LAYER = "Nothing to show: go to a photograph, or choose another layer"
-
-
-@dataclass(eq=False)
-class Place:
-    """The photograph at whose pose a visitor stands.
-
-    Attributes:
-        view: it. wxyz, position: what the browser was told. since: when.
-        reached: whether the browser has told that it is there; until then it may tell of where it was before.
-    """
-
-    view: View
-    wxyz: np.ndarray
-    position: np.ndarray
-    since: float
-    reached: bool = False
-
-    def holds(self, camera: Any, now: float, distance: float) -> bool:
-        """Whether a browser's camera is still there, or may still be on its way."""
-        turned = 1 - abs(float(np.dot(self.wxyz, camera.wxyz)))
-        moved = float(np.linalg.norm(self.position - camera.position)) / distance
-        there = turned < 1e-6 and moved < 1e-4
-        self.reached |= there
-        return there or (not self.reached and now - self.since < ARRIVAL)
 
 
 class Visitor:
@@ -121,19 +95,10 @@ class Visitor:
 
     def go(self, name: str) -> None:
         """Stand where a photograph was taken."""
-        view, camera = self._photographs[name].view, self._client.camera
-        lens, centre = view.camera, view.camera.centre
-        # Turning goes round a point that the photograph sees, at the distance of the scene's centre.
-        ahead = lens.rotation[2]
-        distance = max(float((self._around.centre - centre) @ ahead), 0.1 * self._around.distance)
         with self._lock:
             self._playing = None
-            with self._client.atomic():
-                camera.fov = window_fov(lens, camera.aspect)
-                camera.up_direction = (-lens.rotation[1]).numpy()
-                camera.position = centre.numpy()
-                camera.look_at = (centre + distance * ahead).numpy()
-            self._place = Place(view, np.array(camera.wxyz), np.array(camera.position), time.monotonic())
+            view = self._photographs[name].view
+            self._place = stand(self._client, view, self._around, time.monotonic())
             self.pace.change(time.monotonic())
         self.panel.view.value = name
         self._wake()

@@ -1,0 +1,29 @@
+"""A Chromium of the system, driven by Playwright, where both are installed."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = (
+    "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--ignore-gpu-blocklist"
+)
+PATIENCE = 240  # seconds; software rendering on a busy machine is slow
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """A browser with WebGL 2 by software; skips the test where there is none."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this system")
+    playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
+        yield browser
+        browser.close()
