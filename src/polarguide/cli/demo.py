@@ -38,3 +38,4 @@ def demo(*, out: Path = Path("runs/demo"), steps: int = STEPS, seed: int = 0, th
             opened, opened.scene.test_views, [n for n in LAYERS if n != "alpha"], out / "render"
         )
     console.print(f"look at {sheet}: rows are rendered and true pictures, columns are layers")
+    console.print(f"look around: polarguide view {out}")
