@@ -13,11 +13,14 @@ import torch
 from other_device import BACKEND, OtherDevice
 
 from polarguide.capture import load_scene
-from polarguide.cli.common import open_run
+from polarguide.cli.common import OpenRun, open_run
 from polarguide.cli.evaluate import evaluate_run
 from polarguide.cli.render import render_views
 from polarguide.evaluation import ViewTarget, score_view
 from polarguide.inspection.short_run import short_run, surface_of
+from polarguide.surroundings import surroundings
+from polarguide.viewer import shown_run
+from polarguide.viewer.appearance import Appearance, Crop, Painter
 
 
 @pytest.fixture
@@ -86,3 +89,24 @@ def test_the_inspection_trains_there_and_compares_here(
     assert json.loads((tmp_path / "short_run.json").read_text())["steps"] == 2
     assert state.step == 2
     assert {t.device.type for t in (surface.normal, surface.depth, surface.known)} == {"cpu"}
+
+
+def test_the_viewer_draws_what_lies_there(run: Path) -> None:
+    crop = Crop((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    chosen = [
+        Appearance(layer, exposure=0.5, strength=0.5, turn=30.0, crop=crop)
+        for layer in ("final", "specular", "normal", "depth", "error")
+    ]
+
+    def drawn(opened: OpenRun) -> list[np.ndarray]:
+        view = opened.scene.test_views[0]
+        painter = Painter(surroundings(list(opened.cameras.values())))
+        pictures = [painter.paint(shown_run(opened), view.camera, look, view) for look in chosen]
+        return [picture.astype(float) for picture in pictures if picture is not None]
+
+    with OtherDevice():
+        there = drawn(open_run(run))
+    here = drawn(open_run(run, device="cpu"))
+    assert len(there) == len(here) == len(chosen)
+    for a, b in zip(there, here, strict=True):
+        assert np.abs(a - b).mean() < 1

@@ -52,7 +52,9 @@ class Crop:
         """Which means [N, 3] lie in it, [N] bool."""
         axes, centre = (t.to(means) for t in (around.panorama_axes(), around.centre))
         local = (means - centre) @ axes / around.distance
-        low, high = local.new_tensor(self.low), local.new_tensor(self.high)
+        low, high = (
+            torch.tensor(side, dtype=local.dtype, device=local.device) for side in (self.low, self.high)
+        )
         return ((local >= low) & (local <= high)).all(dim=1)
 
 
