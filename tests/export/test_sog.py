@@ -100,11 +100,11 @@ def test_what_is_read_back_is_what_was_written(ply: Path, tmp_path: Path) -> Non
     for name, error in (("log_scales", 0.1), ("sh_dc", 0.1)):
         expected = ours[name].reshape(COUNT, -1).numpy()
         assert np.quantile(np.abs(found[name][at] - expected)[seen], 0.99) < error, name
-    # Random harmonics are the worst case of a palette: 3,000 in 2,048 places.
+    # Random harmonics are the worst case of a palette: 3,000 in 2,048 places. Many keep a place to themselves.
     rest = ours["sh_rest"].reshape(COUNT, -1).numpy()
-    error = np.sqrt(np.mean((found["sh_rest"].reshape(COUNT, -1)[at] - rest) ** 2))
-    assert error < 0.8 * np.sqrt(np.mean(rest**2))
-    assert np.median(np.abs(found["sh_rest"].reshape(COUNT, -1)[at] - rest).max(axis=1)) < 0.05
+    errors = found["sh_rest"].reshape(COUNT, -1)[at] - rest
+    assert np.sqrt(np.mean(errors**2)) < 0.8 * np.sqrt(np.mean(rest**2))
+    assert np.quantile(np.abs(errors).max(axis=1), 0.25) < 0.02
 
 
 def test_the_same_splats_make_the_same_file(ply: Path, tmp_path: Path) -> None:
