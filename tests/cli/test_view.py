@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import socket
 import subprocess
@@ -82,6 +83,26 @@ def test_an_address_that_cannot_be_is_refused(
     said = capsys.readouterr().err
     assert named in said
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("damage", ["no run", "no checkpoint", "half a checkpoint"])
+def test_a_run_that_is_none_is_refused(
+    damage: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    if damage == "no run":
+        folder.mkdir()
+    else:
+        shutil.copytree(trained, folder)
+        checkpoint = folder / CHECKPOINT
+        data = checkpoint.read_bytes()
+        checkpoint.unlink()
+        if damage == "half a checkpoint":
+            checkpoint.write_bytes(data[: len(data) // 2])
+    assert run(["view", str(folder)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
 
 
 def test_a_training_with_a_viewer_gives_the_same_bits(
