@@ -40,6 +40,7 @@ const renderer = new THREE.WebGLRenderer({ antialias: false, preserveDrawingBuff
 const scene = new THREE.Scene(), spark = new SparkRenderer({ renderer, maxStdDev: 3.33, minAlpha: 1 / 255 });
 scene.add(spark);
 const mesh = new SplatMesh({ url: "/FILE" });
+if ("FILE".endsWith(".spz")) mesh.quaternion.set(1, 0, 0, 0);  // from its own axes (right, up, back) to the world's
 scene.add(mesh);
 window.show = async (frame) => {
   await mesh.initialized;
