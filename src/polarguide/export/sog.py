@@ -2,8 +2,8 @@
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
 
-Ours, because the libraries at hand compare every Gaussian with up to 65,536 harmonics of a palette on one core: with
-more than 65,535 Gaussians that takes them over half an hour.
+Ours, because GaussForge 0.6 writes 65,000 Gaussians in eight seconds, but had not finished 88,623 after six minutes:
+from 65,536 on it compares every Gaussian with a palette of as many harmonics.
 """
 
 from __future__ import annotations
