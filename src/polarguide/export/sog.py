@@ -2,8 +2,7 @@
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
 
-Ours, because GaussForge 0.6 writes 65,000 Gaussians in eight seconds, but had not finished 88,623 after six minutes:
-from 65,536 on it compares every Gaussian with a palette of as many harmonics.
+Ours, because GaussForge 0.6 writes 65,000 Gaussians in eight seconds, but had not finished 88,623 after six minutes.
 """
 
 from __future__ import annotations
