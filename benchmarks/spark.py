@@ -31,6 +31,7 @@ FLAGS = (
     "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--ignore-gpu-blocklist"
 )
+STILL = 6  # equal pictures in a row
 PAGE = """<!doctype html><script type="importmap">{"imports": {"three": "/three/build/three.module.js",
 "three/addons/": "/three/examples/jsm/",
 "@sparkjsdev/spark": "/@sparkjsdev/spark/dist/spark.module.js"}}</script><script type="module">
@@ -53,11 +54,14 @@ window.show = async (frame) => {
   const top = frame.cy / frame.fl_y, bottom = (frame.cy - frame.h) / frame.fl_y;
   camera.projectionMatrix.makePerspective(near * left, near * right, near * top, near * bottom, near, far);
   camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
-  for (let k = 0; k < 6; ++k) {  // sorting happens in a worker, between frames
+  // Sorting happens in a worker, between frames: until the picture has stayed the same for a while.
+  for (let same = 0, before = ""; same < STILL; ) {
     renderer.render(scene, camera);
+    const now = renderer.domElement.toDataURL("image/png");
+    same = now === before ? same + 1 : 0;
+    before = now;
     await new Promise((resolve) => setTimeout(resolve, WAIT));
   }
-  renderer.render(scene, camera);
   return renderer.domElement.toDataURL("image/png");
 };
 window.ready = true;
@@ -96,7 +100,11 @@ def main() -> None:
         def answer(route) -> None:
             name = route.request.url.split("/", 3)[3]
             if not name:
-                text = PAGE.replace("FILE", file).replace("WAIT", str(arguments.wait))
+                text = (
+                    PAGE.replace("FILE", file)
+                    .replace("WAIT", str(arguments.wait))
+                    .replace("STILL", str(STILL))
+                )
                 return route.fulfill(body=text, content_type="text/html")
             path = Path(folder) / file if name == file else arguments.node_modules / name
             kind = "text/javascript" if path.suffix == ".js" else "application/octet-stream"
