@@ -20,10 +20,11 @@ import torch
 
 from polarguide.cli.common import open_run
 from polarguide.gaussians.rows import GaussianRows
+from polarguide.shading.result import LAYERS
 from polarguide.surroundings import surroundings
 from polarguide.trajectory import orbit
 from polarguide.viewer import shown_run
-from polarguide.viewer.appearance import RENDERED, Appearance, Painter
+from polarguide.viewer.appearance import Appearance, Painter
 from polarguide.viewer.lens import fit
 from polarguide.viewer.visitor import JPEG_QUALITY
 
@@ -53,7 +54,7 @@ def main() -> None:
         f"{shown.status}; {len(shown.rows):,} of them, {width} x {height}, {torch.get_num_threads()} threads"
     )
     print("layer        ms (10 % to 90 %)   pictures a second")
-    for layer in RENDERED:
+    for layer in LAYERS:
         painter, seconds = Painter(surroundings(cameras)), []
         for camera in path:
             began = time.perf_counter()

@@ -16,13 +16,10 @@ from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import validate_metrics
 from polarguide.raster import DeviceName
-from polarguide.shading.result import RenderResult
+from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.trained import TrainedRun, open_trained
 
 __all__ = ["LAYERS", "Model", "PolarguideError", "load"]
-
-LAYERS = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth", "alpha")
-"""What ``Model.render`` gives, by the names of ``polarguide.shading.result.RenderResult``."""
 
 
 class Model:

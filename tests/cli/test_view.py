@@ -71,8 +71,8 @@ def test_view_warns_where_others_can_look_and_takes_a_free_port(trained: Path, p
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (("--port", "0"), "--port"),
-        (("--port", "99999"), "--port"),
+        (("--port", "0"), "the port"),
+        (("--port", "99999"), "the port"),
         (("--host", "no.such.host.invalid"), "no.such"),
     ],
 )
@@ -103,6 +103,15 @@ def test_a_run_that_is_none_is_refused(
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert lines[0].startswith("error: ")
+
+
+def test_a_viewer_that_cannot_listen_leaves_no_run(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ("--downscale", "4", "--viewer", "--viewer-host", "192.0.2.1")  # an address of documents alone
+    assert run(["train", str(demo_scene), "--out", str(tmp_path / "run"), *flags]) == 2
+    assert "192.0.2.1" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_training_with_a_viewer_gives_the_same_bits(

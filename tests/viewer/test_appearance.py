@@ -11,7 +11,8 @@ from random_runs import KINDS, ring
 from sights import around, photograph, shown
 
 from polarguide.evaluation import figures
-from polarguide.viewer.appearance import MEASURED, RENDERED, Appearance, Crop, Painter
+from polarguide.shading.result import LAYERS
+from polarguide.viewer.appearance import MEASURED, Appearance, Crop, Painter
 from polarguide.viewer.lens import fit
 
 CAMERAS = ring()
@@ -30,7 +31,7 @@ def paint(seen, appearance=PLAIN, view=None, camera=CAMERA, **named):
 def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
     seen = shown(recipe)
     result = seen.render(CAMERA, seen.rows, seen.environment, depth=True)
-    for layer in RENDERED:
+    for layer in LAYERS:
         picture = paint(seen, Appearance(layer=layer))
         if getattr(result, layer) is None:
             assert picture is None

@@ -35,9 +35,7 @@ class Opened:
         cameras = {**ring(width=WIDTH // 4, height=HEIGHT // 4)}
         cameras[HOSTILE] = cameras.pop("v5")
         self.photographs = {name: photograph(name, camera, self.seen) for name, camera in cameras.items()}
-        self.viewer = Viewer(
-            lambda: self.seen, self.photographs, list(cameras.values()), lit=True, port=18080, title=HOSTILE
-        )
+        self.viewer = Viewer(lambda: self.seen, self.photographs, lit=True, port=18080, title=HOSTILE)
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()

@@ -25,7 +25,7 @@ class Looking:
         self.client = StandIn()
         offer = Offer(lit=True, turns=True, views=tuple(self.photographs), trains=True)
         self.visitor = Visitor(self.client, self.photographs, around(), offer, lambda: None)
-        self.visitor.arrive("v0", self.photographs["v0"].view.camera)
+        self.visitor.go("v0")
         self.client.camera.tell()
 
     def picture(self):
@@ -155,10 +155,14 @@ def test_a_path_is_set_down_played_and_saved(looking):
     client.control("Add this pose").click()
     client.control("Remove the last").click()
     assert client.control("Poses").value == "2, 2 s"
+    client.control("Seconds each").value = 3.0
+    assert client.control("Poses").value == "2, 3 s"
+    client.control("Seconds each").value = 2.0
     client.control("Save path").click()
     cameras = json.loads(client.files[PATH_FILE])["cameras"]
     assert len(cameras) == 61
     client.control("Play").click()
+    assert client.control("Go to").value == NOWHERE
     looking.clock.now += 1.0
     assert looking.visitor.wants() == "coarse"
     middle = client.camera.position

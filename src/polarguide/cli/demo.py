@@ -7,9 +7,10 @@ from pathlib import Path
 
 from polarguide.cli.common import console, open_run, use_threads
 from polarguide.cli.evaluate import evaluate_run
-from polarguide.cli.render import LAYERS, render_run
+from polarguide.cli.render import render_run
 from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
+from polarguide.shading.result import LAYERS
 from polarguide.training.run import CONFIGURATION
 
 STEPS = 2000

@@ -64,7 +64,9 @@ def export(
         "environment": lambda: _environment(opened, folder),
         "cameras": lambda: _cameras(opened, folder),
     }
-    for path in writers[format]():
+    with console.status(f"writing {format}"):
+        written = writers[format]()
+    for path in written:
         size = f" ({path.stat().st_size / 1e6:.1f} MB)" if path.is_file() else ""
         console.print(f"{format}: {path}{size}", markup=False)
 

@@ -14,13 +14,18 @@ from polarguide.cli.film import film
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import figures
 from polarguide.evaluation.pictures import Picture, layer_picture, true_depth_range, truth_pictures
-from polarguide.export.environment import needs_radiance, read_panorama, texels_of, turned_cubemap
+from polarguide.export.environment import (
+    RELIT_RESOLUTION,
+    needs_radiance,
+    read_panorama,
+    texels_of,
+    turned_cubemap,
+)
 from polarguide.raster import DeviceName
+from polarguide.shading.result import LAYERS
 from polarguide.surroundings import surroundings
 
-LAYERS = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth", "alpha")
 SHEET_VIEWS = 8
-RELIT_RESOLUTION = 128
 
 
 def render_views(

@@ -99,12 +99,12 @@ def train(
         if resume:
             _check_same(RunConfiguration.load(out), configuration, out)
             state = load_checkpoint(out, chosen, backend.device) if (out / CHECKPOINT).exists() else None
-        ranks.wait()
-        if leads:
-            out.mkdir(parents=True, exist_ok=True)
-            configuration.save(out)
         trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
         with watched(trainer, viewer_host, viewer_port) if viewer else nullcontext() as look:
+            ranks.wait()
+            if leads:
+                out.mkdir(parents=True, exist_ok=True)
+                configuration.save(out)
             train_run(trainer, out, checkpoint_every=checkpoint_every, look=look)
     if leads:
         console.print(f"trained: {out}   next: polarguide eval {out}   polarguide view {out}")

@@ -109,7 +109,6 @@ def watched(trainer: Trainer, host: str, port: int) -> Iterator[Look]:
     viewer = Viewer(
         lambda: shown_training(trainer),
         photographs(scene),
-        [view.camera for view in scene.views],
         lit=trainer.state.environment is not None,
         trains=True,
         host=host,

@@ -36,7 +36,6 @@ def view(
     viewer = Viewer(
         lambda: shown,
         photographs(opened.scene),
-        list(opened.cameras.values()),
         lit=opened.environment is not None,
         host=host,
         port=port,

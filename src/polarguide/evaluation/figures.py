@@ -25,6 +25,7 @@ __all__ = [
     "dolp_to_rgb",
     "error_to_rgb",
     "normal_to_rgb",
+    "png_bytes",
     "radiance_to_rgb",
     "scalar_to_rgb",
     "write_png",
@@ -150,12 +151,22 @@ def write_png(path: str | Path, rgb8: Picture) -> None:
         raise PolarguideError(
             path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
         )
+    data = png_bytes(rgb8)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(data)
+    os.replace(partial, path)
+
+
+def png_bytes(rgb8: Picture) -> bytes:
+    """A uint8 RGB [H, W, 3] picture as a PNG file.
+
+    Raises:
+        ValueError: it cannot be encoded.
+    """
     encoded, data = cv2.imencode(".png", rgb8[..., ::-1])
     if not encoded:
-        raise ValueError(f"{path}: the picture could not be encoded")
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data.tobytes())
-    os.replace(partial, path)
+        raise ValueError("picture: it could not be encoded as PNG")
+    return data.tobytes()
 
 
 def _to_uint8(values: Tensor) -> Picture:

@@ -24,6 +24,8 @@ from polarguide.shading.render import Shading
 from polarguide.surroundings import Surroundings
 
 LARGEST = 8192 * 4096
+RELIT_RESOLUTION = 128
+"""Texels along the sides of a cubemap that is made of another light, or of the learned one turned."""
 _NO_LIGHT = 1e-4  # radiance of black, so that its logarithm is finite
 
 

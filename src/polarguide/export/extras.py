@@ -1,4 +1,4 @@
-"""Libraries that only some exports need."""
+"""Libraries that only some verbs need."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 from polarguide.errors import PolarguideError
 
 
-def needed(module: str, what: str) -> Any:
-    """Import a module of the optional part ``export``.
+def needed(module: str, what: str, *, install: str = "'polarguide[export]'") -> Any:
+    """Import a library that most verbs do without.
 
     Args:
-        module: its name. what: what it is needed for, as the message says.
+        module: its name. what: what it is needed for, as the message says. install: what to give to pip.
 
     Raises:
         PolarguideError: it is not installed.
@@ -24,5 +24,5 @@ def needed(module: str, what: str) -> Any:
             what,
             expected=f"the Python package {module.partition('.')[0]}",
             found="that it is not installed",
-            remedy="Install the optional part: pip install 'polarguide[export]'.",
+            remedy=f"Install it: pip install {install}.",
         ) from None

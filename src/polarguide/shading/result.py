@@ -8,6 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+LAYERS = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth", "alpha")
+"""The pictures in a ``RenderResult``, by name."""
+
 
 @dataclass(frozen=True, eq=False)
 class RenderResult:

@@ -13,7 +13,7 @@ from polarguide.capture import View
 from polarguide.evaluation import figures
 from polarguide.evaluation.figures import Picture
 from polarguide.evaluation.pictures import depth_range, layer_picture
-from polarguide.export.environment import turned_cubemap
+from polarguide.export.environment import RELIT_RESOLUTION, turned_cubemap
 from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
 from polarguide.optics import aolp, dolp, luminance, stokes
 from polarguide.shading.model import Rows
@@ -23,12 +23,10 @@ from polarguide.surroundings import Surroundings
 from polarguide.viewer.lens import fit
 from polarguide.viewer.shown import Shown
 
-RENDERED = ("final", "diffuse", "specular", "base", "reflection", "strength", "normal", "depth", "alpha")
 MEASURED = ("photograph", "DoLP", "AoLP", "error")
 """Layers that only a photograph's pose has."""
 
 RADIANCE = {"final", "diffuse", "specular", "base", "reflection"}
-TURNED_RESOLUTION = 64
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class Appearance:
     """What a visitor has chosen.
 
     Attributes:
-        layer: a name in ``RENDERED`` or ``MEASURED``.
+        layer: a name in ``LAYERS`` or ``MEASURED``.
         exposure: stops by which radiance is brightened.
         strength: factor on the specular layer.
         turn: degrees of the far environment, counter-clockwise seen from above.
@@ -137,7 +135,7 @@ class Painter:
         light = shown.environment
         if light is None or degrees % 360 == 0 or not isinstance(shown.shading, Shading):
             return light
-        turned = turned_cubemap(light["texels"].detach(), self.around.turn(degrees), TURNED_RESOLUTION)
+        turned = turned_cubemap(light["texels"].detach(), self.around.turn(degrees), RELIT_RESOLUTION)
         return {**light, "texels": turned}
 
     def _layer(

@@ -37,10 +37,6 @@ class Pace:
             return None if self._sharp == self._version else "sharp"
         return None if self._drawn == self._version else "coarse"
 
-    def waits(self, now: float) -> float:
-        """Seconds after which a picture may be wanted that is not wanted now."""
-        return max(0.0, self._changed + REST - now)
-
     def size(self, window: tuple[int, int], kind: str) -> tuple[int, int]:
         """Width and height of the next picture for a window of so many pixels."""
         limit = GREATEST_HEIGHT if kind == "sharp" else round(self._height)

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.viewer.appearance import MEASURED, RENDERED, Appearance, Crop
+from polarguide.shading.result import LAYERS
+from polarguide.viewer.appearance import MEASURED, Appearance, Crop
 
 NOWHERE = "(free)"
 
@@ -43,14 +44,13 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._told = gui.add_markdown("")
         self.pause = gui.add_checkbox("Pause training", False, visible=offer.trains)
-        layers = [n for n in RENDERED if offer.lit or n in ("final", "normal", "depth", "alpha")]
-        measured = MEASURED if offer.views else ()
-        self.layer = gui.add_dropdown("Layer", (*layers, *measured), hint="The last four: at a photograph")
+        layers = [n for n in LAYERS if offer.lit or n in ("final", "normal", "depth", "alpha")]
+        self.layer = gui.add_dropdown("Layer", (*layers, *MEASURED), hint="The last four: at a photograph")
         self.exposure = gui.add_slider("Exposure", -4.0, 4.0, 0.1, 0.0, hint="Stops")
         self.strength = gui.add_slider("Reflection", 0.0, 2.0, 0.05, 1.0, visible=offer.lit)
         hint = "Degrees, what is far away; what stands near stays"
         self.turn = gui.add_slider("Environment", -180, 180, 1, 0, hint=hint, visible=offer.turns)
-        with gui.add_folder("Photographs", visible=bool(offer.views)):
+        with gui.add_folder("Photographs"):
             self.view = gui.add_dropdown("Go to", (NOWHERE, *offer.views))
             self.step = gui.add_button_group("", ("previous", "next"))
             self.frusta = gui.add_checkbox("Show cameras", True)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import socket
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
+from polarguide.export.extras import needed
 from polarguide.shading.render import Shading
 from polarguide.surroundings import surroundings
 from polarguide.viewer.panel import Offer
@@ -40,8 +39,7 @@ class Viewer:
 
     Args:
         look: gives the scene as it is now.
-        photographs: to go to, by name; the first one is where visitors begin.
-        cameras: of the scene, at least one, to find their way about.
+        photographs: of the scene by name, at least one; the first one is where visitors begin.
         lit: whether the recipe learns light. trains: whether ``paused`` is looked at.
         host, port: where to listen; another port is taken if this one is in use.
         title: plain text.
@@ -54,7 +52,6 @@ class Viewer:
         self,
         look: Callable[[], Shown],
         photographs: Mapping[str, Photograph],
-        cameras: Sequence[Camera],
         *,
         lit: bool,
         trains: bool = False,
@@ -62,12 +59,11 @@ class Viewer:
         port: int = 8080,
         title: str = "polarguide",
     ) -> None:
-        viser = _viser()
+        viser = needed("viser", "the viewer", install="'viser>=1.1'")
         # Of pictures for a browser that has just left.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        self._look, self._cameras = look, cameras
-        self._photographs = photographs
-        self._around = surroundings(cameras)
+        self._look, self._photographs = look, photographs
+        self._around = surroundings([photograph.view.camera for photograph in photographs.values()])
         turns = lit and isinstance(look().shading, Shading)
         self._offer = Offer(lit, turns, tuple(photographs), trains)
         self._visitors: dict[int, Visitor] = {}
@@ -90,7 +86,7 @@ class Viewer:
 
     def _arrive(self, client: Any) -> None:
         visitor = Visitor(client, self._photographs, self._around, self._offer, self._wake.set)
-        visitor.arrive(next(iter(self._photographs), None), self._cameras[0])
+        visitor.go(next(iter(self._photographs)))
         with self._lock:
             self._visitors[client.client_id] = visitor
         self._wake.set()
@@ -149,21 +145,11 @@ class Viewer:
             self._server.stop()
 
 
-def _viser() -> Any:
-    try:
-        return importlib.import_module("viser")  # half a second that no other verb needs
-    except ImportError:
-        raise PolarguideError(
-            "the viewer",
-            expected="the Python package viser",
-            found="that it is not installed",
-            remedy="Install it: pip install 'viser>=1.1'.",
-        ) from None
-
-
 def _listening(viser: Any, host: str, port: int, title: str) -> Any:
     if not 0 < port < 65536:
-        raise PolarguideError("--port", expected="1 to 65535", found=str(port), remedy="Choose such a port.")
+        raise PolarguideError(
+            "the port", expected="1 to 65535", found=str(port), remedy="Choose such a port."
+        )
     try:  # viser itself would wait for ever
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as listener:

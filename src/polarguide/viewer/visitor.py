@@ -7,16 +7,15 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 
 from polarguide.camera import Camera
-from polarguide.evaluation.figures import Picture
+from polarguide.evaluation.figures import Picture, png_bytes
 from polarguide.surroundings import Surroundings
 from polarguide.viewer.appearance import Painter
 from polarguide.viewer.frusta import Frusta
 from polarguide.viewer.keys import FRAMES_PER_SECOND, Keys
-from polarguide.viewer.lens import free_camera, quaternion
+from polarguide.viewer.lens import free_camera
 from polarguide.viewer.pace import Pace
 from polarguide.viewer.panel import NOWHERE, Offer, Panel
 from polarguide.viewer.photographs import Photograph
@@ -51,8 +50,9 @@ class Visitor:
         self._place: Place | None = None
         self._screenshot = False
         self._playing: tuple[float, list[Camera]] | None = None
-        first = next(iter(photographs.values())).view.camera if photographs else None
-        self._keys = Keys((first.width, first.height) if first else (640, 480))
+        first = next(iter(photographs.values())).view.camera
+        self._size = first.width, first.height
+        self._keys = Keys(self._size)
         self.panel = Panel(client.gui, offer, self._changed)
         self._frusta = Frusta(client.scene, list(photographs.values()), around, self.go)
         self._connect()
@@ -73,6 +73,7 @@ class Visitor:
         panel.screenshot.on_click(lambda _: self._ask_for_file())
         panel.add_key.on_click(lambda _: self._add_key())
         panel.remove_key.on_click(lambda _: self._remove_key())
+        panel.seconds.on_update(lambda _: self._count_keys())
         panel.play.on_click(lambda _: self._play())
         panel.save_path.on_click(lambda _: self._save_path())
 
@@ -117,7 +118,7 @@ class Visitor:
         self._wake()
 
     def _add_key(self) -> None:
-        camera = self._place.view.camera if self._place else self._camera((640, 480))
+        camera = self._place.view.camera if self._place else self._camera(self._size)
         self._keys.add(camera)
         self._count_keys()
 
@@ -140,6 +141,7 @@ class Visitor:
         if len(path) > 1:
             with self._lock:
                 self._place, self._playing = None, (time.monotonic(), path)
+            self.panel.view.value = NOWHERE
             self._wake()
 
     def _camera(self, size: tuple[int, int]) -> Camera:
@@ -185,7 +187,7 @@ class Visitor:
         self._send(picture, size, sharp=sharp)
         self._frusta.seen_from(None if view else lens.centre.numpy())
         if screenshot and picture is not None:
-            self._client.send_file_download(PICTURE_FILE, _png(picture), save_immediately=True)
+            self._client.send_file_download(PICTURE_FILE, png_bytes(picture), save_immediately=True)
         now = time.monotonic()
         with self._lock:
             self.pace.end(version, kind, now - began, now)
@@ -199,19 +201,3 @@ class Visitor:
             self._client.scene.set_background_image(picture, format="png")
         else:
             self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
-
-    def arrive(self, name: str | None, camera: Camera) -> None:
-        """Begin at a photograph, or else at a camera."""
-        if name is not None:
-            self.go(name)
-            return
-        own = self._client.camera
-        with self._lock, self._client.atomic():
-            own.position = camera.centre.numpy()
-            own.wxyz = np.array(quaternion(camera))
-
-
-def _png(picture: Picture) -> bytes:
-    encoded, data = cv2.imencode(".png", picture[..., ::-1])
-    assert encoded
-    return data.tobytes()
