@@ -1,0 +1,41 @@
+"""Half a turn about x, from our axes (right, down, forward) to those of SPZ (right, up, back)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from random_runs import random_state
+from torch.nn.functional import normalize
+
+from polarguide.export import write_run_ply
+from polarguide.export.spz import _half_turned
+from polarguide.gaussians.geometry import quaternions_to_rotations
+from polarguide.gaussians.ply import read_ply
+from polarguide.gaussians.spherical_harmonics import sh_basis
+
+TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+
+
+def test_the_whole_scene_is_turned(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(1)
+    state, shading = random_state("3dgs", 7)
+    write_run_ply(tmp_path / "run.ply", state, shading)
+    ours = read_ply(tmp_path / "run.ply")
+    turned = read_ply(_half_turned(tmp_path / "run.ply"))
+    torch.testing.assert_close(turned["means"], ours["means"] @ TURN.T)
+    # Both sets of axes span the same ellipsoid.
+    ellipsoids = [
+        quaternions_to_rotations(rows["quaternions"]) * rows["log_scales"].exp()[:, None]
+        for rows in (ours, turned)
+    ]
+    expected, found = (axes @ axes.mT for axes in (TURN @ ellipsoids[0], ellipsoids[1]))
+    torch.testing.assert_close(found, expected)
+    # What is seen along a turned direction is what was seen along the direction.
+    directions = normalize(torch.randn(20, 3, generator=generator), dim=-1)
+    for rest in (ours["sh_rest"], turned["sh_rest"]):
+        assert rest.shape[1] == 15
+        assert bool((rest.abs().amax(dim=(0, 2)) > 1e-3).all()), "every harmonic takes part"
+    before = torch.einsum("dk,nkc->ndc", sh_basis(directions, 3)[:, 1:], ours["sh_rest"])
+    after = torch.einsum("dk,nkc->ndc", sh_basis(directions @ TURN.T, 3)[:, 1:], turned["sh_rest"])
+    torch.testing.assert_close(after, before, atol=1e-5, rtol=1e-4)
