@@ -59,7 +59,8 @@ def test_turning_the_environment_turns_what_a_mirror_shows():
     assert np.array_equal(paint(seen, Appearance(turn=360)), paint(seen))
     # Any turn samples the light anew, so compare with one that is too small to see.
     barely, far = (
-        np.abs(paint(seen, Appearance(turn=degrees)).astype(int) - paint(seen)).mean() for degrees in (0.01, 90)
+        np.abs(paint(seen, Appearance(turn=degrees)).astype(int) - paint(seen)).mean()
+        for degrees in (0.01, 90)
     )
     assert far > 5 * barely
     assert far > 1
