@@ -209,6 +209,14 @@ def test_a_sweep_over_views_shares_its_test_views(spec: SceneSpec, variant: Vari
         verify_scene(folder)
 
 
+def test_a_sweep_over_more_views_than_there_are_is_refused_before_anything_is_rendered(
+    spec: SceneSpec, tmp_path: Path
+) -> None:
+    with pytest.raises(PolarguideError, match=r"up to \d+ training views, found 300.* --views"):
+        sweep_scenes(spec, tmp_path / "s", SETTINGS, Overrides(), Sweep("views", (2.0, 300.0)), Reporter())
+    assert not (tmp_path / "s").exists()
+
+
 def test_members_of_a_sweep_sort_like_their_numbers(
     spec: SceneSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ from polarguide.capture.prepare.reporter import Reporter
 from polarguide.errors import PolarguideError
 from polarguide.synth import folder
 from polarguide.synth.build import build_scene
-from polarguide.synth.cameras import place_cameras
+from polarguide.synth.cameras import held_out_names, place_cameras, view_names
 from polarguide.synth.manifest import verify_scene, write_manifest
 from polarguide.synth.run import synthesise
 from polarguide.synth.schema import SceneSpec
@@ -99,18 +99,19 @@ def _fewer_views(
     spec: SceneSpec, out: Path, settings: SynthSettings, sweep: Sweep, reporter: Reporter, threads: int
 ) -> list[Path]:
     """All members of a sweep over the number of training views."""
-    whole = synthesise(spec, out / "all", settings, reporter, threads=threads)
-    record = json.loads((whole / "scene.json").read_text(encoding="utf-8"))
-    train, tests = record["train"], record["test"]
+    cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
+    by_name = dict(zip(view_names(len(cameras)), cameras, strict=True))
+    tests = held_out_names(list(by_name))
+    train = [name for name in by_name if name not in tests]
     if sweep.values[-1] > len(train):
         raise PolarguideError(
             "--sweep",
             expected=f"up to {len(train)} training views",
             found=f"{sweep.values[-1]:g}",
-            remedy=f"The scene has {len(record['views'])} views; give --views to render more.",
+            remedy=f"The scene has {len(cameras)} views; give --views to render more.",
         )
-    cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
-    by_name = dict(zip(record["views"], cameras, strict=True))
+    whole = synthesise(spec, out / "all", settings, reporter, threads=threads)
+    record = json.loads((whole / "scene.json").read_text(encoding="utf-8"))
     done = []
     for value in sweep.values:
         member = _member(out, sweep, value)
