@@ -14,6 +14,11 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+if dist.is_available():
+    # Its functions have the default group for a default value. Imported once there is a group, as torch's optimisers
+    # import it, it would keep that for good, and the group's threads could abort the interpreter as it ends.
+    import torch.distributed.nn
+
 
 class LostRank(Exception):
     """Another rank does not take part any more."""
