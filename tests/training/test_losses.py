@@ -16,7 +16,6 @@ from polarguide.errors import PolarguideError
 from polarguide.shading.display import srgb_encode
 from polarguide.shading.result import RenderResult
 from polarguide.training.losses import (
-    agreement_loss,
     azimuth_loss,
     chromatic_loss,
     flatness_loss,
@@ -143,21 +142,6 @@ def test_chromatic_loss_has_a_weight_of_its_own(priors: ViewPriors) -> None:
     assert float(chromatic_loss(-priors.chromatic, none)) == 0
 
 
-def test_agreement_loss_is_what_scatter_takes_from_the_length() -> None:
-    alpha, weight = torch.full(SIZE, 0.8), torch.ones(SIZE)
-    assert float(agreement_loss(0.8 * unit(0), alpha, weight)) == pytest.approx(0.0, abs=1e-6)
-    assert float(agreement_loss(0.3 * unit(0), alpha, weight)) == pytest.approx(0.5, rel=1e-5)
-    assert float(agreement_loss(0.3 * unit(0), alpha, 0.2 * weight)) == pytest.approx(0.1, rel=1e-5)
-    # Two normals of equal weight: following the gradient brings them together.
-    pair = torch.stack((unit(1), unit(2))).requires_grad_()
-    before = agreement_loss(pair.mean(dim=0), torch.ones(SIZE), weight)
-    before.backward()
-    assert pair.grad is not None
-    with torch.no_grad():
-        after = normalize(pair - 10 * pair.grad, dim=-1)
-    assert float(agreement_loss(after.mean(dim=0), torch.ones(SIZE), weight)) < float(before.detach())
-
-
 def test_stokes_loss_is_zero_for_the_layers_and_normals_that_were_measured(priors: ViewPriors) -> None:
     rendered = result(specular=LAYERS[0], diffuse=LAYERS[1], normal=0.7 * FACING)
     assert float(stokes_loss(rendered, priors, 1.5)) == pytest.approx(0.0, abs=1e-6)
@@ -209,7 +193,6 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         normal=0.3,
         azimuth=0.4,
         chromatic=0.6,
-        agreement=0.8,
         flatness=0.9,
         stokes=1.1,
     )
@@ -227,7 +210,6 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         + 0.3 * normal_loss(rendered.normal, priors)
         + 0.4 * azimuth_loss(rendered.normal, priors)
         + 0.6 * chromatic_loss(rendered.normal, priors)
-        + 0.8 * agreement_loss(rendered.normal, rendered.alpha, priors.weight)
         + 0.9 * flatness_loss(SCALES, rendered.radii, 2.0)
         + 1.1 * stokes_loss(rendered, priors, 1.5)
     )

@@ -8,7 +8,7 @@ import pytest
 
 from polarguide.errors import PolarguideError
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
-from polarguide.training.stages import Recipe, Repeat, Schedule, Stage
+from polarguide.training.stages import Recipe, Repeat, Schedule, Stage, Weights
 
 EVERY_RECIPE = pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES.keys())
 
@@ -85,10 +85,25 @@ def test_harmonics_begin_at_their_shares() -> None:
 
 def test_rate_of_the_means_decays_to_its_last_share() -> None:
     schedule = Schedule(RECIPE, 101)
-    assert schedule.means_rate(0) == pytest.approx(2.0)
-    assert schedule.means_rate(50) == pytest.approx(1.0)
-    assert schedule.means_rate(100) == pytest.approx(0.5)
-    assert Schedule(RECIPE, 1).means_rate(0) == pytest.approx(2.0)
+    assert [schedule.rates(step)["means"] for step in (0, 50, 100)] == pytest.approx([2.0, 1.0, 0.5])
+    assert Schedule(RECIPE, 1).rates(0) == {"means": 2.0}
+
+
+def test_a_stage_changes_the_rates_that_it_names_while_it_lasts() -> None:
+    first, second, third = RECIPE.stages
+    slow = replace(second, rate_factors={"quaternions": 0.25})
+    recipe = replace(
+        RECIPE, stages=(first, slow, third), rates={"means": 2.0, "quaternions": 8.0, "sh_dc": 3.0}
+    )
+    schedule = Schedule(recipe, 100)
+    assert [schedule.rates(step)["quaternions"] for step in (0, 19, 20, 69, 70, 99)] == [8, 8, 2, 2, 8, 8]
+    assert all(schedule.rates(step)["sh_dc"] == 3 for step in range(100))
+    assert schedule.rates(30)["means"] == Schedule(RECIPE, 100).rates(30)["means"]
+
+
+def test_eased_weights_leave_the_picture_its_own() -> None:
+    weights = Weights(photometric=0.5, azimuth=0.4, stokes=2.0)
+    assert weights.eased(0.25) == Weights(photometric=0.5, azimuth=0.1, stokes=0.5)
 
 
 @pytest.mark.parametrize("share", [0.4, 0.6])
@@ -111,6 +126,7 @@ def test_every_recipe_is_named_told_and_trains_what_it_renders(recipe: Recipe) -
     assert recipe.about.endswith(".")
     core = {"means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest"}
     assert core <= set(recipe.rates)
+    assert all(set(stage.rate_factors) <= set(recipe.rates) for stage in recipe.stages)
     side = "strength_logits" if recipe.directional is None else "log_albedo"
     assert (side in recipe.rates) == recipe.reflects
     assert "texels" in recipe.environment_rates

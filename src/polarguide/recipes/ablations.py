@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from typing import Any
 
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
@@ -15,7 +16,7 @@ def varied(
     name: str,
     about: str,
     *,
-    weights: dict[str, float] | None = None,
+    weights: Callable[[Weights], Weights] | None = None,
     priors: dict[str, Any] | None = None,
     without: Action | None = None,
     **fields: Any,
@@ -23,14 +24,14 @@ def varied(
     """A recipe named ``base:name`` that differs from ``base`` in what is given.
 
     Args:
-        weights: new values in every stage that has polarization terms.
+        weights: the new weights from the old ones, in every stage that has polarization terms.
         priors: new values of its ``Priors``.
         without: an action that does not happen. (Priors are then computed once, when they are first needed.)
         fields: new values of the recipe itself.
     """
 
     def weights_of(old: Weights) -> Weights:
-        return replace(old, **(weights or {})) if old.priors else old
+        return weights(old) if weights and old.priors else old
 
     stages = tuple(
         replace(
@@ -45,7 +46,28 @@ def varied(
     return replace(base, name=f"{base.name}:{name}", about=about, stages=stages, priors=changed, **fields)
 
 
-_NORMAL_TERMS_OFF = {"normal": 0.0, "azimuth": 0.0, "chromatic": 0.0, "agreement": 0.0, "consistency": 0.0}
+def off(*names: str) -> Callable[[Weights], Weights]:
+    """Weights without the terms of these names."""
+    return lambda old: replace(old, **dict.fromkeys(names, 0.0))
+
+
+def firm_to_the_end(base: Recipe) -> Recipe:
+    """``base:without-easing``: the final stage keeps the weights and the rates of the guided one before it."""
+    *before, final = base.stages
+    kept = {
+        name: getattr(before[-1].weights, name)
+        for name in asdict(final.weights)
+        if getattr(final.weights, name)
+    }
+    return replace(
+        base,
+        name=f"{base.name}:without-easing",
+        about="Polarization weighs as much in the final stage as before, and rotations learn as fast.",
+        stages=(*before, replace(final, weights=replace(final.weights, **kept), rate_factors={})),
+    )
+
+
+_NORMAL_TERMS_OFF = off("normal", "azimuth", "chromatic", "consistency")
 
 ABLATIONS_3DGS_DR: tuple[Recipe, ...] = (
     replace(
@@ -64,7 +86,7 @@ ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE,
         "only-normals",
         "Polarization normals alone: no term on the separated layers.",
-        weights={"specular": 0.0, "diffuse": 0.0},
+        weights=off("specular", "diffuse"),
     ),
     varied(
         RECIPE_POLARGUIDE,
@@ -88,7 +110,7 @@ ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE,
         "without-azimuth-weighting",
         "Zenith trusted like azimuth, in the choice and in the term.",
-        weights={"azimuth": 0.0, "normal": 0.15},
+        weights=lambda old: replace(old, azimuth=0.0, normal=old.azimuth),
         priors={"azimuth_weight": 0.0},
     ),
     varied(
@@ -107,26 +129,21 @@ ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE,
         "without-colour",
         "Nothing is read from the polarization of colour differences.",
-        weights={"chromatic": 0.0},
+        weights=off("chromatic"),
         priors={"chromatic": False},
     ),
-    varied(
-        RECIPE_POLARGUIDE,
-        "without-agreement",
-        "The normals that a pixel blends need not agree.",
-        weights={"agreement": 0.0},
-    ),
+    firm_to_the_end(RECIPE_POLARGUIDE),
     varied(
         RECIPE_POLARGUIDE,
         "without-consistency",
         "Normals need not agree with the depth.",
-        weights={"consistency": 0.0},
+        weights=off("consistency"),
     ),
     varied(
         RECIPE_POLARGUIDE,
         "without-flatness",
         "Gaussians need not be flat.",
-        weights={"flatness": 0.0},
+        weights=off("flatness"),
     ),
 )
 
@@ -135,13 +152,13 @@ ABLATIONS_STOKES: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE_STOKES,
         "without-stokes",
         "S1 and S2 are not rendered.",
-        weights={"stokes": 0.0},
+        weights=off("stokes"),
     ),
     varied(
         RECIPE_POLARGUIDE_STOKES,
         "without-separation",
         "No term on the separated layers.",
-        weights={"specular": 0.0, "diffuse": 0.0},
+        weights=off("specular", "diffuse"),
     ),
     varied(
         RECIPE_POLARGUIDE_STOKES,
@@ -173,19 +190,14 @@ ABLATIONS_STOKES: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE_STOKES,
         "without-colour",
         "Nothing is read from the polarization of colour differences.",
-        weights={"chromatic": 0.0},
+        weights=off("chromatic"),
         priors={"chromatic": False},
     ),
-    varied(
-        RECIPE_POLARGUIDE_STOKES,
-        "without-agreement",
-        "The normals that a pixel blends need not agree.",
-        weights={"agreement": 0.0},
-    ),
+    firm_to_the_end(RECIPE_POLARGUIDE_STOKES),
     varied(
         RECIPE_POLARGUIDE_STOKES,
         "without-consistency",
         "Normals need not agree with the depth.",
-        weights={"consistency": 0.0},
+        weights=off("consistency"),
     ),
 )

@@ -6,6 +6,7 @@ difference between the two is a difference of supervision.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
@@ -16,7 +17,13 @@ REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)
 _PLAIN = Stage("plain", 0.1, reflection=False, densify=True)
 
 
-def _stages(guided: Weights, final: Weights, *, oriented: bool = False) -> tuple[Stage, ...]:
+def _stages(
+    guided: Weights,
+    final: Weights,
+    *,
+    final_rates: Mapping[str, float] | None = None,
+    oriented: bool = False,
+) -> tuple[Stage, ...]:
     """The paper's three stages; the guided one first with, then without density control."""
     enter: tuple[Action, ...] = ("refresh_priors",)
     orient: tuple[Action, ...] = ("orient_normals",) if oriented else ()
@@ -32,11 +39,21 @@ def _stages(guided: Weights, final: Weights, *, oriented: bool = False) -> tuple
             on_enter=enter,
         ),
         Stage("guided", 0.35, reflection=True, weights=guided, repeats=(REFRESH,)),
-        Stage("final", 0.15, reflection=True, weights=final, on_enter=orient + enter),
+        Stage(
+            "final",
+            0.15,
+            reflection=True,
+            weights=final,
+            on_enter=orient + enter,
+            rate_factors=final_rates or {},
+        ),
     )
 
 
-_GEOMETRY_TERMS = Weights(azimuth=0.15, chromatic=0.05, agreement=0.1, flatness=0.1, consistency=0.05)
+_GEOMETRY_TERMS = Weights(azimuth=0.15, chromatic=0.05, flatness=0.3, consistency=0.1)
+# Last comes the picture: what guided it so far now only holds it, and normals that no longer turn fast keep still.
+_HOLD = 0.2
+_HELD = {"quaternions": _HOLD}
 
 RECIPE_POLARGUIDE: Recipe = replace(
     RECIPE_3DGS_DR,
@@ -44,7 +61,8 @@ RECIPE_POLARGUIDE: Recipe = replace(
     about="The paper's three stages with repaired physics: physical candidates, azimuth, exact separation.",
     stages=_stages(
         replace(_GEOMETRY_TERMS, specular=0.5, diffuse=0.2),
-        _GEOMETRY_TERMS,
+        _GEOMETRY_TERMS.eased(_HOLD),
+        final_rates=_HELD,
     ),
     # An ideal sensor tells the azimuth down to a DoLP of a percent; noise has its own mask.
     priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0, snr=3.0, chromatic=True),
@@ -58,7 +76,8 @@ RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     about="Renders the measurement: S1 and S2 of Fresnel-weighted layers, with local reflections.",
     stages=_stages(
         replace(_STOKES_TERMS, specular=0.25, diffuse=0.1),
-        _STOKES_TERMS,
+        _STOKES_TERMS.eased(_HOLD),
+        final_rates=_HELD,
         oriented=True,
     ),
     oriented=True,

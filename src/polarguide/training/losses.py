@@ -45,19 +45,6 @@ def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
     return ((1 - cosine) * priors.chromatic_weight).sum() / priors.chromatic_weight.sum().clamp(min=1)
 
 
-def agreement_loss(normal: Tensor, alpha: Tensor, weight: Tensor) -> Tensor:
-    """Mean by which blended normals are shorter than their weights allow: 0 where all of a pixel agree.
-
-    Normals that scatter blend to one that leans to the camera, since each is turned to face it. This term pulls
-    each towards the mean of its pixel, and does not say where that points: it belongs where something else does.
-
-    Args:
-        normal: [H, W, 3] blended unit normals. alpha: [H, W] the sum of the blending weights. weight: [H, W].
-    """
-    length = torch.sqrt(dot(normal, normal) + 1e-8)
-    return (weight * (alpha.detach() - length).clamp(min=0)).mean()
-
-
 def stokes_loss(result: RenderResult, priors: ViewPriors, index: float) -> Tensor:
     """Mean distance of the predicted S1 and S2 from the measured ones, over the square root of S0.
 
@@ -168,6 +155,4 @@ def _prior_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssi
         total = total + weights.azimuth * azimuth_loss(result.normal, priors)
     if weights.chromatic and result.normal is not None:
         total = total + weights.chromatic * chromatic_loss(result.normal, priors)
-    if weights.agreement and result.normal is not None:
-        total = total + weights.agreement * agreement_loss(result.normal, result.alpha, priors.weight)
     return total

@@ -5,7 +5,8 @@ Nothing in the loop compares a step with a constant: boundaries are fractions of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Literal
 
 from polarguide.gaussians.densify import Densification
@@ -45,7 +46,6 @@ class Weights:
         azimuth: distance of the normal from the plane of incidence that the AoLP names (azimuth alone).
         chromatic: 1 - cosine with the normal that colour differences tell, where they do.
         stokes: S1 and S2 that the layers and the normal predict against the measured ones.
-        agreement: how far the normals that a pixel blends disagree, where polarization says something.
         flatness: shortest scale of the Gaussians, in percent of the scene's extent.
         consistency: alpha - cosine of the blended normal with that of the rendered depth.
     """
@@ -57,7 +57,6 @@ class Weights:
     azimuth: float = 0.0
     chromatic: float = 0.0
     stokes: float = 0.0
-    agreement: float = 0.0
     flatness: float = 0.0
     consistency: float = 0.0
 
@@ -65,12 +64,17 @@ class Weights:
     def priors(self) -> bool:
         """Whether a term compares with the priors of a view."""
         layers = self.specular, self.diffuse, self.stokes
-        return any((*layers, self.normal, self.azimuth, self.chromatic, self.agreement))
+        return any((*layers, self.normal, self.azimuth, self.chromatic))
 
     @property
     def normals(self) -> bool:
         """Whether a term looks at the rendered normals."""
-        return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.agreement, self.consistency))
+        return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.consistency))
+
+    def eased(self, share: float) -> Weights:
+        """Every term but the photometric one at ``share`` of its weight."""
+        terms = {name: share * weight for name, weight in asdict(self).items()}
+        return Weights(**{**terms, "photometric": self.photometric})
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,7 @@ class Stage:
         densify: whether the density control runs.
         repeats: what happens every so often in it.
         on_enter: what happens at its first step.
+        rate_factors: on the recipe's learning rates while it lasts, by name; 1 where not named.
     """
 
     name: str
@@ -94,6 +99,7 @@ class Stage:
     densify: bool = False
     repeats: tuple[Repeat, ...] = ()
     on_enter: tuple[Action, ...] = ()
+    rate_factors: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -242,6 +248,9 @@ class Schedule:
         """SH degree in use at a step."""
         return sum(step >= f * self.steps for f in self.recipe.sh_fractions)
 
-    def means_rate(self, step: int) -> float:
-        """Learning rate of the means at a step, before the scene's extent."""
-        return self.recipe.rates["means"] * self.recipe.means_decay ** (step / max(1, self.steps - 1))
+    def rates(self, step: int) -> dict[str, float]:
+        """Learning rates at a step by name; that of the means is before the scene's extent."""
+        factors = self.at(step).stage.rate_factors
+        rates = {name: rate * factors.get(name, 1.0) for name, rate in self.recipe.rates.items()}
+        rates["means"] *= self.recipe.means_decay ** (step / max(1, self.steps - 1))
+        return rates

@@ -165,23 +165,24 @@ class Trainer:
             torch._foreach_div_(gradients, float(views))
 
     def _use_batch_rates(self) -> None:
-        """Learning rates and decays for more than one view a step; see ``TrainSettings``."""
+        """What the optimisers need for more than one view a step; see ``TrainSettings``."""
         views = self.settings.views_per_step
         if views == 1:
             return
         betas = (0.9**views, 0.999**views)
         self.state.rows.set_betas(betas)
-        for name, rate in self.recipe.rates.items():
-            self.state.rows.set_rate(name, rate * self._rate)
         if self.state.environment is not None:
             rates = {name: rate * self._rate for name, rate in self.recipe.environment_rates.items()}
             self.state.environment.retune(rates, betas)
 
     def _optimise(self) -> None:
-        state, rates = self.state, self.recipe.rates
-        state.rows.set_rate("means", self.schedule.means_rate(state.step) * self._extent * self._rate)
-        resting = state.step < state.opacity_frozen_until
-        state.rows.set_rate("opacity_logits", 0.0 if resting else rates["opacity_logits"] * self._rate)
+        state = self.state
+        rates = self.schedule.rates(state.step)
+        rates["means"] *= self._extent
+        if state.step < state.opacity_frozen_until:
+            rates["opacity_logits"] = 0.0
+        for name, rate in rates.items():
+            state.rows.set_rate(name, rate * self._rate)
         state.rows.step()
         if state.environment is not None:
             state.environment.step()
