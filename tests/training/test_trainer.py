@@ -127,6 +127,18 @@ def test_any_step_can_be_resumed_from(
     assert different(state.tensors(), whole.state.tensors()) == []
 
 
+def test_what_a_stage_gives_no_rate_rests_in_it(tiny_scene: Scene) -> None:
+    recipe = RECIPES["3dgs"]
+    first, last = recipe.stages
+    resting = dataclasses.replace(last, rate_factors={"quaternions": 0.0, "means": 0.0})
+    recipe = dataclasses.replace(recipe, stages=(first, resting))
+    trainer, _ = train(tiny_scene, recipe, until=STEPS // 2)
+    before = trainer.state.rows.snapshot()
+    trainer.run(lambda _: None, until=STEPS // 2 + 3)
+    after = trainer.state.rows.snapshot()
+    assert sorted(set(before) - set(different(before, after))) == ["means", "quaternions"]
+
+
 def test_the_seed_decides(tiny_scene: Scene, busy_recipe: Recipe) -> None:
     first, _ = train(tiny_scene, busy_recipe, until=20)
     again, _ = train(tiny_scene, busy_recipe, until=20)
