@@ -8,7 +8,7 @@ import pytest
 
 from polarguide.errors import PolarguideError
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
-from polarguide.training.stages import Recipe, Repeat, Schedule, Stage, Weights
+from polarguide.training.stages import Recipe, Repeat, Schedule, Stage
 
 EVERY_RECIPE = pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES.keys())
 
@@ -99,11 +99,6 @@ def test_a_stage_changes_the_rates_that_it_names_while_it_lasts() -> None:
     assert [schedule.rates(step)["quaternions"] for step in (0, 19, 20, 69, 70, 99)] == [8, 8, 2, 2, 8, 8]
     assert all(schedule.rates(step)["sh_dc"] == 3 for step in range(100))
     assert schedule.rates(30)["means"] == Schedule(RECIPE, 100).rates(30)["means"]
-
-
-def test_eased_weights_leave_the_picture_its_own() -> None:
-    weights = Weights(photometric=0.5, azimuth=0.4, stokes=2.0)
-    assert weights.eased(0.25) == Weights(photometric=0.5, azimuth=0.1, stokes=0.5)
 
 
 @pytest.mark.parametrize("share", [0.4, 0.6])

@@ -62,7 +62,7 @@ def firm_to_the_end(base: Recipe) -> Recipe:
     return replace(
         base,
         name=f"{base.name}:without-easing",
-        about="Polarization weighs as much in the final stage as before, and rotations learn as fast.",
+        about="Every term weighs as much in the final stage as before, and rotations learn as fast.",
         stages=(*before, replace(final, weights=replace(final.weights, **kept), rate_factors={})),
     )
 

@@ -50,34 +50,34 @@ def _stages(
     )
 
 
-_GEOMETRY_TERMS = Weights(azimuth=0.15, chromatic=0.05, flatness=0.3, consistency=0.1)
-# Last comes the picture: what guided it so far now only holds it, and normals that no longer turn fast keep still.
-_HOLD = 0.2
-_HELD = {"quaternions": _HOLD}
+_MEASURED = Weights(azimuth=0.15, chromatic=0.05)
+_GUIDED = replace(_MEASURED, flatness=0.3, consistency=0.1)
+# Last comes the picture: what is measured of the normals holds, what keeps the geometry in order lets go, and rotations
+# come to rest.
+_FINAL = replace(_MEASURED, flatness=0.06, consistency=0.02)
+_SLOW = {"quaternions": 0.2}
 
 RECIPE_POLARGUIDE: Recipe = replace(
     RECIPE_3DGS_DR,
     name="polarguide",
     about="The paper's three stages with repaired physics: physical candidates, azimuth, exact separation.",
     stages=_stages(
-        replace(_GEOMETRY_TERMS, specular=0.5, diffuse=0.2),
-        _GEOMETRY_TERMS.eased(_HOLD),
-        final_rates=_HELD,
+        replace(_GUIDED, specular=0.5, diffuse=0.2),
+        _FINAL,
+        final_rates=_SLOW,
     ),
     # An ideal sensor tells the azimuth down to a DoLP of a percent; noise has its own mask.
     priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0, snr=3.0, chromatic=True),
 )
-
-_STOKES_TERMS = replace(_GEOMETRY_TERMS, stokes=1.0)
 
 RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     RECIPE_POLARGUIDE,
     name="polarguide-stokes",
     about="Renders the measurement: S1 and S2 of Fresnel-weighted layers, with local reflections.",
     stages=_stages(
-        replace(_STOKES_TERMS, specular=0.25, diffuse=0.1),
-        _STOKES_TERMS.eased(_HOLD),
-        final_rates=_HELD,
+        replace(_GUIDED, specular=0.25, diffuse=0.1, stokes=1.0),
+        replace(_FINAL, stokes=0.2),
+        final_rates=_SLOW,
         oriented=True,
     ),
     oriented=True,

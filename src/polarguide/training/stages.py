@@ -6,7 +6,7 @@ Nothing in the loop compares a step with a constant: boundaries are fractions of
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Literal
 
 from polarguide.gaussians.densify import Densification
@@ -70,11 +70,6 @@ class Weights:
     def normals(self) -> bool:
         """Whether a term looks at the rendered normals."""
         return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.consistency))
-
-    def eased(self, share: float) -> Weights:
-        """Every term but the photometric one at ``share`` of its weight."""
-        terms = {name: share * weight for name, weight in asdict(self).items()}
-        return Weights(**{**terms, "photometric": self.photometric})
 
 
 @dataclass(frozen=True)
