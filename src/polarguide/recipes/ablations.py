@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
@@ -52,18 +52,14 @@ def off(*names: str) -> Callable[[Weights], Weights]:
 
 
 def firm_to_the_end(base: Recipe) -> Recipe:
-    """``base:without-easing``: the final stage keeps the weights and the rates of the guided one before it."""
+    """``base:without-easing``: the final stage keeps rates and weights (but those of the layers) of the guided one."""
     *before, final = base.stages
-    kept = {
-        name: getattr(before[-1].weights, name)
-        for name in asdict(final.weights)
-        if getattr(final.weights, name)
-    }
+    weights = off("specular", "diffuse")(before[-1].weights)
     return replace(
         base,
         name=f"{base.name}:without-easing",
         about="Every term weighs as much in the final stage as before, and rotations learn as fast.",
-        stages=(*before, replace(final, weights=replace(final.weights, **kept), rate_factors={})),
+        stages=(*before, replace(final, weights=weights, rate_factors={})),
     )
 
 
