@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
@@ -158,6 +158,41 @@ def test_an_ablation_changes_something_and_is_found_by_its_name() -> None:
             same = replace(recipe, name=base, about=RECIPES[base].about)
             assert same != RECIPES[base], recipe.name
             Schedule(recipe, 1000)
+
+
+@pytest.mark.parametrize(
+    ("name", "terms"),
+    [
+        ("polarguide:only-normals", {"specular", "diffuse"}),
+        ("polarguide:without-normals", {"azimuth", "chromatic", "consistency"}),
+        ("polarguide:without-colour", {"chromatic"}),
+        ("polarguide:without-flatness", {"flatness"}),
+        ("polarguide-stokes:without-stokes", {"stokes"}),
+        ("polarguide-stokes:without-separation", {"specular", "diffuse"}),
+        ("polarguide-stokes:without-normals", {"azimuth", "chromatic", "consistency"}),
+        ("polarguide-stokes:without-consistency", {"consistency"}),
+    ],
+)
+def test_an_ablation_switches_off_its_terms_in_every_stage_and_no_other(name: str, terms: set[str]) -> None:
+    base, variation = RECIPES[name.partition(":")[0]], recipe_named(name)
+    changed: set[str] = set()
+    for old, new in zip(base.stages, variation.stages, strict=True):
+        before, after = asdict(old.weights), asdict(new.weights)
+        assert all(after[term] == 0 for term in terms)
+        changed |= {term for term in before if before[term] != after[term]}
+        assert replace(new, weights=old.weights) == old
+    assert changed == terms
+
+
+@pytest.mark.parametrize("base", ["polarguide", "polarguide-stokes"])
+def test_without_easing_the_final_stage_goes_on_as_the_one_before_it(base: str) -> None:
+    recipe = recipe_named(f"{base}:without-easing")
+    *before, guided, final = recipe.stages
+    assert [*before, guided] == list(RECIPES[base].stages[:-1])
+    assert final.weights == replace(guided.weights, specular=0.0, diffuse=0.0)
+    assert final.rate_factors == {}
+    eased = RECIPES[base].stages[-1]
+    assert replace(final, weights=eased.weights, rate_factors=eased.rate_factors) == eased
 
 
 def test_an_unknown_recipe_is_refused_with_the_names_there_are() -> None:
