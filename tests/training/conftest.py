@@ -6,7 +6,7 @@ import pytest
 from tiny import make_busy_recipe, make_scene
 
 from polarguide.capture import Scene
-from polarguide.training.stages import Recipe
+from polarguide.training.recipe import Recipe
 
 
 @pytest.fixture(scope="session")
