@@ -15,10 +15,10 @@ from camera_files import mosaic as seen_through
 from damage import EVERYWHERE, colmap_binary, duplicate, patched
 from dataset_files import write_gnerp, write_neisf, write_nersp, write_pandora, write_pisr
 
+from polarguide import files
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
 from polarguide.preparation import PrepareSettings, prepare_scene
-from polarguide.preparation import folder as folder_module
 
 PLAIN = PrepareSettings(poses="none", gains="none")
 MOSAIC = replace(PLAIN, sensor="IMX250MYR")
@@ -146,7 +146,7 @@ def test_full_and_read_only_disks(
             raise OSError(code, os.strerror(code))
         replace_file(source, target)
 
-    monkeypatch.setattr(folder_module.os, "replace", fail)
+    monkeypatch.setattr(files.os, "replace", fail)
     text = refused(tmp_path / "in", tmp_path / "out", case.settings)
     assert said in text
     assert "goes on where it stopped" in text

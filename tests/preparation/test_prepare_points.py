@@ -12,7 +12,7 @@ from camera_files import behind, smooth_light, write_shots
 from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
-from polarguide.capture.colmap.model import triangulate as points_module
+from polarguide.capture.colmap import triangulate as points_module
 from polarguide.capture.colmap.sample import region_samples
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.errors import PolarguideError

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from camera_files import ANGLES, behind, smooth_light, write_model, write_mosaics, write_shots
 
+from polarguide import files
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration, read_calibration
 from polarguide.errors import PolarguideError
@@ -195,7 +196,7 @@ def test_a_full_disk_and_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             raise OSError(errno.ENOSPC, "No space left on device")
         replace_file(source, target)
 
-    monkeypatch.setattr(folder_module.os, "replace", full)
+    monkeypatch.setattr(files.os, "replace", full)
     text = refused(tmp_path / "in", tmp_path / "out", MOSAIC)
     assert "No space left on device" in text
     assert "goes on where it stopped" in text

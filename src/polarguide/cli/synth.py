@@ -54,7 +54,7 @@ def synth(
         spacing: Degrees between neighboring views on a ring.
         sweep: A family of scenes, such as views=9,18,36,63 or noise=0,1,2,4; also roughness, index and spacing.
         color: Three channels with exact values, or a sampled spectrum.
-        truth: Views that get ground truth.
+        ground_truth: Views that get ground truth.
         threads: Threads to use; 0 takes all cores.
     """
     use_threads(threads)

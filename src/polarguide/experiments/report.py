@@ -12,6 +12,7 @@ from typing import Any
 from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash
 from polarguide.experiments.tables import Block, ShownCell, blocks, notes, shown_columns
 from polarguide.visualization.embedded import LAYERS, EmbeddedView
+from polarguide.visualization.figures import color_gradient
 
 ERROR_HIGH = 0.25
 """Mean absolute difference of shown pictures that is brightest in the error map."""
