@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from polarguide.cli.common import open_run
+from polarguide.api import open_run
 from polarguide.color import srgb_encode
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.gaussians.ply import read_ply
@@ -31,11 +31,11 @@ def main() -> None:
     opened, file = open_run(run), read_ply(sys.argv[2] if len(sys.argv) > 2 else run / PLY)
     scores = []
     for view in opened.scene.test_views:
-        result = opened.render(view)
+        result = opened.result(view.camera).to("cpu")
         colors = evaluate_sh(
             file["means"], view.camera.center, file["sh_dc"][:, 0].contiguous(), file["sh_rest"], 3
         )
-        baked = opened.backend.rasterize(
+        baked = opened.model.backend.rasterize(
             file["means"],
             file["quaternions"],
             file["log_scales"].exp(),

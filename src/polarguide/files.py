@@ -30,6 +30,15 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def make_folder(path: Path) -> None:
+    """Create a folder and those above it, unless it exists.
+
+    Raises:
+        PolarguideError: it cannot be created.
+    """
+    guarded(lambda: path.mkdir(parents=True, exist_ok=True), path)
+
+
 def write_whole(path: Path, data: bytes) -> int:
     """Write a file that is there completely or not at all; returns its size.
 

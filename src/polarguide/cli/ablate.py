@@ -7,10 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.common import Transfer
 from polarguide.cli.compare import compare
 from polarguide.errors import PolarguideError
-from polarguide.raster import DeviceName
+from polarguide.options import DeviceName, Transfer
 from polarguide.recipes import ABLATIONS
 
 

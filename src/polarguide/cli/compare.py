@@ -12,17 +12,18 @@ from typing import Annotated, Any
 import tyro
 
 from polarguide.capture.view import listed
-from polarguide.cli.common import Transfer, console, use_threads
+from polarguide.cli.console import console
 from polarguide.cli.job_progress import JobProgress
-from polarguide.cli.train import check_count, checked_settings
 from polarguide.errors import PolarguideError
 from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
 from polarguide.experiments.jobs import STDERR, Job, run_jobs
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
 from polarguide.experiments.report_views import REPORT, write_report
 from polarguide.experiments.study import read_study, study_svg
-from polarguide.raster import DeviceName, choose_backend
+from polarguide.options import DeviceName, Transfer, check_count
+from polarguide.raster import choose_backend, use_threads
 from polarguide.recipes import recipe_named
+from polarguide.training.settings import TrainSettings
 
 LOCK, STUDY = ".lock", "study.svg"
 
@@ -74,15 +75,15 @@ def compare(
         raise PolarguideError(
             "--recipes", expected="every name once", found=" ".join(recipes), remedy="Name each once."
         )
-    for name, count in (("--seeds", seeds), ("--threads", threads), ("--jobs", jobs or 1)):
+    for name, count in (("seeds", seeds), ("threads", threads), ("jobs", jobs or 1)):
         check_count(name, count)
-    check_count("--report-views", report_views + 1)
+    check_count("report_views", report_views, 0)
     choose_backend(device)
     run_comparison(
         Comparison(
             scenes=scenes,
             recipes=chosen,
-            settings=checked_settings(steps, 0, refractive_index),
+            settings=TrainSettings(steps, 0, refractive_index),
             seeds=seeds,
             downscale=downscale,
             transfer=transfer,

@@ -11,7 +11,7 @@ from typing import Any
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from polarguide.cli.common import console
+from polarguide.cli.console import console
 from polarguide.experiments.jobs import Child, Job
 from polarguide.runs.folder import LOG
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-import cv2
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from polarguide.capture.calibration import Calibration, read_calibration
-from polarguide.cli.common import console, use_threads
+import polarguide
+from polarguide.cli.console import console
+from polarguide.cli.progress import REPORTER
 from polarguide.errors import PolarguideError
-from polarguide.preparation import ORIGINS, PrepareSettings, Reporter, prepare_scene
+from polarguide.options import ThreadOptions
 
 
 def prepare(
@@ -53,7 +51,7 @@ def prepare(
     refine_intrinsics: bool = False,
     masks: Path | None = None,
     seed: int = 0,
-    threads: int = 0,
+    machine: ThreadOptions = ThreadOptions(),
 ) -> None:
     """Camera files to a scene folder: raw mosaics, shots through a rotating filter, published datasets.
 
@@ -91,22 +89,20 @@ def prepare(
         refine_intrinsics: Let SfM change the focal lengths and distortion given.
         masks: Folder of object masks called like the views; SfM looks at their white parts alone.
         seed: Seed of SfM.
-        threads: Threads for the pictures; 0 takes all cores, as SfM always does.
     """
-    use_threads(threads)
-    if threads:
-        cv2.setNumThreads(threads)
-    settings = PrepareSettings(
+    polarguide.use_threads(machine.threads)
+    preparation = import_module("polarguide.preparation")
+    settings = preparation.PrepareSettings(
         format=format, sensor=sensor, packing=packing, width=width, height=height, bits=bits,
         offset_x=offset_x, offset_y=offset_y, black_level=black_level,
         dark_frame=None if dark_frame is None else os.path.realpath(dark_frame), saturation=saturation,
         white_balance=white_balance, demosaic=demosaic, interpolation=interpolation, register=register,
         transfer=transfer, align=align, gains=gains, calibration=_calibration(calibration, order, sense, zero),
-        poses=poses if poses in ORIGINS else os.path.realpath(poses), matching=matching, seed=seed,
+        poses=poses if poses in preparation.ORIGINS else os.path.realpath(poses), matching=matching, seed=seed,
         sfm_pictures=sfm_pictures, intrinsics=intrinsics, refine_intrinsics=refine_intrinsics,
         masks=None if masks is None else os.path.realpath(masks),
     )  # fmt: skip
-    done = prepare_scene(source, out, settings, ConsoleReporter())
+    done = polarguide.prepare(source, out, settings=settings, reporter=REPORTER)
     without = f", {len(done.left_out)} left out" if done.left_out else ""
     console.print(f"scene: {done.folder} ({len(done.views)} views{without})", markup=False)
     if done.posed:
@@ -115,30 +111,10 @@ def prepare(
         console.print("it has no poses: repeat the command with --poses sfm or --poses PATH", markup=False)
 
 
-class ConsoleReporter(Reporter):
-    """Messages and progress bars on the console."""
-
-    def say(self, text: str) -> None:
-        """A finding, as a plain sentence."""
-        console.print(text, markup=False)
-
-    def warn(self, text: str) -> None:
-        """Something the user should know before going on."""
-        console.print("[yellow]warning:[/] ", end="")
-        console.print(text, markup=False)
-
-    @contextlib.contextmanager
-    def track(self, label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-        """A progress bar."""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console, transient=True) as progress:
-            task = progress.add_task(label, total=total)
-            yield lambda done: progress.update(task, completed=done)
-
-
-def _calibration(path: Path | None, order: str | None, sense: str | None, zero: float | None) -> Calibration:
+def _calibration(path: Path | None, order: str | None, sense: str | None, zero: float | None) -> Any:
     """The calibration file, if any, with the flags over it."""
-    found = Calibration() if path is None else read_calibration(path)
+    module = import_module("polarguide.capture.calibration")
+    found = module.Calibration() if path is None else module.read_calibration(path)
     if order is not None:
         try:
             first, second, third, fourth = (int(angle) for angle in order.split(","))

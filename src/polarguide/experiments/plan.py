@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from polarguide import __version__
-from polarguide.cli.common import Transfer, read_scene
-from polarguide.cli.evaluate import METRICS
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import validate_metrics
+from polarguide.evaluation.evaluate import METRICS
 from polarguide.evaluation.sources import scoring_digest, training_digest
-from polarguide.raster import DeviceName
+from polarguide.options import DeviceName, SceneOptions, Transfer
 from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration, recipe_data
+from polarguide.runs.opened import read_scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import TrainSettings
 
@@ -146,7 +146,7 @@ def scene_entries(comparison: Comparison) -> list[SceneEntry]:
     """
     entries: list[SceneEntry] = []
     for path in comparison.scenes:
-        scene = read_scene(path, downscale=comparison.downscale, transfer=comparison.transfer)
+        scene = read_scene(path, SceneOptions(comparison.downscale, comparison.transfer))
         if scene.name in [entry.name for entry in entries]:
             raise PolarguideError(
                 path,

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.cli.common import OpenRun, console, open_run, read_scene
 from polarguide.evaluation.metrics import normal_angles_deg
 from polarguide.experiments.curves import Curve, read_curve
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
 from polarguide.experiments.report import ERROR_HIGH, NORMAL_ERROR_HIGH, report_html
 from polarguide.files import atomic
+from polarguide.options import SceneOptions
+from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import EmbeddedView, Tile, chosen_views, embed
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
@@ -80,9 +81,8 @@ def _embed_scene(
     remarks: list[str],
 ) -> None:
     """Append the views of one scene, and what there is to say about them."""
-    console.print(f"report: pictures of {entry.name}")
-    scene = read_scene(entry.path, downscale=comparison.downscale, transfer=comparison.transfer)
-    opened = [open_run(run.folder, device=comparison.device, scene=scene) for run in runs]
+    scene = read_scene(entry.path, SceneOptions(comparison.downscale, comparison.transfer))
+    opened = [OpenedRun.open(run.folder, device=comparison.device, scene=scene) for run in runs]
     scores = [(run.metrics() or {})["views"] for run in runs]
     for name in names:
         tiles = [_truth_tile(scene, name)]
@@ -98,9 +98,9 @@ def _truth_tile(scene: Scene, name: str) -> Tile:
     return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
 
 
-def _tile(opened: OpenRun, view: View, scores: Mapping[str, float | None]) -> Tile:
+def _tile(opened: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
     """What one run shows of one view."""
-    result = opened.render(view)
+    result = opened.result(view.camera).to("cpu")
     pictures: dict[str, Picture] = {}
     for layer in ("final", "diffuse", "specular", "normal"):
         picture = layer_picture(result, layer, view.camera)

@@ -28,7 +28,9 @@ def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor
     """
     gaussians = state.gaussians
     columns = []
-    normals = shortest_axis_normals(gaussians["means"], gaussians["quaternions"], gaussians["log_scales"], torch.zeros(3))
+    normals = shortest_axis_normals(
+        gaussians["means"], gaussians["quaternions"], gaussians["log_scales"], torch.zeros(3)
+    )
     for direction in directions.to(gaussians["means"].device):
         # A camera far behind each Gaussian sees it along one direction.
         rays = direction.expand(len(gaussians), 3)
@@ -49,7 +51,8 @@ def write_run_ply(path: Path, state: TrainingState, shading: ShadingModel) -> No
         lambda directions: shown_colors(state, shading, directions).cpu(), len(gaussians)
     )
     plain = {
-        name: gaussians[name].detach().cpu() for name in ("means", "log_scales", "quaternions", "opacity_logits")
+        name: gaussians[name].detach().cpu()
+        for name in ("means", "log_scales", "quaternions", "opacity_logits")
     }
     with atomic(path) as temporary:
         write_ply(

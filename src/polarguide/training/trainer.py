@@ -50,6 +50,9 @@ class Trainer:
         backend: device and rasterizer.
         state: where to go on from, on the backend's device; None: from the beginning.
         ranks: the processes that share the views of each step.
+
+    Attributes:
+        whole: whether the state is one between two steps; an exception may leave it in the middle of a change.
     """
 
     def __init__(
@@ -63,6 +66,7 @@ class Trainer:
     ) -> None:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
         self.ranks, self._device = ranks, backend.device
+        self.whole = True
         self.schedule = Schedule(recipe, settings.steps)
         self.state = state or first_state(scene, recipe, settings, backend.device)
         self._rate = math.sqrt(settings.views_per_step)
@@ -86,11 +90,13 @@ class Trainer:
         """One optimizer step."""
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
+        self.whole = not position.actions
         for action in position.actions:
             self._act(action)
         mine = self.ranks.slots(views)
         # A rank without a view looks at the first one, so that it knows what has gradients, and adds nothing.
         measured = [self._look(slot, position.stage, bool(mine)) for slot in mine or range(1)]
+        self.whole = False
         self._join_gradients(idle=not mine)
         self._optimize()
         told = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
@@ -109,6 +115,7 @@ class Trainer:
                 limit=self._limit,
                 generator=seeded(self.settings.seed, 2, state.step),
             )
+        self.whole = True
         return report
 
     def exchange_statistics(self) -> None:
@@ -148,6 +155,7 @@ class Trainer:
         loss.backward()
         if counts and statistic is not None and statistic.gradient is not None:
             size = view.camera.width, view.camera.height
+            self.whole = False
             state.statistics.add(statistic.gradient, result.radii, *size, slot)
         return torch.stack((photometric.detach(), _psnr(result.final, shown.picture), loss.detach()))
 

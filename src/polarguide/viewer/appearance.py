@@ -10,9 +10,9 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import View
-from polarguide.export.environment import RELIT_RESOLUTION, turned_cubemap
 from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
 from polarguide.optics import aolp, dolp, luminance, stokes
+from polarguide.rendering.relight import RELIT_RESOLUTION, turned_cubemap
 from polarguide.scene_frame import SceneFrame
 from polarguide.shading.deferred import Shading
 from polarguide.shading.model import Parameters

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
+from polarguide.options import LOOPBACK
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.deferred import Shading
 from polarguide.viewer.panel import Offer
@@ -19,7 +20,6 @@ from polarguide.viewer.photographs import Photograph
 from polarguide.viewer.shown import Shown
 from polarguide.viewer.visitor import Visitor
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 REFRESH = 1.0  # seconds between pictures of a training at least,
 SHARE = 10.0  # and at least this many times as long as the last one took
 TICK = 0.02

@@ -11,7 +11,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.raster.interface import Rasterize
-from polarguide.runs.opened import TrainedRun
+from polarguide.runs.opened import OpenedRun
 from polarguide.shading.deferred import render
 from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
@@ -51,11 +51,11 @@ class Shown:
         ).to("cpu")
 
 
-def shown_run(run: TrainedRun) -> Shown:
+def shown_run(run: OpenedRun) -> Shown:
     """A trained run."""
-    gaussians = run.state.gaussians
-    status = f"{run.recipe.name}, {run.state.step:,} steps; {len(gaussians):,} Gaussians"
-    return Shown(gaussians, run.environment, run.shading, run.backend.rasterize, 3, status)
+    model = run.model
+    status = f"{run.recipe.name}, {run.steps:,} steps; {len(model):,} Gaussians"
+    return Shown(model.state.gaussians, model.light, model.shading, model.backend.rasterize, 3, status)
 
 
 def shown_training(trainer: Trainer) -> Shown:

@@ -1,4 +1,4 @@
-"""The learned environment as a panorama, and panoramas as environments.
+"""Other light for a run; the learned environment as a panorama, and panoramas as environments.
 
 A panorama [H, 2 H, 3] is upright in the scene: row i, column j look at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
 cameras' common level and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle, to the right. Files hold linear
@@ -17,7 +17,9 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from polarguide.errors import PolarguideError, optional_import
-from polarguide.scene_frame import SceneFrame
+from polarguide.progress import SILENT, Reporter
+from polarguide.runs.opened import OpenedRun
+from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
 from polarguide.shading.deferred import Shading
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, ShadingModel
@@ -26,6 +28,39 @@ LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
 """Texels along the sides of a cubemap that is made of another light, or of the learned one turned."""
 _NO_LIGHT = 1e-4  # radiance of black, so that its logarithm is finite
+
+
+def relight(
+    run: OpenedRun, panorama: Path | None = None, degrees: float = 0.0, *, reporter: Reporter = SILENT
+) -> None:
+    """Put a panorama in the learned environment's place, or turn it, in the run as it is in memory.
+
+    Args:
+        run: the run; its scene is read.
+        panorama: file of linear radiance (.hdr, .exr), to be reflected in place of the learned environment.
+        degrees: by which to turn the environment, counter-clockwise seen from above.
+        reporter: told what stays as it was learned.
+
+    Raises:
+        PolarguideError: the recipe learns no radiance, or the file cannot be read.
+    """
+    if panorama is None and degrees % 360 == 0:
+        return
+    what = "rotate_environment" if panorama is None else "environment"
+    if not math.isfinite(degrees):
+        raise PolarguideError(what, expected="degrees", found=str(degrees), remedy="Give a number.")
+    light = run.model.light
+    shading = needs_radiance(run.model.shading, lit=light is not None, what=what)
+    assert light is not None
+    around = scene_frame(list(run.cameras.values()))
+    if panorama is not None:
+        texels = texels_of(read_panorama(panorama), shading, around, RELIT_RESOLUTION)
+        light["texels"] = texels.to(light["texels"].device)
+    light["texels"] = turned_cubemap(light["texels"].detach(), around.turn(degrees), RELIT_RESOLUTION)
+    if shading.local:
+        reporter.say(
+            "note: what stands near is reflected by light of the Gaussians' own, which stays as it was learned"
+        )
 
 
 def needs_radiance(shading: ShadingModel, *, lit: bool, what: str) -> Shading:
