@@ -21,8 +21,8 @@ from polarguide.capture.write import encoded_png, picture_codes
 from polarguide.errors import PolarguideError
 from polarguide.files import guarded, write_whole
 from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import FileOrder, swaps
-from polarguide.inspection.pictures import Capture
 from polarguide.records import parse_json
 
 SIDES = ("sparse", "masks", "invalid", "gt", "split.json")
