@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from polarguide.camera import Camera
 from polarguide.inspection.capture import Capture, InspectedView
 
-NEIGHBOURS = 4
+NEIGHBORS = 4
 FEATURES = 3000
 FEWEST_MATCHES = 15
 RATIO = 0.75
@@ -72,7 +72,7 @@ def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     apart = apart / max(float(np.median(apart)), 1e-12) + 2 * (1 - axes @ axes.T)
     np.fill_diagonal(apart, np.inf)
-    near = np.argsort(apart, axis=1)[:, : min(NEIGHBOURS, len(cameras) - 1)]
+    near = np.argsort(apart, axis=1)[:, : min(NEIGHBORS, len(cameras) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row})
 
 

@@ -17,7 +17,7 @@ from polarguide.capture.formats.pictures import read_file
 from polarguide.capture.layout import contents
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
-from polarguide.capture.write import encoded_png, picture_codes
+from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import guarded, write_whole
 from polarguide.inspection.angle_checks import Angles
@@ -125,12 +125,9 @@ def _turn_view(capture: Capture, change: Calibration, folder: Path, view: str) -
     full = int(np.iinfo(data.peak.dtype).max)
     lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
     turned = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
-    for angle, codes in zip(ANGLES, picture_codes(turned, lost), strict=True):
-        write_whole(folder / "polar" / f"{view}_{angle:03d}.png", encoded_png(codes[..., ::-1]))
-    (folder / "invalid").mkdir(exist_ok=True)
     for old in (folder / "invalid").glob(f"{view}.*"):
         old.unlink()
-    write_whole(folder / "invalid" / f"{view}.png", encoded_png(lost.astype(np.uint8) * 255))
+    write_view(folder, view, intensity_codes(turned, lost), lost)
 
 
 def _sidecar(capture: Capture, change: Calibration) -> bytes:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.pictures import read_file
-from polarguide.capture.view import ANGLES
-from polarguide.capture.write import encoded_png, picture_codes
+from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import guarded, write_whole
 from polarguide.records import parse_json
@@ -125,14 +124,7 @@ class SceneFolder:
         mask: NDArray[np.bool_] | None = None,
     ) -> None:
         """Write the pictures of a view, then note it."""
-        files = {}
-        for angle, codes in zip(ANGLES, picture_codes(intensities, invalid), strict=True):
-            files[f"polar/{view}_{angle:03d}.png"] = codes[..., ::-1]
-        files[f"invalid/{view}.png"] = invalid.astype(np.uint8) * 255
-        if mask is not None:
-            guarded(lambda: (self.root / "masks").mkdir(exist_ok=True), self.root)
-            files[f"masks/{view}.png"] = mask.astype(np.uint8) * 255
-        sizes = {name: write_whole(self.root / name, encoded_png(pixels)) for name, pixels in files.items()}
+        sizes = write_view(self.root, view, intensity_codes(intensities, invalid), invalid, mask)
         self.views[view] = {**record, "files": sizes}
         self.save()
 

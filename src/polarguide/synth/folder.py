@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.view import ANGLES
+from polarguide.capture.write import picture_name
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
+from polarguide.files import guarded, write_whole
 from polarguide.synth.mesh import Array
 
 REQUEST = "request.json"
@@ -53,24 +54,17 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a whole file or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(data)
-    os.replace(part, path)
+    """Write a file completely or not at all, and its folder if it is missing.
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
+    guarded(lambda: path.parent.mkdir(parents=True, exist_ok=True), path.parent)
+    write_whole(path, data)
 
 
-def write_picture(path: Path, values: NDArray[Any]) -> None:
-    """Write a PNG, gray or RGB."""
-    color = values[..., ::-1] if values.ndim == 3 else values
-    done, data = cv2.imencode(".png", np.ascontiguousarray(color))
-    if not done:
-        raise OSError(f"{path}: PNG encoding failed")
-    write_file(path, data.tobytes())
-
-
-def picture_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.uint16]:
-    """The four pictures behind a polarizer, [4, H, W, 3].
+def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.uint16]:
+    """The four pictures behind a polarizer as a 12-bit sensor stores them, [4, H, W, 3].
 
     Args:
         stokes: [3, H, W, 3], full scale 1.
@@ -90,7 +84,7 @@ def clipped_share(out: Path, names: Sequence[str]) -> float:
 
 def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[Path]:
     """All files of a view; it is finished when they exist."""
-    files = [out / "polar" / f"{name}_{angle:03d}.png" for angle in ANGLES]
+    files = [out / picture_name(name, angle) for angle in ANGLES]
     files += [out / "gt" / f"{name}.npz"] if ground_truth else []
     return files + ([out / "raw" / f"{name}.png"] if raw else [])
 
