@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from polarguide.capture.metadata import refractive_index_of
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.errors import PolarguideError
-from polarguide.records import parse_json
+from polarguide.records import read_record
 
 LONGEST = 640
 """Pixels of the longer side that pictures are averaged down to (by whole factors)."""
@@ -120,9 +121,7 @@ def read_capture(
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     sidecar = root / "scene.json"
-    index = refractive_index_of(
-        sidecar, parse_json(sidecar, read_file(sidecar)) if sidecar.exists() else None
-    )
+    index = refractive_index_of(sidecar, read_record(sidecar, dict[str, Any]) if sidecar.exists() else None)
     factor = downscale or _fitting_factor(layout, names[0])
     data: list[ViewData] = []
 

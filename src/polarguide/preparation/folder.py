@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.pictures import read_file
 from polarguide.capture.view import ANGLES
 from polarguide.capture.write import encoded_png, picture_codes
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
-from polarguide.records import parse_json
+from polarguide.files import make_folder, write_bytes
+from polarguide.records import read_record
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
@@ -63,7 +62,7 @@ class SceneFolder:
             )
 
     def _go_on(self, path: Path) -> None:
-        state = parse_json(path, read_file(path)).get("prepare")
+        state = read_record(path, dict[str, Any]).get("prepare")
         if not isinstance(state, dict) or not isinstance(state.get("request"), dict):
             raise PolarguideError(
                 self.root,
@@ -90,18 +89,18 @@ class SceneFolder:
 
     def start(self) -> None:
         """Create the folder and take note of the request."""
-        guarded(lambda: (self.root / "polar").mkdir(parents=True, exist_ok=True), self.root)
-        guarded(lambda: (self.root / "invalid").mkdir(exist_ok=True), self.root)
+        make_folder(self.root / "polar")
+        make_folder(self.root / "invalid")
         self.save()
         (self.root / SCENE).unlink(missing_ok=True)
 
     def save(self) -> None:
         """Write the journal."""
-        write_whole(self.root / JOURNAL, _json({"prepare": self._state()}))
+        write_bytes(self.root / JOURNAL, _json({"prepare": self._state()}))
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Write ``scene.json``, the sign that the scene is whole, and drop the journal."""
-        write_whole(self.root / SCENE, _json({**summary, "prepare": self._state()}))
+        write_bytes(self.root / SCENE, _json({**summary, "prepare": self._state()}))
         (self.root / JOURNAL).unlink(missing_ok=True)
 
     def has(self, view: str, warp: object) -> bool:
@@ -130,9 +129,9 @@ class SceneFolder:
             files[f"polar/{view}_{angle:03d}.png"] = codes[..., ::-1]
         files[f"invalid/{view}.png"] = invalid.astype(np.uint8) * 255
         if mask is not None:
-            guarded(lambda: (self.root / "masks").mkdir(exist_ok=True), self.root)
+            make_folder(self.root / "masks")
             files[f"masks/{view}.png"] = mask.astype(np.uint8) * 255
-        sizes = {name: write_whole(self.root / name, encoded_png(pixels)) for name, pixels in files.items()}
+        sizes = {name: write_bytes(self.root / name, encoded_png(pixels)) for name, pixels in files.items()}
         self.views[view] = {**record, "files": sizes}
         self.save()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from polarguide.capture.view import ANGLES
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
+from polarguide.files import make_folder, write_bytes
 from polarguide.synth.mesh import Array
 
 REQUEST = "request.json"
@@ -54,10 +54,8 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
 
 def write_file(path: Path, data: bytes) -> None:
     """Write a whole file or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(data)
-    os.replace(part, path)
+    make_folder(path.parent)
+    write_bytes(path, data)
 
 
 def write_picture(path: Path, values: NDArray[Any]) -> None:
