@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.inspection.angle_checks import order_check, weigh, zero_check
+from polarguide.inspection.capture import Capture, read_capture
 from polarguide.inspection.orders import ORDERS
 from polarguide.inspection.picture_checks import pairing_of, picture_checks
-from polarguide.inspection.pictures import Capture, read_capture
 from polarguide.inspection.points import point_evidence
 from polarguide.inspection.readings import read_view_figures
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polarguide.inspection.pictures import Capture, read_capture
+from polarguide.inspection.capture import Capture, read_capture
 
 ANGLES = (0, 45, 90, 135)
 

@@ -14,9 +14,9 @@ from polarguide.capture.calibration import Calibration, oriented
 from polarguide.errors import PolarguideError
 from polarguide.inspection import fix
 from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.capture import read_capture
 from polarguide.inspection.likelihood import Odds
 from polarguide.inspection.orders import ORDERS, PAIRINGS
-from polarguide.inspection.pictures import read_capture
 
 
 def decided(order: int, offset: float = 0.0, error: float = 0.1, p: float = 0.99, pairing: int = 0) -> Angles:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from captures import encode, gained, one_view, write_scene
 
+from polarguide.inspection.capture import read_capture
 from polarguide.inspection.orders import PAIRINGS
 from polarguide.inspection.picture_checks import pairing_of, picture_checks
-from polarguide.inspection.pictures import read_capture
 from polarguide.inspection.readings import read_view_figures
 from polarguide.inspection.verdict import Check
 

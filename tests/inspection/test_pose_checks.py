@@ -11,8 +11,8 @@ from captures import write_scene
 from glossy_ball import camera_at
 
 from polarguide.inspection import pose_checks
+from polarguide.inspection.capture import Capture, read_capture
 from polarguide.inspection.epipolar import PairError, _fundamental, epipolar_errors, view_errors
-from polarguide.inspection.pictures import Capture, read_capture
 
 
 def test_projections_of_one_point_lie_on_each_others_epipolar_lines() -> None:

@@ -20,8 +20,8 @@ from polarguide.capture.write import encoded_png, picture_codes
 from polarguide.errors import PolarguideError
 from polarguide.files import write_whole, writing
 from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import FileOrder, swaps
-from polarguide.inspection.pictures import Capture
 from polarguide.records import read_record
 
 SIDES = ("sparse", "masks", "invalid", "gt", "split.json")

@@ -13,10 +13,10 @@ from typing import Literal
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
 from polarguide.inspection.angle_checks import Angles, handedness_check, order_check, weigh, zero_check
+from polarguide.inspection.capture import Capture, InspectedView, read_capture
 from polarguide.inspection.dielectric import dielectric_check
 from polarguide.inspection.likelihood import Evidence
 from polarguide.inspection.picture_checks import pairing_of, picture_checks
-from polarguide.inspection.pictures import Capture, Pictures, read_capture
 from polarguide.inspection.points import point_evidence
 from polarguide.inspection.pose_checks import coverage_check, pose_check
 from polarguide.inspection.readings import Readings, read_view_figures
@@ -177,7 +177,7 @@ def _trained_pixels(
         )
     with track("comparing with normals", len(names)) as advance:
 
-        def surfaces() -> Iterator[tuple[Pictures, Surface]]:
+        def surfaces() -> Iterator[tuple[InspectedView, Surface]]:
             for done, view in enumerate(capture.posed):
                 yield view, surface_of(state, scene.view(view.name), backend)
                 advance(done + 1)

@@ -8,8 +8,8 @@ import numpy as np
 
 from polarguide.capture import checks
 from polarguide.capture.view import FULL_CODE, listed
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import PAIRINGS, swaps
-from polarguide.inspection.pictures import Capture
 from polarguide.inspection.readings import POLARIZED, Readings
 from polarguide.inspection.verdict import Check, Verdict
 

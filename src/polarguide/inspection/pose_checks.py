@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.view import listed
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.epipolar import epipolar_errors, view_errors
-from polarguide.inspection.pictures import Capture
 from polarguide.inspection.verdict import Check, Verdict
 
 TYPICAL_PX, VIEW_PX = 2.0, 2.0
