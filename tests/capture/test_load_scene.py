@@ -188,7 +188,7 @@ def test_arguments_out_of_range(capture: TinyCapture, arguments: dict[str, objec
     ("name", "text", "message"),
     [
         ("split.json", "{", r"split.json: expected a JSON file, found broken JSON"),
-        ("split.json", "[]", r"split.json: expected a JSON object \{...\}, found a JSON list"),
+        ("split.json", "[]", r"split.json: expected a JSON object \{...\}, found \[\]"),
         ("split.json", '{"tests": []}', r"split.json: expected \{\"test\".*found the keys tests"),
         ("split.json", '{"test": [3]}', r"split.json: expected \{\"test\".*found"),
         ("split.json", '{"test": ["v000", "v0010"]}', r"split.json \(test\).*found 'v0010'.*v001"),

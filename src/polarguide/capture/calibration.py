@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.pictures import read_file
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
-from polarguide.records import parse_json
+from polarguide.records import read_record
 
 Gains = tuple[float, float, float, float]
 UNIT_GAINS: Gains = (1.0, 1.0, 1.0, 1.0)
@@ -92,7 +91,7 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         PolarguideError: the file cannot be read, has unknown keys or values that make no sense.
     """
-    content = parse_json(path, read_file(path))
+    content = read_record(path, dict[str, Any])
     unknown = sorted(content.keys() - {"gains", "order", "sense", "zero"})
     try:
         if unknown:

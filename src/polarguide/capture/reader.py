@@ -21,7 +21,7 @@ from polarguide.capture.metadata import held_out, refractive_index_of
 from polarguide.capture.view import Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, read_view
 from polarguide.errors import PolarguideError
-from polarguide.records import parse_json
+from polarguide.records import decode
 
 _THREADS = 4
 
@@ -185,7 +185,7 @@ def _check_downscale(downscale: int) -> None:
 
 def _read_json(files: Files, path: Path) -> dict[str, Any] | None:
     """The JSON object in a file, or None if there is no such file."""
-    return parse_json(path, files.read(path)) if path.exists() else None
+    return decode(files.read(path), dict[str, Any], path) if path.exists() else None
 
 
 def _largest_value(data: Sequence[ViewData]) -> int:

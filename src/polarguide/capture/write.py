@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.view import ANGLES, FULL_CODE
-from polarguide.files import guarded, write_whole
+from polarguide.files import make_folder, write_whole
 
 
 def intensity_codes(intensities: NDArray[np.float32], invalid: NDArray[np.bool_]) -> NDArray[np.uint16]:
@@ -72,5 +72,5 @@ def write_png(path: Path, pixels: NDArray[Any]) -> int:
     done, data = cv2.imencode(".png", np.ascontiguousarray(stored))
     if not done:
         raise OSError(f"{path}: the picture cannot be encoded")
-    guarded(lambda: path.parent.mkdir(parents=True, exist_ok=True), path.parent)
+    make_folder(path.parent)
     return write_whole(path, data.tobytes())

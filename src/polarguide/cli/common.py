@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.capture import Scene, View, load_scene
+from polarguide.cli.console import console as console
 from polarguide.errors import PolarguideError
 from polarguide.raster import DeviceName
 from polarguide.runs.folder import recipe_data
@@ -20,8 +20,6 @@ from polarguide.runs.opened import TrainedRun, open_trained
 from polarguide.shading.result import RenderResult
 
 Transfer = Literal["linear", "srgb"]
-
-console = Console(highlight=False, soft_wrap=True)
 
 
 def use_threads(threads: int) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from polarguide.cli.common import console, use_threads
-from polarguide.cli.prepare import ConsoleReporter
+from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.synth.manifest import MANIFEST, scene_digest
 from polarguide.synth.render import synthesize

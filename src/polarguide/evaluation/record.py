@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.scores import MEAN_KEYS, PERFECT_PSNR, ViewScores, score_view, summarize
+from polarguide.files import write_text
 
 __all__ = [
     "PROVENANCE_KEYS",
@@ -67,9 +67,7 @@ def write_metrics(
     }
     validate_metrics(record, where=path)
     text = json.dumps(record, indent=2, allow_nan=False) + "\n"
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)
+    write_text(path, text)
     return record
 
 

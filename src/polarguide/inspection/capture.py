@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
-from polarguide.records import parse_json
+from polarguide.records import read_record
 
 LONGEST = 640
 """Pixels of the longer side that pictures are averaged down to (by whole factors)."""
@@ -114,7 +115,7 @@ def read_capture(
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
     index = refractive_index_of(
-        metadata, parse_json(metadata, read_file(metadata)) if metadata.exists() else None
+        metadata, read_record(metadata, dict[str, Any]) if metadata.exists() else None
     )
     factor = downscale or _fitting_factor(layout, names[0])
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, progress=progress)

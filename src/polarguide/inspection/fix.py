@@ -13,17 +13,16 @@ import numpy as np
 
 from polarguide import __version__
 from polarguide.capture.calibration import Calibration, oriented
-from polarguide.capture.formats.pictures import read_file
 from polarguide.capture.layout import contents
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
+from polarguide.files import write_whole, writing
 from polarguide.inspection.angle_checks import Angles
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import FileOrder, swaps
-from polarguide.records import parse_json
+from polarguide.records import read_record
 
 SIDES = ("sparse", "masks", "invalid", "gt", "split.json")
 """What is copied as it is, beside the pictures."""
@@ -78,10 +77,11 @@ def fix_scene(
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        guarded(lambda: _write(capture, change, partial, advance), out)
-        if out.is_dir():
-            out.rmdir()
-        guarded(lambda: os.replace(partial, out), out)
+        with writing(out):
+            _write(capture, change, partial, advance)
+            if out.is_dir():
+                out.rmdir()
+            os.replace(partial, out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return described(change)
@@ -133,7 +133,7 @@ def _turn_view(capture: Capture, change: Calibration, folder: Path, view: str) -
 def _sidecar(capture: Capture, change: Calibration) -> bytes:
     """``scene.json`` of the copy: that of the scene, and a note on what was changed."""
     path = capture.root / SCENE
-    content: dict[str, Any] = parse_json(path, read_file(path)) if path.exists() else {}
+    content: dict[str, Any] = read_record(path, dict[str, Any]) if path.exists() else {}
     note = {
         "program": f"polarguide {__version__}",
         "from": capture.name,

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.pictures import read_file
 from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
-from polarguide.records import parse_json
+from polarguide.files import make_folder, write_whole
+from polarguide.records import read_record
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
@@ -62,7 +61,7 @@ class SceneFolder:
             )
 
     def _go_on(self, path: Path) -> None:
-        state = parse_json(path, read_file(path)).get("prepare")
+        state = read_record(path, dict[str, Any]).get("prepare")
         if not isinstance(state, dict) or not isinstance(state.get("request"), dict):
             raise PolarguideError(
                 self.root,
@@ -89,8 +88,8 @@ class SceneFolder:
 
     def start(self) -> None:
         """Create the folder and take note of the request."""
-        guarded(lambda: (self.root / "polar").mkdir(parents=True, exist_ok=True), self.root)
-        guarded(lambda: (self.root / "invalid").mkdir(exist_ok=True), self.root)
+        make_folder(self.root / "polar")
+        make_folder(self.root / "invalid")
         self.save()
         (self.root / SCENE).unlink(missing_ok=True)
 

@@ -13,7 +13,7 @@ from polarguide.capture.colmap.sfm import reconstruct, tone_mapped
 from polarguide.capture.colmap.triangulate import add_points
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.write import write_png
-from polarguide.files import guarded
+from polarguide.files import make_folder
 from polarguide.preparation.folder import SFM, SceneFolder
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
 from polarguide.preparation.source import Source
@@ -80,7 +80,7 @@ class Workshop:
             shutil.rmtree(self._root, ignore_errors=True)  # of an earlier call with other poses
             known.clear()
         for path in (images, masks):
-            guarded(lambda path=path: path.mkdir(parents=True, exist_ok=True), path)  # type: ignore[misc]
+            make_folder(path)
         with self._reporter.track("photographs", len(views)) as advance:
             for count, view in enumerate(views, 1):
                 path = images / f"{view}.png"

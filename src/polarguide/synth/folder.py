@@ -15,7 +15,7 @@ from polarguide.capture.view import ANGLES
 from polarguide.capture.write import picture_name
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
+from polarguide.files import make_folder, write_whole
 from polarguide.synth.mesh import Array
 
 REQUEST = "request.json"
@@ -59,7 +59,7 @@ def write_file(path: Path, data: bytes) -> None:
     Raises:
         PolarguideError: the file cannot be written.
     """
-    guarded(lambda: path.parent.mkdir(parents=True, exist_ok=True), path.parent)
+    make_folder(path.parent)
     write_whole(path, data)
 
 

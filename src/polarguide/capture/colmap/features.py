@@ -18,7 +18,7 @@ import pycolmap
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.write import write_png
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded
+from polarguide.files import make_folder, writing
 from polarguide.progress import Reporter
 
 _POLL_SECONDS = 0.5
@@ -112,11 +112,12 @@ def match_features(
 def _named_for_colmap(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
     """Copies of the masks as ``<view>.png.png``, which COLMAP expects; white for views without, which it would skip."""
     named = masks.with_name("colmap_masks")
-    guarded(lambda: named.mkdir(exist_ok=True), named)
+    make_folder(named)
     for view, (width, height) in sizes.items():
         mask, wanted = masks / f"{view}.png", named / f"{view}.png.png"
         if mask.exists():
-            guarded(lambda mask=mask, wanted=wanted: shutil.copyfile(mask, wanted), wanted)  # type: ignore[misc]
+            with writing(wanted):
+                shutil.copyfile(mask, wanted)
         else:
             write_png(wanted, np.full((height, width), 255, np.uint8))
     return named

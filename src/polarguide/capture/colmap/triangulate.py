@@ -19,9 +19,9 @@ from polarguide.capture.colmap.visual_hull import colmap_camera, sample_visual_h
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_file
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
+from polarguide.files import make_folder, write_whole, writing
 from polarguide.progress import Reporter
-from polarguide.records import parse_json
+from polarguide.records import read_record
 
 FEWEST = 200
 """With fewer triangulated points than this, points are sampled in the visual hull instead."""
@@ -60,12 +60,13 @@ def add_points(
     """
     model, note = folder / "model", folder / FOUND
     if model.is_dir() and note.exists():
-        return model, parse_json(note, read_file(note))
+        return model, read_record(note, dict[str, Any])
     start, trial = folder / "start", folder / "triangulated"
     for path in (start, trial):
         shutil.rmtree(path, ignore_errors=True)
-        guarded(lambda path=path: path.mkdir(parents=True), path)  # type: ignore[misc]
-    guarded(lambda: write_cameras(start, cameras), start)
+        make_folder(path)
+    with writing(start):
+        write_cameras(start, cameras)
     count, error = _triangulated(folder, start, trial, cameras, matching, seed, reporter)
     found: dict[str, Any] = {"from": "triangulation with fixed poses", "count": count}
     if error is not None:
@@ -76,7 +77,8 @@ def add_points(
         reporter.say(
             f"The poses came without points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
         )
-    guarded(lambda: _replace(model, trial), model)
+    with writing(model):
+        _replace(model, trial)
     write_whole(note, (json.dumps(found) + "\n").encode())
     return model, found
 
@@ -102,7 +104,8 @@ def _triangulated(
         numbers = match_features(
             database, images, sizes, matching=matching, seed=seed, reporter=reporter, cameras=cameras
         )
-        guarded(lambda: write_cameras(start, cameras, numbers), start)
+        with writing(start):
+            write_cameras(start, cameras, numbers)
         model = load_model(start, ".bin")
         options = pycolmap.IncrementalPipelineOptions()
         for part in (options, options.mapper, options.triangulation):
@@ -150,7 +153,7 @@ def _sample(
     for place, color in zip(places, _colors(folder, cameras, places), strict=True):
         model.add_point3D(place, pycolmap.Track(), color)
     shutil.rmtree(trial, ignore_errors=True)
-    guarded(trial.mkdir, trial)
+    make_folder(trial)
     model.write_binary(str(trial))
     reporter.warn(
         f"The poses came without points, and only {triangulated} could be triangulated (fewer than {FEWEST}): "
