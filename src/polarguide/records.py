@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -54,7 +55,10 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         record = msgspec.convert(value, kind)
         _require_finite(msgspec.to_builtins(record, enc_hook=str), where, remedy)
     except msgspec.ValidationError as error:
-        raise _fault(str(error), value, kind, where, remedy) from None
+        field, expected, found = _fault(str(error), value, kind)
+        raise PolarguideError(
+            f"{where} ({field})" if field else where, expected=expected, found=found, remedy=remedy
+        ) from None
     except (ValueError, RecursionError) as error:
         raise PolarguideError(
             where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
@@ -62,13 +66,36 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
     return record
 
 
+def check_options(options: Any) -> None:
+    """Check the values of a dataclass of options against its annotations.
+
+    Raises:
+        PolarguideError: one has another type or is out of range; the message names it as the command line does.
+    """
+    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    for name, value in values.items():
+        _require_finite(value, option_name(name), "Correct the value.")
+    try:
+        msgspec.convert(values, type(options), from_attributes=True)
+    except msgspec.ValidationError as error:
+        field, expected, found = _fault(str(error), values, type(options))
+        raise PolarguideError(
+            option_name(field), expected=expected, found=found, remedy="Correct the value."
+        ) from None
+
+
+def option_name(field: str) -> str:
+    """The command line's option that sets a field."""
+    return "--" + field.replace("_", "-")
+
+
 def to_json(content: Any) -> bytes:
     """A record as the text of a JSON file."""
     return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
 
 
-def _fault(message: str, value: Any, kind: Any, where: object, remedy: str) -> PolarguideError:
-    """msgspec's message in plain words, with the value at its path."""
+def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
+    """Field, what was expected there and what was found, from a message of msgspec's."""
     what, _, path = message.partition(" - at `$")
     what, _, got = what.partition(", got ")
     path = path.rstrip("`")
@@ -90,9 +117,7 @@ def _fault(message: str, value: Any, kind: Any, where: object, remedy: str) -> P
         expected = "a number of usual size"
     elif what.startswith("Invalid enum value"):
         expected = " or ".join(str(choice) for choice in _choices(form))
-    return PolarguideError(
-        f"{where} ({field})" if field else where, expected=expected, found=found, remedy=remedy
-    )
+    return field, expected, found
 
 
 def shortened(value: Any, most: int = 100) -> str:

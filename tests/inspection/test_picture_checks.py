@@ -38,10 +38,10 @@ def test_a_sound_capture_is_not_flagged(tmp_path) -> None:
     [
         (encode, {"encoding": "wrong"}),
         (lambda v: v**1.6, {"encoding": "wrong"}),
-        (gained(1.05, 1, 1, 1), {"exposure": "look"}),
-        (gained(1, 1.05, 1, 1), {"exposure": "look"}),
-        (gained(1, 1, 1.05, 1), {"exposure": "look"}),
-        (gained(1, 1, 1, 1.05), {"exposure": "look"}),
+        (gained(1.05, 1, 1, 1), {"exposure": "warning"}),
+        (gained(1, 1.05, 1, 1), {"exposure": "warning"}),
+        (gained(1, 1, 1.05, 1), {"exposure": "warning"}),
+        (gained(1, 1, 1, 1.05), {"exposure": "warning"}),
         (gained(1.008, 1, 1, 1), {}),
         (gained(1.13, 1, 1, 1), {"exposure": "wrong", "pair_sums": "wrong"}),
     ],
@@ -69,7 +69,7 @@ def test_saturation_is_flagged_with_its_views(tmp_path) -> None:
     root = write_scene(tmp_path / "s", lambda v: v * 0.9)
     one_view(root, lambda v: v * 2.2)
     check = checked(root)["saturation"]
-    assert check.verdict == "look"
+    assert check.verdict == "warning"
     assert check.views == ("v1",)
     assert checked(write_scene(tmp_path / "t", lambda v: v * 4))["saturation"].verdict == "wrong"
 
@@ -77,7 +77,7 @@ def test_saturation_is_flagged_with_its_views(tmp_path) -> None:
 def test_noise_is_flagged(tmp_path) -> None:
     rng = np.random.default_rng(0)
     found = checked(write_scene(tmp_path / "s", lambda v: v + rng.normal(0, 0.05, v.shape)))
-    assert found["noise"].verdict == "look"
+    assert found["noise"].verdict == "warning"
     assert found["noise"].figures["noise_share"] == pytest.approx(0.05 / np.sqrt(3) / 0.3, rel=0.35)
 
 
@@ -91,7 +91,7 @@ def test_one_view_with_another_exposure_is_named(tmp_path) -> None:
     root = write_scene(tmp_path / "s", views=5)
     one_view(root, gained(1.04, 1, 1, 1))
     check = checked(root)["exposure"]
-    assert check.verdict == "look"
+    assert check.verdict == "warning"
     assert check.views == ("v1",)
 
 
@@ -111,5 +111,5 @@ def test_light_that_changed_between_the_shots_is_flagged(tmp_path) -> None:
     shade[0, 0, :, 0] += 0.3 * np.linspace(-1, 1, 80)
     one_view(root, lambda v: v * shade)
     check = checked(root)["pair_sums"]
-    assert check.verdict == "look"
+    assert check.verdict == "warning"
     assert check.views == ("v1",)

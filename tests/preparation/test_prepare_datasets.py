@@ -25,12 +25,13 @@ from dataset_files import (
     write_pandora,
     write_pisr,
 )
+from heard import Heard
 
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.pictures import decode_mask
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, Reporter, prepare_scene
+from polarguide.preparation import PrepareSettings, prepare_scene
 
 PLAIN = PrepareSettings(poses="none", gains="none")
 NAMES = {
@@ -42,18 +43,6 @@ NAMES = {
 }
 # PANDORA's files share an exponent between channels, GNeRP's pictures have 8 bits.
 TOLERANCE = {"pandora": 1e-2, "nersp": 2e-5, "neisf": 2e-5, "gnerp": 1e-2}
-
-
-class Heard(Reporter):
-    """Keeps what was said."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.said.append(text)
-
-    warn = say
 
 
 def summary(scene: Path) -> dict:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from polarguide.capture.datasets import Dataset, fitted_mask
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Developed
+from polarguide.progress import Advance
 
 PAIR_SUMS = (
     "n/a: the four intensities were made from Stokes vectors, so that I0 + I90 = I45 + I135 by construction"
@@ -46,7 +46,7 @@ class StokesSource:
         """All files that are read."""
         return self._dataset.paths
 
-    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> dict[str, Any]:
         """One scale for the whole capture, and what it costs; every file is read once.
 
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;

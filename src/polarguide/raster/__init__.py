@@ -1,6 +1,6 @@
 """Splatting of Gaussians with any channels: one interface, a slow twin, and fast backends."""
 
-from polarguide.raster.backends import Backend, DeviceName, choose_backend
+from polarguide.raster.backends import Backend, DeviceName, choose_backend, use_threads
 from polarguide.raster.interface import Rasterize, Rasterized, ScreenStatistic
 from polarguide.raster.reference import rasterize_reference
 
@@ -12,4 +12,5 @@ __all__ = [
     "ScreenStatistic",
     "choose_backend",
     "rasterize_reference",
+    "use_threads",
 ]
