@@ -16,6 +16,7 @@ from polarguide.capture import ColmapModel, checks
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.inspection.pictures import Pictures
 from polarguide.inspection.surfaces import Surface
+from polarguide.polarizer import ANGLES
 
 WIDTH, HEIGHT, INDEX = 72, 64, 1.5
 
@@ -63,7 +64,7 @@ def pictures_of(name: str, camera: Camera, specular: float, diffuse: float, nois
     body = torch.where(hit, diffuse, 0.4)[..., None].expand(HEIGHT, WIDTH, 3)
     normal = torch.where(hit[..., None], normal, -camera.rays())
     stokes = optics.predicted_stokes(gloss, body, normal, camera.rays(), INDEX)
-    values = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in (0, 45, 90, 135)])
+    values = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in ANGLES])
     generator = torch.Generator().manual_seed(len(name) + ord(name[-1]))
     values = values + noise * torch.randn(values.shape, generator=generator)
     return with_intensities(
@@ -87,10 +88,10 @@ def with_intensities(view: Pictures, values: np.ndarray) -> Pictures:
     return dataclasses.replace(view, codes=torch.from_numpy(codes), measures=checks.measure(codes, usable))
 
 
-def mistaken(view: Pictures, *, files: tuple[int, ...] = (0, 45, 90, 135), zero: float = 0.0) -> Pictures:
+def mistaken(view: Pictures, *, files: tuple[int, ...] = ANGLES, zero: float = 0.0) -> Pictures:
     """The view as an instrument with this zero and these file names would have stored it."""
     values = oriented(view.intensities().numpy(), Calibration(zero=-zero))
-    return with_intensities(view, values[[(0, 45, 90, 135).index(angle) for angle in files]])
+    return with_intensities(view, values[[ANGLES.index(angle) for angle in files]])
 
 
 def surfaces(views: tuple[Pictures, ...]) -> list[tuple[Pictures, Surface]]:
