@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from captures import soft_intensities, write_scene
-from polarguide.inspection.pictures import read_capture
 
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.errors import PolarguideError

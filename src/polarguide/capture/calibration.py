@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES, four_intensities, stokes_of_four
 from polarguide.records import read_record
