@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from polarguide.errors import PolarguideError
@@ -35,7 +35,7 @@ def atomic(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def write_bytes(path: Path, data: bytes) -> int:
+def write_whole(path: Path, data: bytes) -> int:
     """Write a file completely or not at all; returns its size.
 
     Raises:
@@ -52,7 +52,7 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         PolarguideError: it cannot be written.
     """
-    write_bytes(path, text.encode())
+    write_whole(path, text.encode())
 
 
 def make_folder(path: Path) -> None:
@@ -81,6 +81,12 @@ def writing(path: Path) -> Iterator[None]:
             found=error.strerror or str(error),
             remedy="Make room or give rights, and repeat the command: it goes on where it stopped.",
         ) from error
+
+
+def guarded(action: Callable[[], object], path: Path) -> None:
+    """Run what writes ``path``, under ``writing``."""
+    with writing(path):
+        action()
 
 
 def read_file(path: Path) -> bytes:

@@ -1,16 +1,25 @@
-"""How long work says what it does; silent unless a console or a notebook stands behind it."""
+"""How long work says what it does; silent unless somebody listens, as the command line does."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from typing import Protocol
 
-Advance = Callable[[int], None]
-"""Takes how much of a piece of work is done so far."""
+
+class Advance(Protocol):
+    """Takes how far a piece of work is."""
+
+    def __call__(self, done: int, *, total: int | None = None, note: str = "") -> None:
+        """``done`` so far, of ``total`` if that has become known, and a few words about it."""
+
+
+def _ignore(done: int, *, total: int | None = None, note: str = "") -> None:
+    pass
 
 
 class Reporter:
-    """Where messages and progress go. This one is silent; a subclass shows them."""
+    """Where messages and progress go. This one drops them; derive from it to show them."""
 
     def say(self, text: str) -> None:
         """A finding, as a plain sentence."""
@@ -23,9 +32,9 @@ class Reporter:
         """Progress of one piece of work; yields a function that takes what has been done so far.
 
         Args:
-            label: what is done. total: how much there is to do; None where that is not known.
+            label: what is done. total: how much there is to do; None where that is not known yet.
         """
-        yield lambda done: None
+        yield _ignore
 
 
 SILENT = Reporter()

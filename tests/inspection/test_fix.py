@@ -110,7 +110,7 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path, monkeypatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(fix, "write_bytes", full)
+    monkeypatch.setattr(fix, "write_whole", full)
     with pytest.raises(PolarguideError, match="No space left"):
         fix.fix_scene(capture, Calibration(order=(90, 45, 0, 135)), tmp_path / "fixed")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s"]

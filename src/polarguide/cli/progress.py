@@ -31,7 +31,12 @@ class ConsoleReporter(Reporter):
             BarColumn(),
             MofNCompleteColumn(),
             TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}", markup=False),
         )
         with Progress(*columns, console=console, transient=True) as progress:
-            task = progress.add_task(label, total=total)
-            yield lambda done: progress.update(task, completed=done)
+            task = progress.add_task(label, total=total, note="")
+
+            def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+                progress.update(task, completed=done, total=total, note=note)
+
+            yield advance

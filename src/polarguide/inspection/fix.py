@@ -18,7 +18,7 @@ from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import encoded_png, picture_codes
 from polarguide.errors import PolarguideError
-from polarguide.files import write_bytes, writing
+from polarguide.files import write_whole, writing
 from polarguide.inspection.angle_checks import Angles
 from polarguide.inspection.orders import FileOrder, swaps
 from polarguide.inspection.pictures import Capture
@@ -111,7 +111,7 @@ def _write(capture: Capture, change: Calibration, folder: Path, advance: Callabl
         else:
             _rename_view(capture, change.order, folder, view)
         advance(done + 1)
-    write_bytes(folder / SCENE, _sidecar(capture, change))
+    write_whole(folder / SCENE, _sidecar(capture, change))
 
 
 def _rename_view(capture: Capture, order: FileOrder, folder: Path, view: str) -> None:
@@ -126,11 +126,11 @@ def _turn_view(capture: Capture, change: Calibration, folder: Path, view: str) -
     lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
     turned = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
     for angle, codes in zip(ANGLES, picture_codes(turned, lost), strict=True):
-        write_bytes(folder / "polar" / f"{view}_{angle:03d}.png", encoded_png(codes[..., ::-1]))
+        write_whole(folder / "polar" / f"{view}_{angle:03d}.png", encoded_png(codes[..., ::-1]))
     (folder / "invalid").mkdir(exist_ok=True)
     for old in (folder / "invalid").glob(f"{view}.*"):
         old.unlink()
-    write_bytes(folder / "invalid" / f"{view}.png", encoded_png(lost.astype(np.uint8) * 255))
+    write_whole(folder / "invalid" / f"{view}.png", encoded_png(lost.astype(np.uint8) * 255))
 
 
 def _sidecar(capture: Capture, change: Calibration) -> bytes:

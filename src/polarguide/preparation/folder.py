@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from polarguide.capture.view import ANGLES
 from polarguide.capture.write import encoded_png, picture_codes
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, write_bytes
+from polarguide.files import make_folder, write_whole
 from polarguide.records import read_record
 
 JOURNAL = "prepare.json"
@@ -96,11 +96,11 @@ class SceneFolder:
 
     def save(self) -> None:
         """Write the journal."""
-        write_bytes(self.root / JOURNAL, _json({"prepare": self._state()}))
+        write_whole(self.root / JOURNAL, _json({"prepare": self._state()}))
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Write ``scene.json``, the sign that the scene is whole, and drop the journal."""
-        write_bytes(self.root / SCENE, _json({**summary, "prepare": self._state()}))
+        write_whole(self.root / SCENE, _json({**summary, "prepare": self._state()}))
         (self.root / JOURNAL).unlink(missing_ok=True)
 
     def has(self, view: str, warp: object) -> bool:
@@ -131,7 +131,7 @@ class SceneFolder:
         if mask is not None:
             make_folder(self.root / "masks")
             files[f"masks/{view}.png"] = mask.astype(np.uint8) * 255
-        sizes = {name: write_bytes(self.root / name, encoded_png(pixels)) for name, pixels in files.items()}
+        sizes = {name: write_whole(self.root / name, encoded_png(pixels)) for name, pixels in files.items()}
         self.views[view] = {**record, "files": sizes}
         self.save()
 

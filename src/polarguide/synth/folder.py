@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from polarguide.capture.view import ANGLES
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, write_bytes
+from polarguide.files import make_folder, write_whole
 from polarguide.synth.mesh import Array
 
 REQUEST = "request.json"
@@ -55,7 +55,7 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
 def write_file(path: Path, data: bytes) -> None:
     """Write a whole file or nothing."""
     make_folder(path.parent)
-    write_bytes(path, data)
+    write_whole(path, data)
 
 
 def write_picture(path: Path, values: NDArray[Any]) -> None:

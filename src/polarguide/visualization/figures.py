@@ -13,7 +13,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.color import shown
 from polarguide.errors import PolarguideError
-from polarguide.files import write_bytes
+from polarguide.files import write_whole
 from polarguide.visualization.sheet import Picture, check_picture, contact_sheet
 
 __all__ = [
@@ -150,7 +150,7 @@ def write_png(path: str | Path, rgb8: Picture) -> None:
         raise PolarguideError(
             path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
         )
-    write_bytes(path, png_bytes(rgb8))
+    write_whole(path, png_bytes(rgb8))
 
 
 def png_bytes(rgb8: Picture) -> bytes:

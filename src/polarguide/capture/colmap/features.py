@@ -16,7 +16,7 @@ from polarguide.capture.colmap.row_counter import RowCounter
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.write import encoded_png
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, write_bytes, writing
+from polarguide.files import guarded, write_whole
 from polarguide.progress import Reporter
 
 _POLL_SECONDS = 0.5
@@ -90,14 +90,13 @@ def match(
 def _named_for_colmap(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
     """Masks under the names that COLMAP wants, ``<view>.png.png``; white for views without, which it would skip."""
     named = masks.with_name("colmap_masks")
-    make_folder(named)
+    guarded(lambda: named.mkdir(exist_ok=True), named)
     for view, (width, height) in sizes.items():
         mask, wanted = masks / f"{view}.png", named / f"{view}.png.png"
         if mask.exists():
-            with writing(wanted):
-                shutil.copyfile(mask, wanted)
+            guarded(lambda mask=mask, wanted=wanted: shutil.copyfile(mask, wanted), wanted)  # type: ignore[misc]
         else:
-            write_bytes(wanted, encoded_png(np.full((height, width), 255, np.uint8)))
+            write_whole(wanted, encoded_png(np.full((height, width), 255, np.uint8)))
     return named
 
 

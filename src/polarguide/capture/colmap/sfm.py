@@ -14,7 +14,7 @@ from polarguide.capture.colmap.features import match, run, seeded
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder
+from polarguide.files import guarded
 from polarguide.progress import Reporter
 
 _FEW_SHARE = 0.8
@@ -83,7 +83,7 @@ def reconstruct(
         matching=matching, seed=seed, reporter=reporter, cameras=cameras, masks=folder / "masks",
     )  # fmt: skip
     shutil.rmtree(trial, ignore_errors=True)
-    make_folder(trial)
+    guarded(lambda: trial.mkdir(), trial)
     free = intrinsics is None or refine
     models = _map(database, images, trial, len(sizes), seed, reporter, free)
     best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
@@ -97,7 +97,7 @@ def reconstruct(
         )
     chosen = folder / "chosen"
     shutil.rmtree(chosen, ignore_errors=True)
-    make_folder(chosen)
+    guarded(chosen.mkdir, chosen)
     best.write_binary(str(chosen))
     chosen.rename(model)
     said = f"{registered} of {len(sizes)} views registered"

@@ -19,7 +19,7 @@ from polarguide.capture.colmap.sample import region_samples
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_file
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, write_text, writing
+from polarguide.files import guarded, write_whole
 from polarguide.progress import Reporter
 from polarguide.records import read_record
 
@@ -64,9 +64,8 @@ def add_points(
     start, trial = folder / "start", folder / "triangulated"
     for path in (start, trial):
         shutil.rmtree(path, ignore_errors=True)
-        make_folder(path)
-    with writing(start):
-        write_cameras(start, cameras)
+        guarded(lambda path=path: path.mkdir(parents=True), path)  # type: ignore[misc]
+    guarded(lambda: write_cameras(start, cameras), start)
     count, error = _triangulated(folder, start, trial, cameras, matching, seed, reporter)
     found: dict[str, Any] = {"from": "triangulation with fixed poses", "count": count}
     if error is not None:
@@ -77,9 +76,8 @@ def add_points(
         reporter.say(
             f"The poses came without points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
         )
-    with writing(model):
-        _replace(model, trial)
-    write_text(note, json.dumps(found) + "\n")
+    guarded(lambda: _replace(model, trial), model)
+    write_whole(note, (json.dumps(found) + "\n").encode())
     return model, found
 
 
@@ -104,8 +102,7 @@ def _triangulated(
         numbers = match(
             database, images, sizes, matching=matching, seed=seed, reporter=reporter, cameras=cameras
         )
-        with writing(start):
-            write_cameras(start, cameras, numbers)
+        guarded(lambda: write_cameras(start, cameras, numbers), start)
         model = load_model(start, ".bin")
         options = pycolmap.IncrementalPipelineOptions()
         for part in (options, options.mapper, options.triangulation):
@@ -153,7 +150,7 @@ def _sample(
     for place, color in zip(places, _colors(folder, cameras, places), strict=True):
         model.add_point3D(place, pycolmap.Track(), color)
     shutil.rmtree(trial, ignore_errors=True)
-    make_folder(trial)
+    guarded(trial.mkdir, trial)
     model.write_binary(str(trial))
     reporter.warn(
         f"The poses came without points, and only {triangulated} could be triangulated (fewer than {FEWEST}): "
