@@ -10,6 +10,7 @@ import pytest
 from sights import around, photographs_of, shown
 from stand_in import StandIn
 
+from polarguide.shading.result import LAYERS
 from polarguide.viewer.lens import fit
 from polarguide.viewer.panel import NOWHERE, Offer
 from polarguide.viewer.visitor import NO_LAYER, PATH_FILE, PICTURE_FILE, Visitor
@@ -23,7 +24,7 @@ class Looking:
         self.clock, self.seen = clock, shown()
         self.photographs = photographs_of(self.seen)
         self.client = StandIn()
-        offer = Offer(lit=True, turns=True, views=tuple(self.photographs), trains=True)
+        offer = Offer(LAYERS, turns=True, views=tuple(self.photographs), trains=True)
         self.visitor = Visitor(self.client, self.photographs, around(), offer, lambda: None)
         self.visitor.go("v0")
         self.client.camera.tell()
@@ -63,7 +64,7 @@ def looking(monkeypatch):
 
 
 def rendered(seen, camera):
-    result = seen.render(camera, seen.gaussians, seen.environment, depth=False)
+    result = seen.render(camera, depth=False)
     return figures.radiance_to_rgb(result.final)
 
 

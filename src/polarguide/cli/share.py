@@ -53,7 +53,7 @@ def page_of(opened: OpenRun, *, title: str = "", caption: str = "") -> str:
     configuration = opened.configuration
     return share_page(
         opened.state.gaussians,
-        opened.environment,
+        opened.light,
         opened.shading,
         {view.name: view.camera for view in views},
         first=views[0].name,

@@ -17,12 +17,12 @@ class Offer:
     """What a panel has to offer.
 
     Attributes:
-        lit: whether the recipe learns light. turns: whether that can be turned.
+        layers: of the shading model. turns: whether its light can be turned.
         views: names of the photographs.
         trains: whether a training can be made to wait.
     """
 
-    lit: bool
+    layers: Sequence[str]
     turns: bool
     views: Sequence[str]
     trains: bool
@@ -44,10 +44,10 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._told = gui.add_markdown("")
         self.pause = gui.add_checkbox("Pause training", False, visible=offer.trains)
-        layers = [n for n in LAYERS if offer.lit or n in ("final", "normal", "depth", "alpha")]
+        layers = [name for name in LAYERS if name in offer.layers]
         self.layer = gui.add_dropdown("Layer", (*layers, *MEASURED), hint="The last four: at a photograph")
         self.exposure = gui.add_slider("Exposure", -4.0, 4.0, 0.1, 0.0, hint="Stops")
-        self.strength = gui.add_slider("Reflection", 0.0, 2.0, 0.05, 1.0, visible=offer.lit)
+        self.strength = gui.add_slider("Reflection", 0.0, 2.0, 0.05, 1.0, visible="specular" in layers)
         hint = "Degrees, what is far away; what stands near stays"
         self.turn = gui.add_slider("Environment", -180, 180, 1, 0, hint=hint, visible=offer.turns)
         with gui.add_folder("Photographs"):

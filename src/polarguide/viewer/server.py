@@ -13,7 +13,7 @@ from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.scene_frame import scene_frame
-from polarguide.shading.deferred import Shading
+from polarguide.shading.model import ShadingModel
 from polarguide.viewer.panel import Offer
 from polarguide.viewer.photographs import Photograph
 from polarguide.viewer.shown import Shown
@@ -39,7 +39,7 @@ class Viewer:
     Args:
         look: gives the scene as it is now.
         photographs: of the scene by name, at least one; the first one is where visitors begin.
-        lit: whether the recipe learns light. trains: whether ``paused`` is looked at.
+        shading: of the recipe. trains: whether ``paused`` is looked at.
         host, port: where to listen; another port is taken if this one is in use.
         title: plain text.
 
@@ -52,7 +52,7 @@ class Viewer:
         look: Callable[[], Shown],
         photographs: Mapping[str, Photograph],
         *,
-        lit: bool,
+        shading: ShadingModel,
         trains: bool = False,
         host: str = LOOPBACK[0],
         port: int = 8080,
@@ -63,8 +63,8 @@ class Viewer:
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self._look, self._photographs = look, photographs
         self._around = scene_frame([photograph.view.camera for photograph in photographs.values()])
-        turns = lit and isinstance(look().shading, Shading)
-        self._offer = Offer(lit, turns, tuple(photographs), trains)
+        turns = shading.radiance_cubemap is not None
+        self._offer = Offer(shading.layers, turns, tuple(photographs), trains)
         self._visitors: dict[int, Visitor] = {}
         self._lock = threading.Lock()
         self._wake = threading.Event()
