@@ -20,7 +20,7 @@ import torch
 from polarguide import _native
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, open_run
-from polarguide.shading.deferred import render
+from polarguide.shading.gbuffer import render
 
 ROUNDS = 7
 

@@ -14,7 +14,7 @@ from polarguide.color import srgb_encode
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
-from polarguide.shading.deferred import render
+from polarguide.shading.gbuffer import render
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
@@ -54,25 +54,23 @@ class Ours:
         self.stage = self.trainer.schedule.at(BEGIN).stage
         assert self.stage.reflection
         assert self.stage.densify
-        self._shading = recipe.shading(1.5)
         self._turn = 0
 
     def forward(self) -> None:
         """What a step renders."""
         trainer, state = self.trainer, self.trainer.state
-        assert state.environment is not None
         render(
             state.gaussians,
             trainer._view_of(state.step + self._next()).camera,
             trainer.backend.rasterize,
-            environment=state.environment.parameters,
-            shading=self._shading,
+            shading=trainer.shading,
+            light=state.light,
             depth=True,
         )
 
     def look(self) -> None:
         """Forward and backward, with all losses."""
-        self.trainer._look(self._next(), self.stage, True)
+        self.trainer._backpropagate(self._next(), self.stage, True)
 
     def step(self) -> None:
         """A whole step."""
@@ -83,14 +81,12 @@ class Ours:
         """A picture of a trained scene: the final one, or all layers."""
         trainer, state = self.trainer, self.trainer.state
         view = trainer._view_of(state.step + self._next())
-        environment = state.environment.parameters if state.environment else None
-        rasterize, shading = trainer.backend.rasterize, self._shading
         render(
             state.gaussians,
             view.camera,
-            rasterize,
-            environment=environment,
-            shading=shading,
+            trainer.backend.rasterize,
+            shading=trainer.shading,
+            light=state.light,
             normals=layers,
             depth=layers,
         )

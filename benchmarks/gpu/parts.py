@@ -28,7 +28,7 @@ from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
-from polarguide.shading.deferred import render
+from polarguide.shading.gbuffer import render
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer, TrainSettings
 
@@ -91,12 +91,10 @@ def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
 @torch.no_grad()
 def mean_psnr(scene: Scene, state: TrainingState, backend: Backend) -> float:
     """Mean over the test views, in decibels."""
-    environment, values = state.environment, []
+    shading, values = RECIPE.shading.bind(1.5), []
     for view in scene.test_views:
-        light = environment.parameters if environment else None
-        shading = RECIPE.shading(1.5)
         picture = render(
-            state.gaussians, view.camera, backend.rasterize, environment=light, shading=shading
+            state.gaussians, view.camera, backend.rasterize, shading=shading, light=state.light
         ).final
         values.append(psnr(picture, view.photograph(), ~view.invalid))
     return sum(values) / len(values)

@@ -13,6 +13,7 @@ from polarguide.camera import Camera
 from polarguide.capture import Scene, View
 from polarguide.raster import Splats, rasterize_reference
 from polarguide.recipes import RECIPES
+from polarguide.recipes.baselines import SHADING_3DGS_DR
 from polarguide.training.recipe import Recipe, Repeat, Stage, Weights
 
 WIDTH, HEIGHT, VIEWS, GAUSSIANS = 24, 20, 6, 40
@@ -95,7 +96,7 @@ def make_busy_recipe() -> Recipe:
             Stage("final", 0.2, True, Weights(azimuth=0.3), on_enter=("refresh_priors",)),
         ),
         sh_fractions=(0.2, 0.4, 0.6),
-        environment_resolution=16,
+        shading=dataclasses.replace(SHADING_3DGS_DR, environment_resolution=16),
         initialization=dataclasses.replace(recipe.initialization, shell=50),
         densification=dataclasses.replace(
             recipe.densification,

@@ -84,7 +84,7 @@ def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str)
         strict = True
         try:
             for slot in range(views):
-                trainer._look(slot, stage, True)
+                trainer._backpropagate(slot, stage, True)
                 trainer._optimize()
         finally:
             strict = False
