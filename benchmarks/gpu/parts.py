@@ -110,7 +110,7 @@ def bench(job: Job, scene: Scene, state: TrainingState) -> dict[str, Any]:
     """Ours against plain gsplat on the same Gaussians."""
     device, few = job.backend.device, job.tiny
     repeats, warm_up = (2, 1) if few else (40, max(10, len(scene.train_views) + 2))
-    begin_rows = state.gaussians.snapshot()
+    initial = state.gaussians.snapshot()
 
     def timed(call: Callable[[], object]) -> float:
         return milliseconds(call, device, repeats=repeats, warm_up=warm_up)
@@ -134,7 +134,7 @@ def bench(job: Job, scene: Scene, state: TrainingState) -> dict[str, Any]:
     if device.type != "cuda" or not has_gsplat():
         found["plain"] = None
         return found
-    plain = Plain(scene, begin_rows, device)
+    plain = Plain(scene, initial, device)
     forward, look, whole = timed(plain.forward), timed(plain.look), timed(plain.step)
     found["plain"] = {
         "forward_ms": forward,
@@ -172,8 +172,8 @@ def stress(job: Job) -> dict[str, Any]:
     """A million Gaussians at 1224 x 1024."""
     count, size = (20_000, (160, 128)) if job.tiny else (1_000_000, (1224, 1024))
     state = trained(job, "spheres")
-    rows = Gaussians(split_to(state, count), RECIPE.rates)
-    state = TrainingState(0, rows, state.environment, DensityStatistics(count, 1, job.backend.device))
+    gaussians = Gaussians(split_to(state, count), RECIPE.rates)
+    state = TrainingState(0, gaussians, state.environment, DensityStatistics(count, 1, job.backend.device))
     return bench(job, enlarged(job.scene("spheres"), *size, views=8), state)
 
 

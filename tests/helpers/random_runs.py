@@ -8,13 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, look_at
 from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.recipes import RECIPES
 from polarguide.shading.model import ShadingModel
 from polarguide.training.state import Environment, TrainingState
-from polarguide.trajectory import looking
 
 KINDS = {"3dgs": "plain", "3dgs-dr": "reflection", "polarguide-stokes": "local", "ref-gs": "directional"}
 """A recipe for each kind of shading."""
@@ -61,6 +60,6 @@ def ring(count: int = 6, distance: float = 4.0, width: int = 64, height: int = 4
     for k in range(count):
         angle = 2 * math.pi * k / count
         place = [distance * math.cos(angle), -0.3 * distance, distance * math.sin(angle)]
-        place_ = torch.tensor(place, dtype=torch.float64)
-        cameras[f"v{k}"] = looking(lens, place_, torch.zeros(3, dtype=torch.float64), -eye[1])
+        rotation, translation = look_at(place, (0.0, 0.0, 0.0), -eye[1])
+        cameras[f"v{k}"] = replace(lens, rotation=rotation, translation=translation)
     return cameras

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, look_at
 from polarguide.capture import Scene, View
 from polarguide.raster import Splats, rasterize_reference
 from polarguide.recipes import RECIPES
@@ -22,12 +22,9 @@ STEPS = 60
 
 def circling(angle: float) -> Camera:
     """A camera at distance 4 from the origin, somewhat above it, that looks at it."""
-    center = torch.tensor([4 * math.cos(angle), -1.2, 4 * math.sin(angle)], dtype=torch.float64)
-    ahead = -center / center.norm()
-    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), ahead)
-    right = right / right.norm()
-    rotation = torch.stack((right, torch.linalg.cross(ahead, right), ahead))
-    return Camera(WIDTH, HEIGHT, 28.0, 28.0, WIDTH / 2, HEIGHT / 2, rotation, -rotation @ center)
+    center = (4 * math.cos(angle), -1.2, 4 * math.sin(angle))
+    pose = look_at(center, (0.0, 0.0, 0.0), (0.0, -1.0, 0.0))
+    return Camera(WIDTH, HEIGHT, 28.0, 28.0, WIDTH / 2, HEIGHT / 2, *pose)
 
 
 def polarized_codes(picture: Tensor, alpha: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
-"""What ``polarguide inspect`` says of scenes whose faults are planted.
+"""What ``polarguide inspect`` finds in scenes whose faults are planted.
 
-    python benchmarks/inspection_verdicts.py SCENE [SCENE ...]
+    python benchmarks/accuracy/inspection_verdicts.py SCENE [SCENE ...]
 
 The eight orders that keep the pairs, a zero turned by 10 degrees, gamma-encoded files, one angle exposed 5 % longer,
 and pictures overexposed three times are made from each scene in memory, and judged by points seen in several views and
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration, oriented
+from polarguide.color import srgb_encode_array
 from polarguide.inspection.angle_checks import order_check, weigh, zero_check
 from polarguide.inspection.capture import Capture, read_capture
 from polarguide.inspection.orders import ORDERS
@@ -57,12 +58,6 @@ def misnamed(files: tuple[int, int, int, int]) -> Change:
     return lambda values: values[[ANGLES.index(angle) for angle in files]]
 
 
-def encoded(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.where(
-        values <= 0.0031308, 12.92 * values, 1.055 * np.maximum(values, 1e-9) ** (1 / 2.4) - 0.055
-    )
-
-
 def exposed(place: int) -> Change:
     """One picture exposed 5 % longer."""
     gains = np.ones((4, 1, 1, 1), np.float32)
@@ -70,9 +65,9 @@ def exposed(place: int) -> Change:
     return lambda values: values * gains
 
 
-def angles_line(capture: Capture, index: float) -> str:
+def angles_line(capture: Capture, refractive_index: float) -> str:
     pairing = pairing_of(capture) or 0
-    evidence, _ = point_evidence(capture.posed, capture.model, index, pairing)
+    evidence, _ = point_evidence(capture.posed, capture.model, refractive_index, pairing)
     angles = weigh([evidence], pairing)
     order, zero = order_check(angles), zero_check(angles)
     if angles.odds is None:
@@ -94,26 +89,26 @@ def main() -> None:
     torch.set_num_threads(1)
     for path in arguments.scenes:
         capture = read_capture(path)
-        index = capture.refractive_index or 1.5
+        refractive_index = capture.refractive_index or 1.5
         plants: dict[str, Change] = {
             "untouched": lambda values: values,
-            "gamma": encoded,
+            "gamma": srgb_encode_array,
             **{f"5 % at {ANGLES[k]}": exposed(k) for k in range(4)},
             "overexposed x3": lambda values: values * 3,
         }
         for name, change in plants.items():
             planted = altered(capture, change)
-            readings = [read_view_figures(view, index) for view in planted.views]
+            readings = [read_view_figures(view, refractive_index) for view in planted.views]
             found = picture_checks(planted, readings, pairing_of(planted))
             flagged = [f"{check.key} {check.verdict}" for check in found if check.verdict != "ok"]
             print(f"{path.name:9} {name:15} {', '.join(flagged) or 'all ok'}", flush=True)
         if arguments.pictures_only:
             continue
         for order in ORDERS:
-            line = angles_line(altered(capture, misnamed(order.files())), index)
+            line = angles_line(altered(capture, misnamed(order.files())), refractive_index)
             print(f"{path.name:9} {','.join(map(str, order.files())):15} {line}", flush=True)
         print(
-            f"{path.name:9} {'zero at 10':15} {angles_line(altered(capture, turned(10.0)), index)}",
+            f"{path.name:9} {'zero at 10':15} {angles_line(altered(capture, turned(10.0)), refractive_index)}",
             flush=True,
         )
 
