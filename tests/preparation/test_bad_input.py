@@ -18,7 +18,8 @@ from dataset_files import write_gnerp, write_neisf, write_nersp, write_pandora, 
 from polarguide import files
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 PLAIN = PrepareSettings(poses="none", gains="none")
 MOSAIC = replace(PLAIN, sensor="IMX250MYR")
