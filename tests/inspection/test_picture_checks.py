@@ -13,6 +13,7 @@ from polarguide.inspection.orders import PAIRINGS
 from polarguide.inspection.picture_checks import pairing_of, picture_checks
 from polarguide.inspection.readings import read_view_figures
 from polarguide.inspection.verdict import Check
+from polarguide.polarizer import ANGLES
 
 
 def checked(root: Path) -> dict[str, Check]:
@@ -98,7 +99,7 @@ def test_one_view_with_another_exposure_is_named(tmp_path) -> None:
 @pytest.mark.parametrize("pairing", [1, 2])
 def test_files_of_another_pairing_are_named(tmp_path, pairing: int) -> None:
     files = PAIRINGS[pairing]
-    root = write_scene(tmp_path / "s", lambda v: v[[(0, 45, 90, 135).index(angle) for angle in files]])
+    root = write_scene(tmp_path / "s", lambda v: v[[ANGLES.index(angle) for angle in files]])
     found = checked(root)
     assert found["pair_sums"].verdict == "wrong"
     assert found["pair_sums"].figures["pairing"] == list(files)

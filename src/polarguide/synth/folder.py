@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.view import ANGLES
 from polarguide.capture.write import picture_name
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
+from polarguide.polarizer import ANGLES, malus
 from polarguide.synth.mesh import Array
 
 REQUEST = "request.json"
@@ -70,8 +70,7 @@ def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.
         stokes: [3, H, W, 3], full scale 1.
         change: what happens to intensities [4, H, W, 3] before they are stored (noise).
     """
-    twice = [2 * np.radians(angle) for angle in ANGLES]
-    light = np.stack([(stokes[0] + stokes[1] * np.cos(a) + stokes[2] * np.sin(a)) / 2 for a in twice])
+    light = np.stack([malus(stokes, np.radians(angle)) for angle in ANGLES])
     return np.clip(np.round(change(light) * (65535 / STEP)), 0, TOP).astype(np.uint16) * STEP
 
 
