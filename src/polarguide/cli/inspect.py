@@ -95,10 +95,12 @@ def _say(found: Inspection) -> None:
         console.print(f"{check.title}: {check.finding}", markup=False)
         if check.remedy and check.verdict != "ok":
             console.print(f"       {check.remedy}", markup=False)
-    odds = found.angles.odds
-    if odds is not None:
+    posterior = found.angles.posterior
+    if posterior is not None:
         console.print("order of the pictures called 0, 45, 90, 135: probability (log-odds to the best)")
-        ranked = sorted(zip(ORDERS, odds.probabilities, odds.log_odds, strict=True), key=lambda row: -row[1])
+        ranked = sorted(
+            zip(ORDERS, posterior.probabilities, posterior.log_odds, strict=True), key=lambda row: -row[1]
+        )
         for order, probability, against in ranked:
             files = ", ".join(f"{angle:3d}" for angle in order.files(PAIRINGS[found.angles.pairing]))
             console.print(
