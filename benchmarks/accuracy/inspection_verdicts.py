@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.color import srgb_encode_array
-from polarguide.inspection.angle_checks import order_check, weigh, zero_check
+from polarguide.inspection.angle_checks import combine_evidence, order_check, zero_check
 from polarguide.inspection.capture import Capture, read_capture
+from polarguide.inspection.measurements import measure_view
 from polarguide.inspection.orders import ORDERS
-from polarguide.inspection.picture_checks import pairing_of, picture_checks
+from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.points import point_evidence
-from polarguide.inspection.readings import read_view_figures
 from polarguide.polarizer import ANGLES
 
 Change = Callable[[NDArray[np.float32]], NDArray[np.float32]]
@@ -66,16 +66,16 @@ def exposed(place: int) -> Change:
 
 
 def angles_line(capture: Capture, refractive_index: float) -> str:
-    pairing = pairing_of(capture) or 0
+    pairing = find_pairing(capture) or 0
     evidence, _ = point_evidence(capture.posed, capture.model, refractive_index, pairing)
-    angles = weigh([evidence], pairing)
+    angles = combine_evidence([evidence], pairing)
     order, zero = order_check(angles), zero_check(angles)
-    if angles.odds is None:
+    if angles.posterior is None:
         return f"order {order.verdict}: {evidence.note}"
-    best = ORDERS[angles.odds.best].files()
+    best = ORDERS[angles.posterior.best].files()
     return (
-        f"order {order.verdict:5} {','.join(map(str, best)):14} p {max(angles.odds.probabilities):.4f}  "
-        f"zero {zero.verdict:5} {angles.odds.offset:+.2f} +- {angles.odds.offset_error:.2f}"
+        f"order {order.verdict:5} {','.join(map(str, best)):14} p {max(angles.posterior.probabilities):.4f}  "
+        f"zero {zero.verdict:5} {angles.posterior.offset:+.2f} +- {angles.posterior.offset_error:.2f}"
     )
 
 
@@ -98,8 +98,8 @@ def main() -> None:
         }
         for name, change in plants.items():
             planted = altered(capture, change)
-            readings = [read_view_figures(view, refractive_index) for view in planted.views]
-            found = picture_checks(planted, readings, pairing_of(planted))
+            measurements = [measure_view(view, refractive_index) for view in planted.views]
+            found = picture_checks(planted, measurements, find_pairing(planted))
             flagged = [f"{check.key} {check.verdict}" for check in found if check.verdict != "ok"]
             print(f"{path.name:9} {name:15} {', '.join(flagged) or 'all ok'}", flush=True)
         if arguments.pictures_only:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from camera_files import read_invalid, read_polar
 
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 FOLDER = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "mosaic_mono"
 SETTINGS = PrepareSettings(sensor="IMX250MZR", poses="none")

@@ -10,17 +10,17 @@ from captures import gained, one_view, write_scene
 from tiny_capture import encode_srgb
 
 from polarguide.inspection.capture import read_capture
+from polarguide.inspection.measurements import measure_view
 from polarguide.inspection.orders import PAIRINGS
-from polarguide.inspection.picture_checks import pairing_of, picture_checks
-from polarguide.inspection.readings import read_view_figures
+from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.verdict import Check
 from polarguide.polarizer import ANGLES
 
 
 def checked(root: Path) -> dict[str, Check]:
     capture = read_capture(root)
-    readings = [read_view_figures(view, 1.5) for view in capture.views]
-    return {check.key: check for check in picture_checks(capture, readings, pairing_of(capture))}
+    measurements = [measure_view(view, 1.5) for view in capture.views]
+    return {check.key: check for check in picture_checks(capture, measurements, find_pairing(capture))}
 
 
 def flagged(found: dict[str, Check]) -> dict[str, str]:

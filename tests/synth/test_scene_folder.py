@@ -18,7 +18,7 @@ from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.cli.app import run
 from polarguide.errors import PolarguideError
-from polarguide.preparation import Reporter
+from polarguide.progress import Reporter
 from polarguide.synth import render as runner
 from polarguide.synth import sweep as sweeps
 from polarguide.synth.manifest import MANIFEST, scene_digest, verify_scene
