@@ -85,12 +85,14 @@ class Opened:
 
 
 def psnr(picture: np.ndarray, expected: np.ndarray) -> float:
-    return float(-10 * np.log10(np.mean(((picture - expected.astype(float))[FREE] / 255) ** 2)))
+    error = np.mean(((picture - expected.astype(float))[FREE] / 255) ** 2)
+    return float(-10 * np.log10(max(error, 1e-9)))
 
 
 @pytest.fixture(scope="module")
 def opened() -> Iterator[Opened]:
-    with chromium() as browser:
+    with chromium() as browser, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("polarguide.viewer.place.ARRIVAL", PATIENCE)  # a busy machine's browser takes its time
         viewing = Opened(browser)
         yield viewing
         viewing.close()
