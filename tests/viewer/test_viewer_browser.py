@@ -93,7 +93,8 @@ def psnr(picture: np.ndarray, expected: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def opened() -> Iterator[Opened]:
-    with chromium() as browser:
+    with chromium() as browser, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("polarguide.viewer.place.ARRIVAL", PATIENCE)  # a busy machine's browser takes its time
         viewing = Opened(browser)
         yield viewing
         viewing.close()
