@@ -1,4 +1,4 @@
-"""What an exported PLY loses: its display colours, blended as other viewers do, against our final picture.
+"""What an exported PLY loses: its display colors, blended as other viewers do, against our final picture.
 
     python benchmarks/baked_splats.py RUN [RUN/export/splats.ply]
 
@@ -14,10 +14,10 @@ from pathlib import Path
 import torch
 
 from polarguide.cli.common import open_run
+from polarguide.color import srgb_encode
+from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.gaussians.ply import read_ply
-from polarguide.gaussians.spherical_harmonics import evaluate_sh
-from polarguide.shading.display import srgb_encode
-from polarguide.training.run import PLY
+from polarguide.runs.folder import PLY
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -32,15 +32,15 @@ def main() -> None:
     scores = []
     for view in opened.scene.test_views:
         result = opened.render(view)
-        colours = evaluate_sh(
-            file["means"], view.camera.centre, file["sh_dc"][:, 0].contiguous(), file["sh_rest"], 3
+        colors = evaluate_sh(
+            file["means"], view.camera.center, file["sh_dc"][:, 0].contiguous(), file["sh_rest"], 3
         )
-        baked = opened.backend.rasterise(
+        baked = opened.backend.rasterize(
             file["means"],
             file["quaternions"],
             file["log_scales"].exp(),
             torch.sigmoid(file["opacity_logits"]),
-            (colours + 0.5).clamp(min=0),
+            (colors + 0.5).clamp(min=0),
             view.camera,
         ).features.clamp(0, 1)
         diffuse = result.base if result.diffuse is None else result.diffuse

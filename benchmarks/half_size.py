@@ -29,7 +29,7 @@ def seen(intensities: NDArray[np.float64], pattern: Pattern, rng: np.random.Gene
     out = np.empty(intensities.shape[1:3])
     period = pattern.period
     for row, column in np.ndindex(period, period):
-        channel = 1 if pattern.colours is None else int(pattern.colours[row, column])
+        channel = 1 if pattern.colors is None else int(pattern.colors[row, column])
         angle = ANGLES.index(int(pattern.angles[row, column]))
         out[row::period, column::period] = intensities[angle, row::period, column::period, channel]
     return (rng.poisson(out * ELECTRONS) / ELECTRONS).astype(np.float32)
@@ -39,18 +39,18 @@ def errors(found: NDArray[np.floating], true: NDArray[np.floating]) -> tuple[flo
     """DoLP, AoLP in degrees, and PSNR of S0 in dB."""
     inside = np.s_[:, BORDER:-BORDER, BORDER:-BORDER]
     (i0, i45, i90, i135), (t0, t45, t90, t135) = (side[inside].mean(axis=3) for side in (found, true))
-    s0, truth = (i0 + i45 + i90 + i135) / 2, (t0 + t45 + t90 + t135) / 2
-    lit = truth > 0.1
+    s0, ground_truth = (i0 + i45 + i90 + i135) / 2, (t0 + t45 + t90 + t135) / 2
+    lit = ground_truth > 0.1
     dolp, true_dolp = (
         np.hypot(a, b) / np.maximum(s, 1e-4)
-        for a, b, s in ((i0 - i90, i45 - i135, s0), (t0 - t90, t45 - t135, truth))
+        for a, b, s in ((i0 - i90, i45 - i135, s0), (t0 - t90, t45 - t135, ground_truth))
     )
     turn = (np.arctan2(i45 - i135, i0 - i90) - np.arctan2(t45 - t135, t0 - t90)) / 2
     off = np.degrees(np.arcsin(np.abs(np.sin(turn))))
     return (
         float(np.abs(dolp - true_dolp)[lit].mean()),
         float(off[lit & (true_dolp > 0.1)].mean()),
-        float(-10 * np.log10(np.mean((s0 - truth)[lit] ** 2))),
+        float(-10 * np.log10(np.mean((s0 - ground_truth)[lit] ** 2))),
     )
 
 
@@ -71,7 +71,7 @@ def main() -> None:
         for sensor in ("IMX250MYR", "IMX250MZR"):
             pattern = sensor_pattern(sensor)
             values = seen(light, pattern, rng)
-            target = true if pattern.colours is not None else np.repeat(true[..., 1:2], 3, axis=3)
+            target = true if pattern.colors is not None else np.repeat(true[..., 1:2], 3, axis=3)
             for interpolation in ("bilinear", "guided"):
                 for registered in (False, True):
                     picture = demosaic(

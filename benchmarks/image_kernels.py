@@ -1,4 +1,4 @@
-"""Speed of the picture and colour kernels against their plain-torch twins, in one run on this machine.
+"""Speed of the picture and color kernels against their plain-torch twins, in one run on this machine.
 
 Each figure is milliseconds, forward and backward together: the median and, in brackets, the minimum over the
 repeats. The two sides take turns, so a busy machine slows both. ``python benchmarks/image_kernels.py``.
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from polarguide import _native
-from polarguide.gaussians.spherical_harmonics import evaluate_sh, evaluate_sh_reference
+from polarguide.gaussians.harmonics import evaluate_sh, evaluate_sh_reference
 from polarguide.shading.cubemap import cubemap_lookup, cubemap_lookup_reference
 from polarguide.training.photometric import photometric_loss, photometric_loss_reference
 
@@ -43,7 +43,7 @@ def photometric_pair(width: int, height: int) -> tuple[Callable[[], None], Calla
 
 
 def cubemap_pair(resolution: int, count: int) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Directions like those of a picture: neighbours reflect into neighbouring texels."""
+    """Directions like those of a picture: neighbors reflect into neighboring texels."""
     texture = torch.randn(6, resolution, resolution, 3).requires_grad_()
     side = int(count**0.5) + 1
     grid = torch.stack(

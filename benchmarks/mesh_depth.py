@@ -17,15 +17,15 @@ import torch
 import trimesh
 
 from polarguide.cli.common import open_run
-from polarguide.evaluation import figures
-from polarguide.gaussians.initialise import scene_extent
+from polarguide.gaussians.initialize import scene_extent
+from polarguide.visualization import figures
 
 
 def mesh_depth(mesh: trimesh.Trimesh, camera, step: int) -> np.ndarray:
     """Camera depth where the rays of every ``step``-th pixel first meet the mesh, NaN where they do not."""
     rays = camera.rays(dtype=torch.float64)[::step, ::step]
     ways = camera.to_world(rays).reshape(-1, 3).numpy()
-    start = np.broadcast_to(camera.centre.numpy(), ways.shape)
+    start = np.broadcast_to(camera.center.numpy(), ways.shape)
     found, which, _ = mesh.ray.intersects_location(start, ways, multiple_hits=False)
     depth = np.full(len(ways), np.nan)
     depth[which] = (found - start[which]) @ camera.rotation[2].numpy()
@@ -33,17 +33,17 @@ def mesh_depth(mesh: trimesh.Trimesh, camera, step: int) -> np.ndarray:
 
 
 def pictures(mesh: trimesh.Trimesh, camera) -> np.ndarray:
-    """The mesh from a camera, colours and normals side by side, uint8 RGB."""
+    """The mesh from a camera, colors and normals side by side, uint8 RGB."""
     ways = camera.to_world(camera.rays(dtype=torch.float64)).reshape(-1, 3).numpy()
-    start = np.broadcast_to(camera.centre.numpy(), ways.shape)
+    start = np.broadcast_to(camera.center.numpy(), ways.shape)
     places, which, faces = mesh.ray.intersects_location(start, ways, multiple_hits=False)
     shares = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], places)[..., None]
-    colours, normals = np.zeros((len(ways), 3)), np.zeros((len(ways), 3))
-    colours[which] = (mesh.visual.vertex_colors[mesh.faces[faces], :3] * shares).sum(axis=1)
+    colors, normals = np.zeros((len(ways), 3)), np.zeros((len(ways), 3))
+    colors[which] = (mesh.visual.vertex_colors[mesh.faces[faces], :3] * shares).sum(axis=1)
     normals[which] = (mesh.vertex_normals[mesh.faces[faces]] * shares).sum(axis=1)
     shape = (camera.height, camera.width, 3)
     shown = figures.normal_to_rgb(torch.from_numpy(normals.reshape(shape)), camera)
-    return np.concatenate((colours.reshape(shape).round().astype(np.uint8), shown), axis=1)
+    return np.concatenate((colors.reshape(shape).round().astype(np.uint8), shown), axis=1)
 
 
 def main() -> None:
@@ -55,7 +55,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="JPEG or PNG to write of the first test view")
     arguments = parser.parse_args()
     opened = open_run(arguments.run)
-    extent = scene_extent(torch.stack([camera.centre for camera in opened.cameras.values()]))
+    extent = scene_extent(torch.stack([camera.center for camera in opened.cameras.values()]))
     mesh = trimesh.load(arguments.mesh, process=False)
     if arguments.picture:
         shown = pictures(mesh, opened.scene.test_views[0].camera)
@@ -63,9 +63,9 @@ def main() -> None:
     errors: dict[str, list[np.ndarray]] = {"mesh": [], "rendered": []}
     missing = []
     for view in opened.scene.test_views:
-        assert view.truth is not None
-        true = view.truth.depth[:: arguments.step, :: arguments.step].numpy()
-        known = view.truth.mask[:: arguments.step, :: arguments.step].numpy() & (true > 0)
+        assert view.ground_truth is not None
+        true = view.ground_truth.depth[:: arguments.step, :: arguments.step].numpy()
+        known = view.ground_truth.mask[:: arguments.step, :: arguments.step].numpy() & (true > 0)
         rendered = opened.render(view, depth=True).depth[:: arguments.step, :: arguments.step].numpy()
         ours = mesh_depth(mesh, view.camera, arguments.step)
         for name, depth in (("mesh", ours), ("rendered", rendered)):

@@ -1,7 +1,7 @@
 """Where the normal error of runs is: ``python benchmarks/normal_errors.py RUN...`` (scenes with ground truth).
 
 Foreground pixels of the held-out views are parted into those within two pixels of the foreground's border or of a jump
-of the true normals (neighbours more than 26 degrees apart), and the rest, by degree of polarization. For each part: its
+of the true normals (neighbors more than 26 degrees apart), and the rest, by degree of polarization. For each part: its
 share of the pixels, its mean error in degrees, its share of the whole error.
 """
 
@@ -20,7 +20,7 @@ from polarguide.cli.common import open_run
 from polarguide.evaluation.metrics import normal_angles_deg
 
 NEAR = np.ones((5, 5), dtype=np.uint8)
-JUMP = 0.9  # cosine between neighbours
+JUMP = 0.9  # cosine between neighbors
 FAINT = 0.02
 
 
@@ -42,17 +42,17 @@ def main() -> None:
         opened = open_run(run)
         errors, edges, faint = [], [], []
         for view in opened.scene.test_views:
-            truth = view.truth
-            assert truth is not None
-            assert truth.normal is not None
-            assert truth.mask is not None
+            ground_truth = view.ground_truth
+            assert ground_truth is not None
+            assert ground_truth.normal is not None
+            assert ground_truth.mask is not None
             rendered = opened.render(view).normal
             assert rendered is not None
-            angles = normal_angles_deg(rendered, truth.normal)
+            angles = normal_angles_deg(rendered, ground_truth.normal)
             dolp = optics.dolp(optics.luminance(optics.stokes(view.intensities())))
-            errors.append(angles[truth.mask])
-            edges.append(near_edges(truth.normal, truth.mask)[truth.mask])
-            faint.append((dolp < FAINT)[truth.mask])
+            errors.append(angles[ground_truth.mask])
+            edges.append(near_edges(ground_truth.normal, ground_truth.mask)[ground_truth.mask])
+            faint.append((dolp < FAINT)[ground_truth.mask])
         error, edge, dark = torch.cat(errors), torch.cat(edges), torch.cat(faint)
         parts = []
         for part in (edge, ~edge & dark, ~edge & ~dark):

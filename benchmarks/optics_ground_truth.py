@@ -63,22 +63,23 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
 
 def read_view(scene: Path, name: str, camera: Camera) -> View:
     """One test view in float64."""
-    images = [cv2.imread(str(scene / "polar" / f"{name}_{a:03d}.png"), -1) for a in optics.ANGLES_DEG]
+    images = [cv2.imread(str(scene / "polar" / f"{name}_{a:03d}.png"), -1) for a in optics.ANGLES]
     intensities = torch.from_numpy(np.stack(images)[..., ::-1] / 65535.0)
-    with np.load(scene / "gt" / f"{name}.npz") as truth:
+    with np.load(scene / "gt" / f"{name}.npz") as ground_truth:
         arrays = {
-            key: torch.from_numpy(truth[key].astype(np.float64)) for key in ("normal", "specular", "diffuse")
+            key: torch.from_numpy(ground_truth[key].astype(np.float64))
+            for key in ("normal", "specular", "diffuse")
         }
-        mask = torch.from_numpy(truth["mask"])
+        mask = torch.from_numpy(ground_truth["mask"])
     normals = torch.nn.functional.normalize(camera.to_camera(arrays["normal"]), dim=-1)
     rays = camera.rays(dtype=torch.float64)
     return View(optics.stokes(intensities), rays, normals, mask, arrays["specular"], arrays["diffuse"])
 
 
-def psnr(layer: Tensor, truth: Tensor, mask: Tensor) -> float:
+def psnr(layer: Tensor, ground_truth: Tensor, mask: Tensor) -> float:
     """PSNR in dB of a layer as shown (S/2, sRGB) over the mask."""
     shown = []
-    for linear in (layer[mask] / 2, truth[mask] / 2):
+    for linear in (layer[mask] / 2, ground_truth[mask] / 2):
         linear = linear.clamp(0, 1)
         shown.append(torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
     return -10 * math.log10(float(((shown[0] - shown[1]) ** 2).mean()))
@@ -134,11 +135,11 @@ def score(view: View, index: float) -> dict[str, float]:
         error = angle(optics.disambiguate(candidates, view.normals).normal, view.normals)[pixels]
         result[f"best of {label}, mean"] = float(error.mean())
         result[f"best of {label}, median"] = float(error.median())
-    return result | colour_scores(view, true_zenith, index)
+    return result | color_scores(view, true_zenith, index)
 
 
-def colour_scores(view: View, true_zenith: Tensor, index: float) -> dict[str, float]:
-    """How often and how well the polarization of colour differences tells the normal.
+def color_scores(view: View, true_zenith: Tensor, index: float) -> dict[str, float]:
+    """How often and how well the polarization of color differences tells the normal.
 
     The half turn that it leaves open is resolved by the true normal, as in the other rows.
     """
@@ -151,10 +152,10 @@ def colour_scores(view: View, true_zenith: Tensor, index: float) -> dict[str, fl
     error = angle(optics.disambiguate(two, view.normals).normal, view.normals)[where]
     wrong = (turn > 45) & where & (true_zenith > math.radians(15))
     return {
-        "colour: share of mask decided, percent": 100 * float(where.sum() / view.mask.sum()),
-        "colour: of those the wrong lobe, percent": 100 * float(wrong.sum() / where.sum()),
-        "colour: normal error, mean": float(error.mean()),
-        "colour: normal error, median": float(error.median()),
+        "color: share of mask decided, percent": 100 * float(where.sum() / view.mask.sum()),
+        "color: of those the wrong lobe, percent": 100 * float(wrong.sum() / where.sum()),
+        "color: normal error, mean": float(error.mean()),
+        "color: normal error, median": float(error.median()),
     }
 
 

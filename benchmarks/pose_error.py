@@ -1,6 +1,6 @@
 """How far the poses of one scene are from those of another that shows the same views.
 
-The two models are brought together by the similarity that fits the camera centres best in the least-squares sense
+The two models are brought together by the similarity that fits the camera centers best in the least-squares sense
 (Umeyama 1991). Positions are relative to the diagonal of the reference's camera path, so that no unit is needed.
 
     python benchmarks/pose_error.py SCENE REFERENCE
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap import read_model
+from polarguide.capture.colmap.model import read_model
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ def main() -> None:
     found, true = read_model(options.scene), read_model(options.reference)
     names = sorted(set(found.names) & set(true.names))
     pairs = [(found.camera(name), true.camera(name)) for name in names]
-    ours, theirs = (np.stack([c.centre.numpy() for c in side]) for side in zip(*pairs, strict=True))
+    ours, theirs = (np.stack([c.center.numpy() for c in side]) for side in zip(*pairs, strict=True))
     scale, rotation, offset = similarity(ours, theirs)
     distance = np.linalg.norm(ours @ (scale * rotation).T + offset - theirs, axis=1)
     path = float(np.linalg.norm(theirs.max(0) - theirs.min(0)))

@@ -1,6 +1,6 @@
 """What rendering all layers costs against plain Gaussian splatting of the same Gaussians.
 
-Every test view is drawn in turn as colour alone and as all layers, with and without depth; the ratio is taken within
+Every test view is drawn in turn as color alone and as all layers, with and without depth; the ratio is taken within
 each turn, so that a slow moment of the machine meets both. Run it alone: ``python benchmarks/rendering.py RUN...``.
 """
 
@@ -20,7 +20,7 @@ import torch
 from polarguide import _native
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, open_run
-from polarguide.shading.render import render
+from polarguide.shading.deferred import render
 
 ROUNDS = 7
 
@@ -32,10 +32,10 @@ def milliseconds(draw: Callable[[], object]) -> float:
 
 
 def measure(opened: OpenRun, rounds: int) -> None:
-    rows, rasterise = opened.state.rows, opened.backend.rasterise
+    rows, rasterize = opened.state.gaussians, opened.backend.rasterize
 
     def plain(view: View) -> object:
-        return render(rows, view.camera, rasterise, normals=False)
+        return render(rows, view.camera, rasterize, normals=False)
 
     def layers(view: View) -> object:
         return opened.render(view)
@@ -74,7 +74,7 @@ def main() -> None:
     print(
         f"{_native.simd()}, {_native.thread_count()} kernel threads, {torch.get_num_threads()} torch threads\n"
     )
-    print("| run | recipe | size | Gaussians | colour ms | layers ms | with depth ms | ratio | with depth |")
+    print("| run | recipe | size | Gaussians | color ms | layers ms | with depth ms | ratio | with depth |")
     print("|---|---|---|---|---|---|---|---|---|")
     with torch.no_grad():
         for run in arguments.runs:

@@ -1,7 +1,7 @@
-"""Raw mosaics as a colour polarization sensor would have written them, made from a capture with four pictures a view.
+"""Raw mosaics as a color polarization sensor would have written them, made from a capture with four pictures a view.
 
 Each picture pixel becomes one 2x2 cell of the sensor, so a capture of 612x512 gives mosaics of 1224x1024: the cell
-takes the one colour that its filter passes, and its four samples are the four angles. Nothing is interpolated, so
+takes the one color that its filter passes, and its four samples are the four angles. Nothing is interpolated, so
 what ``prepare`` has to put back is exactly what a sensor leaves out; unlike one, all angles of a cell lie in one place
 (hence ``--no-register``). Values are 12-bit in 16-bit PNG files.
 
@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.formats.pictures import decode_picture, linear_codes, read_file
 from polarguide.capture.layout import Layout, find_layout
-from polarguide.capture.pictures import decode_picture, linear_codes, read_file
 from polarguide.capture.sensor import sensor_pattern
 from polarguide.capture.view import ANGLES
 
@@ -41,12 +41,12 @@ def mosaic(
     """12-bit mosaic [2 H, 2 W] of [4, H, W, 3]; ``electrons`` at full scale for shot noise, 0 for none."""
     _, height, width, _ = intensities.shape
     pattern = sensor_pattern("IMX250MYR")
-    assert pattern.colours is not None
+    assert pattern.colors is not None
     out = np.empty((2 * height, 2 * width))
     for row, column in np.ndindex(4, 4):
         angle = ANGLES.index(int(pattern.angles[row, column]))
         # Pixel (row, column) of the 4x4 pattern lies in the cell (row // 2, column // 2) of its 2x2 cells.
-        cells = intensities[angle, row // 2 :: 2, column // 2 :: 2, int(pattern.colours[row, column])]
+        cells = intensities[angle, row // 2 :: 2, column // 2 :: 2, int(pattern.colors[row, column])]
         out[row::4, column::4] = cells
     if electrons:
         out = rng.poisson(out * electrons) / electrons

@@ -24,8 +24,8 @@ import torch
 
 from polarguide.cli.common import open_run
 from polarguide.cli.export import export
-from polarguide.evaluation import figures
 from polarguide.export.cameras import transforms
+from polarguide.visualization import figures
 
 FLAGS = (
     "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "

@@ -1,7 +1,7 @@
 """Milliseconds of one training step of plain Gaussian splatting, and where they go.
 
-A fixed number of Gaussians (no densification), steps 100 to 400 on a scene's training views. The rasteriser is
-timed around its two native calls; the rest is harmonics, loss, optimiser and autograd. Run it alone:
+A fixed number of Gaussians (no densification), steps 100 to 400 on a scene's training views. The rasterizer is
+timed around its two native calls; the rest is harmonics, loss, optimizer and autograd. Run it alone:
 ``python benchmarks/training_step.py SCENE --downscale 2 --gaussians 20800``.
 """
 
@@ -24,7 +24,7 @@ from polarguide import _native
 from polarguide.capture import Scene, load_scene
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.training.stages import Recipe, Stage
+from polarguide.training.recipe import Recipe, Stage
 from polarguide.training.trainer import Trainer, TrainSettings
 
 SKIPPED, LAST = 100, 400
@@ -59,13 +59,13 @@ def recipe_without_densification(added: int) -> Recipe:
         PLAIN,
         stages=(Stage("steps", 1.0, reflection=False),),
         sh_fractions=(0.0, 0.0, 0.0),
-        initialisation=replace(PLAIN.initialisation, shell=added),
+        initialization=replace(PLAIN.initialization, shell=added),
     )
 
 
 def with_gaussians(scene: Scene, wanted: int) -> tuple[Scene, Recipe]:
     """The scene and a recipe that begin with ``wanted`` Gaussians: points are left out, or some repeated nearby."""
-    shell = min(PLAIN.initialisation.shell, wanted // 2)
+    shell = min(PLAIN.initialization.shell, wanted // 2)
     count = wanted - shell
     generator = torch.Generator().manual_seed(0)
     points = len(scene.points)
@@ -76,7 +76,7 @@ def with_gaussians(scene: Scene, wanted: int) -> tuple[Scene, Recipe]:
     again = torch.arange(count) >= points
     spread = 0.01 * (scene.points.quantile(0.9, dim=0) - scene.points.quantile(0.1, dim=0))
     places[again] += spread * torch.randn(int(again.sum()), 3, generator=generator)
-    scene = replace(scene, points=places, point_colours=scene.point_colours[order])
+    scene = replace(scene, points=places, point_colors=scene.point_colors[order])
     return scene, recipe_without_densification(shell)
 
 
@@ -91,26 +91,26 @@ def main() -> None:
     scene, recipe = with_gaussians(
         load_scene(arguments.scene, downscale=arguments.downscale), arguments.gaussians
     )
-    rasteriser = Stopwatch()
-    native = _native.Rasteriser
-    native.forward, native.backward = rasteriser.timed(native.forward), rasteriser.timed(native.backward)
+    rasterizer = Stopwatch()
+    native = _native.Rasterizer
+    native.forward, native.backward = rasterizer.timed(native.forward), rasterizer.timed(native.backward)
     trainer = Trainer(scene, recipe, TrainSettings(arguments.steps, 0), choose_backend("cpu"))
     rows = []
     for _ in range(arguments.steps):
         begin = time.perf_counter()
         trainer.step()
-        rows.append((time.perf_counter() - begin, rasteriser.take()))
+        rows.append((time.perf_counter() - begin, rasterizer.take()))
     counted = [(1e3 * whole, 1e3 * raster) for whole, raster in rows[skipped:]]
     camera = scene.train_views[0].camera
     print(
-        f"{scene.name}, {camera.width} x {camera.height}, {len(trainer.state.rows):,} Gaussians, "
+        f"{scene.name}, {camera.width} x {camera.height}, {len(trainer.state.gaussians):,} Gaussians, "
         f"steps {skipped} to {arguments.steps}, {_native.simd()}, {_native.thread_count()} kernel threads, "
         f"{torch.get_num_threads()} torch threads"
     )
     print("\n| part | median ms | 10 % | 90 % |\n|---|---|---|---|")
     for name, values in (
         ("whole step", [whole for whole, _ in counted]),
-        ("rasteriser, both passes", [raster for _, raster in counted]),
+        ("rasterizer, both passes", [raster for _, raster in counted]),
         ("everything else", [whole - raster for whole, raster in counted]),
     ):
         tenths = statistics.quantiles(values, n=10)

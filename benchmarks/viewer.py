@@ -19,9 +19,9 @@ import cv2
 import torch
 
 from polarguide.cli.common import open_run
-from polarguide.gaussians.rows import GaussianRows
+from polarguide.gaussians.gaussians import Gaussians
+from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import LAYERS
-from polarguide.surroundings import surroundings
 from polarguide.trajectory import orbit
 from polarguide.viewer import shown_run
 from polarguide.viewer.appearance import Appearance, Painter
@@ -43,19 +43,19 @@ def main() -> None:
     opened = open_run(arguments.run)
     shown = shown_run(opened)
     generator = torch.Generator().manual_seed(0)
-    chosen = torch.randint(len(shown.rows), (arguments.gaussians,), generator=generator)
-    if arguments.gaussians <= len(shown.rows):
-        chosen = torch.randperm(len(shown.rows), generator=generator)[: arguments.gaussians]
-    rows = {name: shown.rows[name].detach()[chosen] for name in shown.rows.names}
-    shown = replace(shown, rows=GaussianRows(rows, opened.recipe.rates))
+    chosen = torch.randint(len(shown.gaussians), (arguments.gaussians,), generator=generator)
+    if arguments.gaussians <= len(shown.gaussians):
+        chosen = torch.randperm(len(shown.gaussians), generator=generator)[: arguments.gaussians]
+    rows = {name: shown.gaussians[name].detach()[chosen] for name in shown.gaussians.names}
+    shown = replace(shown, gaussians=Gaussians(rows, opened.recipe.rates))
     cameras = list(opened.cameras.values())
     path = [fit(c, (width, height)).camera(c) for c in orbit(cameras, arguments.pictures + SKIPPED)]
     print(
-        f"{shown.status}; {len(shown.rows):,} of them, {width} x {height}, {torch.get_num_threads()} threads"
+        f"{shown.status}; {len(shown.gaussians):,} of them, {width} x {height}, {torch.get_num_threads()} threads"
     )
     print("layer        ms (10 % to 90 %)   pictures a second")
     for layer in LAYERS:
-        painter, seconds = Painter(surroundings(cameras)), []
+        painter, seconds = Painter(scene_frame(cameras)), []
         for camera in path:
             began = time.perf_counter()
             picture = painter.paint(shown, camera, Appearance(layer=layer), settled=False)

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import polarguide
-from polarguide.evaluation.figures import normal_to_rgb, radiance_to_rgb, write_png
 from polarguide.trajectory import orbit
+from polarguide.visualization.figures import normal_to_rgb, radiance_to_rgb, write_png
 
 model, out = polarguide.load(sys.argv[1]), Path(sys.argv[2])
 out.mkdir(parents=True, exist_ok=True)

@@ -34,7 +34,7 @@ inline Axis outward_axis(const AxesArgs &a, int64_t i) {
     r.axis[2] = kept * ez + t * (z * along + w * (x * ey - y * ex));
     float facing = 0.0f, distance = 0.0f;
     for (int k = 0; k < 3; ++k) {
-        const float to_camera = a.centre[k] - m[k];
+        const float to_camera = a.center[k] - m[k];
         facing += to_camera * r.axis[k], distance += to_camera * to_camera;
     }
     if (a.outward) {
@@ -79,11 +79,11 @@ void axes_backward(const AxesArgs &a, int64_t begin, int64_t end) {
     }
 }
 
-// Unit directions from the centre to the means, mirrored at unit normals; zero for a mean at the centre.
+// Unit directions from the center to the means, mirrored at unit normals; zero for a mean at the center.
 void mirrored_forward(const AxesArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
         const float *m = a.means + 3 * i, *n = a.normals + 3 * i;
-        const float x = m[0] - a.centre[0], y = m[1] - a.centre[1], z = m[2] - a.centre[2];
+        const float x = m[0] - a.center[0], y = m[1] - a.center[1], z = m[2] - a.center[2];
         const float squared = x * x + y * y + z * z;
         const float inverse = squared <= tiny ? 0.0f : 1.0f / sqrtf(squared);
         const float twice = 2.0f * (x * n[0] + y * n[1] + z * n[2]);

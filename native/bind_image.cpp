@@ -107,14 +107,14 @@ void sum_texture_gradient(const CubemapArgs &a, int64_t count, float *gradient) 
     if (slices > 1) parallel_chunks(size, merge_chunk, merge);
 }
 
-HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest) {
+HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &center, const Array &dc, const Array &rest) {
     if (degree < 0 || degree > 3)
         throw std::invalid_argument("degree: expected 0 to 3, found " + std::to_string(degree));
     const int64_t n = rows(means);
-    expect_shape(means, "means", {n, 3}), expect_shape(centre, "centre", {3}), expect_shape(dc, "dc", {n, 3});
+    expect_shape(means, "means", {n, 3}), expect_shape(center, "center", {3}), expect_shape(dc, "dc", {n, 3});
     expect_shape(rest, "rest", {n, 15, 3});
     HarmonicsArgs a{};
-    a.degree = degree, a.means = means.data(), a.centre = centre.data(), a.dc = dc.data(), a.rest = rest.data();
+    a.degree = degree, a.means = means.data(), a.center = center.data(), a.dc = dc.data(), a.rest = rest.data();
     return a;
 }
 
@@ -156,8 +156,8 @@ void bind_image(nb::module_ &module) {
         nb::arg("grad_directions").none(), "Fills the gradients that are not None.");
     module.def(
         "harmonics_forward",
-        [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest, Array out) {
-            HarmonicsArgs a = harmonics_args(degree, means, centre, dc, rest);
+        [](int degree, const Array &means, const Array &center, const Array &dc, const Array &rest, Array out) {
+            HarmonicsArgs a = harmonics_args(degree, means, center, dc, rest);
             const int64_t n = rows(means);
             expect_shape(out, "out", {n, 3});
             a.out = out.data();
@@ -165,13 +165,13 @@ void bind_image(nb::module_ &module) {
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_forward)(a, b, e); };
             parallel_chunks(n, item_chunk, body);
         },
-        nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"),
-        "Sum of the harmonics towards each Gaussian.");
+        nb::arg("degree"), nb::arg("means"), nb::arg("center"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"),
+        "Sum of the harmonics toward each Gaussian.");
     module.def(
         "harmonics_backward",
-        [](int degree, const Array &means, const Array &centre, const Array &dc, const Array &rest,
+        [](int degree, const Array &means, const Array &center, const Array &dc, const Array &rest,
            const Array &grad_out, Array grad_means, Array grad_dc, Array grad_rest) {
-            HarmonicsArgs a = harmonics_args(degree, means, centre, dc, rest);
+            HarmonicsArgs a = harmonics_args(degree, means, center, dc, rest);
             const int64_t n = rows(means);
             expect_shape(grad_out, "grad_out", {n, 3}), expect_shape(grad_means, "grad_means", {n, 3});
             expect_shape(grad_dc, "grad_dc", {n, 3}), expect_shape(grad_rest, "grad_rest", {n, 15, 3});
@@ -181,6 +181,6 @@ void bind_image(nb::module_ &module) {
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_backward)(a, b, e); };
             parallel_chunks(n, item_chunk, body);
         },
-        nb::arg("degree"), nb::arg("means"), nb::arg("centre"), nb::arg("dc"), nb::arg("rest"), nb::arg("grad_out"),
+        nb::arg("degree"), nb::arg("means"), nb::arg("center"), nb::arg("dc"), nb::arg("rest"), nb::arg("grad_out"),
         nb::arg("grad_means"), nb::arg("grad_dc"), nb::arg("grad_rest"), "Fills the three gradients.");
 }

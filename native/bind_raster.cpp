@@ -1,6 +1,6 @@
 #include "arrays.h"
 #include "parallel.h"
-#include "rasteriser.h"
+#include "rasterizer.h"
 
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
@@ -33,14 +33,14 @@ GaussianInputs inputs(const Array &means, const Array &quats, const Array &scale
 }
 
 struct Wrapped {
-    Rasteriser rasteriser;
+    Rasterizer rasterizer;
     int width, height, channels;
 };
 
 } // namespace
 
 void bind_raster(nb::module_ &module) {
-    nb::class_<Wrapped>(module, "Rasteriser", "One picture: the forward pass and what its backward pass needs.")
+    nb::class_<Wrapped>(module, "Rasterizer", "One picture: the forward pass and what its backward pass needs.")
         .def(
             "__init__",
             [](Wrapped *self, const std::vector<float> &rotation, const std::vector<float> &translation,
@@ -54,7 +54,7 @@ void bind_raster(nb::module_ &module) {
                 for (size_t i = 0; i < 3; ++i) c.translation[i] = translation[i];
                 c.fx = intrinsics[0], c.fy = intrinsics[1], c.cx = intrinsics[2], c.cy = intrinsics[3];
                 c.width = width, c.height = height, c.near_plane = near_plane;
-                new (self) Wrapped{Rasteriser(c, permutation, statistic_channels), width, height, int(permutation.size())};
+                new (self) Wrapped{Rasterizer(c, permutation, statistic_channels), width, height, int(permutation.size())};
             },
             nb::arg("rotation"), nb::arg("translation"), nb::arg("intrinsics"), nb::arg("width"), nb::arg("height"),
             nb::arg("near_plane"), nb::arg("permutation"), nb::arg("statistic_channels"))
@@ -68,7 +68,7 @@ void bind_raster(nb::module_ &module) {
                 expect_shape(alpha, "alpha", {self.height, self.width});
                 expect_shape(radius, "radius", {in.count});
                 nb::gil_scoped_release release;
-                self.rasteriser.forward(in, out.data(), alpha.data(), radius.data(), count_pairs);
+                self.rasterizer.forward(in, out.data(), alpha.data(), radius.data(), count_pairs);
             },
             nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
             nb::arg("out"), nb::arg("alpha"), nb::arg("radius"), nb::arg("count_pairs") = false)
@@ -85,16 +85,16 @@ void bind_raster(nb::module_ &module) {
                 expect_shape(d_means, "d_means", {in.count, 3});
                 if (statistic) expect_shape(*statistic, "statistic", {in.count, 2});
                 nb::gil_scoped_release release;
-                self.rasteriser.backward(in, out.data(), grad_out.data(), grad_alpha.data(),
+                self.rasterizer.backward(in, out.data(), grad_out.data(), grad_alpha.data(),
                                          {d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(),
                                           d_features.data(), statistic ? statistic->data() : nullptr});
             },
             nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
             nb::arg("out"), nb::arg("grad_out"), nb::arg("grad_alpha"), nb::arg("d_means"), nb::arg("d_quats"),
             nb::arg("d_scales"), nb::arg("d_opacities"), nb::arg("d_features"), nb::arg("statistic").none())
-        .def_prop_ro("pairs", [](const Wrapped &self) { return self.rasteriser.pairs(); },
+        .def_prop_ro("pairs", [](const Wrapped &self) { return self.rasterizer.pairs(); },
                      "Contributing pixel-Gaussian pairs of the last forward pass that counted them.")
-        .def_prop_ro("instances", [](const Wrapped &self) { return self.rasteriser.instances(); },
+        .def_prop_ro("instances", [](const Wrapped &self) { return self.rasterizer.instances(); },
                      "Gaussian-tile pairs of the last forward pass.");
     module.def(
         "first_not_finite",

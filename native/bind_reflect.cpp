@@ -20,7 +20,7 @@ ReflectArgs reflect_args(const Array &features, const Array &rays, bool fresnel,
     const int64_t channels = features.ndim() == 2 ? int64_t(features.shape(1)) : 0;
     expect_shape(features, "features", {n, channels}), expect_shape(rays, "rays", {n, 3});
     if (channels < (local ? 10 : 7))
-        throw std::invalid_argument("features: expected base colour, normal, strength and what the shading reads");
+        throw std::invalid_argument("features: expected base color, normal, strength and what the shading reads");
     ReflectArgs a{};
     a.channels = int(channels), a.fresnel = fresnel, a.local = local, a.index = index;
     a.features = features.data(), a.rays = rays.data();

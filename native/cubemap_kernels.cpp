@@ -1,8 +1,8 @@
 // The seamless cubemap: bilinear look-up and its gradients.
 //
 // A direction is located sixteen at a time; the taps are then read one direction at a time. Cells (the squares between
-// four texel centres) are counted with one ring of texels beyond each face, so that a cell whose column or row is 0 or
-// the resolution has taps on a neighbouring face. Those few take the slow way.
+// four texel centers) are counted with one ring of texels beyond each face, so that a cell whose column or row is 0 or
+// the resolution has taps on a neighboring face. Those few take the slow way.
 #include "image.h"
 #include "simd.h"
 
@@ -42,7 +42,7 @@ POLARGUIDE_INLINE void locate(const CubemapArgs &a, int64_t first, int n, Cells 
         const reg major = on_x ? x : on_y ? y : z, size = on_x ? ax : on_y ? ay : az;
         const ireg negative = major < 0.0f;
         const reg flipped_x = negative ? -x : x, flipped_z = negative ? -z : z;
-        const reg inverse = size <= 1e-20f ? reg{} : 1.0f / size; // no direction: the centre of +x, without a gradient
+        const reg inverse = size <= 1e-20f ? reg{} : 1.0f / size; // no direction: the center of +x, without a gradient
         const reg s = (on_x ? -flipped_z : on_y ? x : flipped_x) * inverse, t = (on_y ? flipped_z : -y) * inverse;
         const ireg face = (on_y & 2) | (on_z & 4) | (negative & 1);
         for (int l = 0; l < reg_lanes; ++l) cells->face[b + l] = face[l];
@@ -58,8 +58,8 @@ struct Tap {
     int64_t texel[3];
 };
 
-// The texel of the neighbouring face next to (column, row), one of which is one step off `face`. Positions on the cube
-// are counted in half texels from its centre: a face lies at +-R, its texels' centres at -(R - 1) .. R - 1.
+// The texel of the neighboring face next to (column, row), one of which is one step off `face`. Positions on the cube
+// are counted in half texels from its center: a face lies at +-R, its texels' centers at -(R - 1) .. R - 1.
 POLARGUIDE_INLINE int64_t across(int face, int column, int row, int resolution) {
     const int last = resolution - 1, axis = face / 2;
     int p[3];

@@ -110,10 +110,10 @@ template <int D> POLARGUIDE_INLINE void store_rest(float *rest, int n, float *sp
         for (int i = 0; i < n * rest_values; ++i) rest[i] = spare[i];
 }
 
-// Unit directions from the centre; a Gaussian at the centre has direction zero. Returns 1 / distance.
+// Unit directions from the center; a Gaussian at the center has direction zero. Returns 1 / distance.
 POLARGUIDE_INLINE vf directions(const HarmonicsArgs &a, int64_t first, int n, vf *d) {
     load3(a.means + 3 * first, n, d);
-    for (int i = 0; i < 3; ++i) d[i] -= a.centre[i];
+    for (int i = 0; i < 3; ++i) d[i] -= a.center[i];
     const vf squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
     alignas(64) float root[lanes];
     store(root, squared);

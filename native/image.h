@@ -1,4 +1,4 @@
-// Kernels of pictures and colours: photometric loss, cubemap look-up, spherical harmonics, normals.
+// Kernels of pictures and colors: photometric loss, cubemap look-up, spherical harmonics, normals.
 #pragma once
 #include "kernels.h"
 
@@ -6,7 +6,7 @@
 
 namespace polarguide {
 
-// Photometric loss of one picture, in passes over rows. Planes are [height][stride]: interleaved colours, zero beyond
+// Photometric loss of one picture, in passes over rows. Planes are [height][stride]: interleaved colors, zero beyond
 // 3 * width; `stride` is a multiple of 16. `scratch` is a worker's own: see photometric_scratch.
 struct PhotometricArgs {
     int width, height;
@@ -42,7 +42,7 @@ POLARGUIDE_DECLARE(void cubemap_backward_texture(const CubemapArgs &a, int64_t b
 
 struct HarmonicsArgs {
     int degree;
-    const float *means, *centre, *dc, *rest; // [N,3] [3] [N,3] [N,15,3]
+    const float *means, *center, *dc, *rest; // [N,3] [3] [N,3] [N,15,3]
     float *out;                              // [N,3]
     const float *grad_out;
     float *grad_means, *grad_dc, *grad_rest;
@@ -52,7 +52,7 @@ POLARGUIDE_DECLARE(void harmonics_backward(const HarmonicsArgs &a, int64_t begin
 
 // Shortest axes of Gaussians turned outward, their gradient, and rays mirrored at them.
 struct AxesArgs {
-    const float *means, *quaternions, *log_scales, *centre; // [N,3] [N,4] [N,3] [3]
+    const float *means, *quaternions, *log_scales, *center; // [N,3] [N,4] [N,3] [3]
     const float *outward;                                   // [N,3] or null
     float grazing;                                          // cosine under which `outward` decides
     const float *normals;                                   // [N,3], of mirrored_forward
@@ -64,7 +64,7 @@ POLARGUIDE_DECLARE(void axes_forward(const AxesArgs &a, int64_t begin, int64_t e
 POLARGUIDE_DECLARE(void axes_backward(const AxesArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void mirrored_forward(const AxesArgs &a, int64_t begin, int64_t end))
 
-// Deferred reflection per pixel. Features are base colour, normal, strength and, with `local`, three of light; others
+// Deferred reflection per pixel. Features are base color, normal, strength and, with `local`, three of light; others
 // may follow. `seen` is what the look-up of `directions` gave.
 struct ReflectArgs {
     int channels;

@@ -11,7 +11,7 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-constexpr int reach = 5, taps = 11, moments = 4, colours = 3;
+constexpr int reach = 5, taps = 11, moments = 4, colors = 3;
 constexpr float tap[taps] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
                              0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
 constexpr float c1 = 0.0001f, c2 = 0.0009f; // (0.01)^2 and (0.03)^2, of a range of 1
@@ -51,11 +51,11 @@ POLARGUIDE_INLINE double sum_of(reg x) {
     return sum;
 }
 
-// The weights of row y, once per colour; zero in the padding.
+// The weights of row y, once per color; zero in the padding.
 POLARGUIDE_INLINE void spread_weights(const PhotometricArgs &a, int64_t y, float *line) {
     for (int x = 0; x < a.width; ++x)
-        for (int c = 0; c < colours; ++c) line[colours * x + c] = a.weight ? a.weight[y * a.width + x] : 1.0f;
-    for (int64_t x = int64_t(colours) * a.width; x < a.stride; ++x) line[x] = 0.0f;
+        for (int c = 0; c < colors; ++c) line[colors * x + c] = a.weight ? a.weight[y * a.width + x] : 1.0f;
+    for (int64_t x = int64_t(colors) * a.width; x < a.stride; ++x) line[x] = 0.0f;
 }
 
 // A worker's scratch: lines with room for the taps on both sides, which stays zero.
@@ -116,7 +116,7 @@ void blur_line(const float *line, float *out, int64_t stride) {
     for (int64_t x = 0; x < stride; x += reg_lanes) {
         reg sum = reg_load(line + x) * tap[reach];
         for (int t = 1; t <= reach; ++t)
-            sum += (reg_load(line + x - colours * t) + reg_load(line + x + colours * t)) * tap[reach + t];
+            sum += (reg_load(line + x - colors * t) + reg_load(line + x + colors * t)) * tap[reach + t];
         reg_store(out + x, sum);
     }
 }
@@ -124,7 +124,7 @@ void blur_line(const float *line, float *out, int64_t stride) {
 } // namespace
 
 void photometric_show(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch) {
-    const int64_t used = int64_t(colours) * a.width;
+    const int64_t used = int64_t(colors) * a.width;
     const Lines l = lay_out(a, scratch);
     for (int64_t y = begin; y < end; ++y) {
         if (a.weight || y == begin) spread_weights(a, y, l.weight);
@@ -166,7 +166,7 @@ void photometric_statistics(const PhotometricArgs &a, int64_t begin, int64_t end
 }
 
 void photometric_gradient(const PhotometricArgs &a, int64_t begin, int64_t end, float *scratch) {
-    const int64_t used = int64_t(colours) * a.width;
+    const int64_t used = int64_t(colors) * a.width;
     const reg for_l1 = reg_splat((1.0f - a.ssim_weight) * a.inverse_count), for_ssim = reg_splat(-a.ssim_weight * a.inverse_count);
     const Lines l = lay_out(a, scratch);
     for (int64_t y = begin; y < end; ++y) {

@@ -127,7 +127,7 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
         const float *s = args.screen + g * screen_values;
         for (int ty = box[2]; ty < box[3]; ++ty)
             for (int tx = box[0]; tx < box[1]; ++tx) {
-                // The largest exponent over the tile's pixel centres: on one of the two sides facing the centre.
+                // The largest exponent over the tile's pixel centers: on one of the two sides facing the center.
                 const float x0 = float(tx * tile_size) + 0.5f - s[0], x1 = x0 + (tile_size - 1);
                 const float y0 = float(ty * tile_size) + 0.5f - s[1], y1 = y0 + (tile_size - 1);
                 const float cx = x0 > 0 ? x0 : x1 < 0 ? x1 : 0, cy = y0 > 0 ? y0 : y1 < 0 ? y1 : 0;

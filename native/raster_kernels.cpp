@@ -19,7 +19,7 @@ alignas(64) const float lane_y[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.
                                       .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
 // The blocks (one bit each) of a tile in which log2(alpha) of a Gaussian can reach the threshold. The maximum of the
-// concave exponent over a block lies on one of the two sides that face the centre. `row` is relative to the tile centre.
+// concave exponent over a block lies on one of the two sides that face the center. `row` is relative to the tile center.
 POLARGUIDE_INLINE uint32_t touched_blocks(const float *row) {
     vf bx = load(lane_x) * 4.0f - row[0], by = load(lane_y) * 4.0f - row[1];
     vf x0 = bx - 1.5f, x1 = bx + 1.5f, y0 = by - 1.5f, y1 = by + 1.5f;
@@ -35,7 +35,7 @@ POLARGUIDE_INLINE uint32_t touched_blocks(const float *row) {
 struct Tile {
     int count;
     int x0, y0;
-    float centre_x, centre_y;
+    float center_x, center_y;
     int list_sizes[16];
 };
 
@@ -45,14 +45,14 @@ template <int D> POLARGUIDE_INLINE Tile open_tile(const RasterArgs &a, int64_t t
     int64_t begin = a.tile_begin[tile];
     t.count = int(a.tile_begin[tile + 1] - begin);
     t.x0 = int(tile % a.tiles_x) * tile_size, t.y0 = int(tile / a.tiles_x) * tile_size;
-    t.centre_x = float(t.x0) + 8.0f, t.centre_y = float(t.y0) + 8.0f;
+    t.center_x = float(t.x0) + 8.0f, t.center_y = float(t.y0) + 8.0f;
     int sizes[16] = {0};
     const int n = t.count, real = a.channels_real;
     for (int i = 0; i < n; ++i) {
         int64_t g = a.gaussians[begin + i];
         const float *screen = a.screen + g * screen_values, *features = a.features + g * real;
         float *row = s.rows + int64_t(i) * (D + 6);
-        row[0] = screen[0] - t.centre_x, row[1] = screen[1] - t.centre_y;
+        row[0] = screen[0] - t.center_x, row[1] = screen[1] - t.center_y;
         for (int k = 2; k < 6; ++k) row[k] = screen[k];
         for (int k = 0; k < real; ++k) row[6 + k] = features[a.permutation[k]];
         for (int k = real; k < D; ++k) row[6 + k] = 0.0f;
@@ -67,7 +67,7 @@ template <int D> POLARGUIDE_INLINE Tile open_tile(const RasterArgs &a, int64_t t
 
 struct Block {
     int x, y;   // first pixel
-    vf px, py;  // pixel centres relative to the tile centre
+    vf px, py;  // pixel centers relative to the tile center
 };
 POLARGUIDE_INLINE bool open_block(const RasterArgs &a, const Tile &t, int block, Block *out) {
     int bx = (block & 3) * 4, by = (block >> 2) * 4;
@@ -166,7 +166,7 @@ struct Batch {
     int size = 0;
 };
 
-// Moments 1, x, y, xx, xy, yy of a block's pixels (transposed: v[pixel] holds sixteen Gaussians), about the tile centre.
+// Moments 1, x, y, xx, xy, yy of a block's pixels (transposed: v[pixel] holds sixteen Gaussians), about the tile center.
 POLARGUIDE_INLINE void moments(const float *v, float x, float y, bool second, vf *m) {
     vf column[4], row[4], xy = vf{};
     for (int i = 0; i < 4; ++i) column[i] = load(v + 16 * i);

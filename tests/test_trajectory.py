@@ -13,13 +13,13 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
-from polarguide.surroundings import surroundings
+from polarguide.scene_frame import scene_frame
 from polarguide.trajectory import camera_record, interpolated, looking, orbit, read_path, spiral
 
 EYE = torch.eye(3, dtype=torch.float64)
 LENS = Camera(64, 48, 70.0, 70.0, 32.0, 24.0, EYE, EYE[0])
 UP = torch.tensor([0.1, -1.0, 0.2], dtype=torch.float64) / math.sqrt(1.05)
-CENTRE = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+CENTER = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
 
 
 def around(count: int = 8, distance: float = 4.0) -> list[Camera]:
@@ -30,13 +30,13 @@ def around(count: int = 8, distance: float = 4.0) -> list[Camera]:
     for k in range(count):
         angle = 2 * math.pi * k / count
         way = math.cos(angle) * ahead + math.sin(angle) * side + 0.3 * UP
-        cameras.append(looking(LENS, CENTRE + distance * way / way.norm(), CENTRE, UP))
+        cameras.append(looking(LENS, CENTER + distance * way / way.norm(), CENTER, UP))
     return cameras
 
 
 def test_the_frame_of_cameras_around_a_point() -> None:
-    frame = surroundings(around())
-    torch.testing.assert_close(frame.centre, CENTRE)
+    frame = scene_frame(around())
+    torch.testing.assert_close(frame.center, CENTER)
     torch.testing.assert_close(frame.up, UP, atol=1e-6, rtol=0)
     assert frame.distance == pytest.approx(4.0)
 
@@ -46,14 +46,14 @@ def test_one_camera_and_parallel_ones_have_a_frame() -> None:
         [LENS],
         [LENS, replace(LENS, translation=torch.tensor([5.0, 0, 0], dtype=torch.float64))],
     ):
-        frame = surroundings(cameras)
-        assert bool(torch.isfinite(frame.centre).all())
+        frame = scene_frame(cameras)
+        assert bool(torch.isfinite(frame.center).all())
         assert frame.distance > 0
-        assert float((frame.centre - cameras[0].centre) @ cameras[0].rotation[2]) > 0
+        assert float((frame.center - cameras[0].center) @ cameras[0].rotation[2]) > 0
 
 
 def test_turning_is_counter_clockwise_seen_from_above() -> None:
-    frame = surroundings(around())
+    frame = scene_frame(around())
     axes = frame.panorama_axes()
     right, up, back = axes.unbind(1)
     torch.testing.assert_close(axes @ axes.T, EYE, atol=1e-9, rtol=0)
@@ -68,17 +68,17 @@ def angle_between(a: Tensor, b: Tensor) -> float:
 
 
 @pytest.mark.parametrize("path", [orbit, spiral])
-def test_paths_around_look_at_the_centre_upright(path) -> None:  # type: ignore[no-untyped-def]
+def test_paths_around_look_at_the_center_upright(path) -> None:  # type: ignore[no-untyped-def]
     cameras = path(around(), 16)
     assert len(cameras) == 16
     for camera in cameras:
-        assert angle_between(CENTRE - camera.centre, camera.rotation[2]) < 1e-5
+        assert angle_between(CENTER - camera.center, camera.rotation[2]) < 1e-5
         assert angle_between(-camera.rotation[1], UP) < 60
         assert abs(float(camera.rotation[0] @ UP)) < 1e-6  # no roll
         assert float(torch.linalg.det(camera.rotation)) == pytest.approx(1)
     if path is orbit:
-        torch.testing.assert_close(cameras[0].centre, around()[0].centre)
-        steps = torch.stack([camera.centre for camera in cameras])
+        torch.testing.assert_close(cameras[0].center, around()[0].center)
+        steps = torch.stack([camera.center for camera in cameras])
         gaps = (steps - steps.roll(1, 0)).norm(dim=1)
         torch.testing.assert_close(gaps, gaps[:1].expand(16))
 
@@ -87,7 +87,7 @@ def test_interpolation_passes_through_the_cameras() -> None:
     cameras = around(5)
     path = interpolated(cameras, 41)
     for k, camera in enumerate(cameras):
-        torch.testing.assert_close(path[10 * k].centre, camera.centre, atol=1e-9, rtol=0)
+        torch.testing.assert_close(path[10 * k].center, camera.center, atol=1e-9, rtol=0)
         torch.testing.assert_close(path[10 * k].rotation, camera.rotation, atol=1e-6, rtol=0)
     assert len(interpolated([LENS, LENS], 3)) == 3
 
@@ -100,7 +100,7 @@ def test_a_file_of_cameras_is_read_back(tmp_path: Path) -> None:
     assert speed == 24
     for a, b in zip(read, cameras, strict=True):
         assert (a.width, a.height, a.fx, a.cy) == (b.width, b.height, b.fx, b.cy)
-        torch.testing.assert_close(a.centre, b.centre)
+        torch.testing.assert_close(a.center, b.center)
 
 
 @pytest.mark.parametrize(

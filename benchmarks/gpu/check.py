@@ -232,7 +232,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
     if benches:
         shares = [cell for _, found in benches for cell in (number(found["ours"]["outside"]), "")]
-        lines.append("| share outside rasteriser, SSIM, optimiser | " + " | ".join(shares) + " |")
+        lines.append("| share outside rasterizer, SSIM, optimizer | " + " | ".join(shares) + " |")
     for part in ("train-demo", "train-spheres", "train-long"):
         if found := results[part]:
             told = f"{found['steps']:,} of {found['of']:,} steps in {found['minutes']:.1f} minutes"

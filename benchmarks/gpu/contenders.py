@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene
-from polarguide.gaussians.rows import CORE_ROWS, GaussianRows
+from polarguide.color import srgb_encode
+from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 from polarguide.raster import Backend
 from polarguide.recipes import RECIPES
-from polarguide.shading.display import srgb_encode
-from polarguide.shading.render import render
+from polarguide.shading.deferred import render
 from polarguide.training.photometric import photometric_loss
-from polarguide.training.stages import Recipe
+from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer, TrainSettings
 
@@ -32,7 +32,7 @@ def steady(name: str) -> Recipe:
 
 def split_to(state: TrainingState, count: int, seed: int = 0) -> dict[str, Tensor]:
     """Rows of ``count`` Gaussians: each of a trained state many times, drawn from itself and smaller by as much."""
-    rows, generator = state.rows.snapshot(), torch.Generator().manual_seed(seed)
+    rows, generator = state.gaussians.snapshot(), torch.Generator().manual_seed(seed)
     present = len(rows["means"])
     pick = torch.arange(count) % present
     copies = count / present
@@ -62,9 +62,9 @@ class Ours:
         trainer, state = self.trainer, self.trainer.state
         assert state.environment is not None
         render(
-            state.rows,
+            state.gaussians,
             trainer._view_of(state.step + self._next()).camera,
-            trainer.backend.rasterise,
+            trainer.backend.rasterize,
             environment=state.environment.parameters,
             shading=self._shading,
             depth=True,
@@ -84,11 +84,11 @@ class Ours:
         trainer, state = self.trainer, self.trainer.state
         view = trainer._view_of(state.step + self._next())
         environment = state.environment.parameters if state.environment else None
-        rasterise, shading = trainer.backend.rasterise, self._shading
+        rasterize, shading = trainer.backend.rasterize, self._shading
         render(
-            state.rows,
+            state.gaussians,
             view.camera,
-            rasterise,
+            rasterize,
             environment=environment,
             shading=shading,
             normals=layers,
@@ -96,8 +96,8 @@ class Ours:
         )
 
     def parts(self) -> dict[str, Any]:
-        """The rasteriser, SSIM and the optimiser of a step by themselves, as calls."""
-        trainer, rows = self.trainer, self.trainer.state.rows
+        """The rasterizer, SSIM and the optimizer of a step by themselves, as calls."""
+        trainer, rows = self.trainer, self.trainer.state.gaussians
         view = trainer._view_of(trainer.state.step)
         leaves = [
             rows["means"],
@@ -113,7 +113,7 @@ class Ours:
         def raster() -> None:
             from polarguide.raster import ScreenStatistic
 
-            picture = trainer.backend.rasterise(
+            picture = trainer.backend.rasterize(
                 *leaves, features, view.camera, statistic=ScreenStatistic((0, 1, 2))
             )
             torch.autograd.grad((picture.features.sum() + picture.alpha.sum()), (*leaves, features))
@@ -123,12 +123,12 @@ class Ours:
             for _ in range(1 + (weights.specular > 0) + (weights.diffuse > 0)):
                 torch.autograd.grad(photometric_loss(prediction, shown), prediction)
 
-        def optimiser() -> None:
+        def optimizer() -> None:
             for t in rows.trained():
                 t.grad = torch.zeros_like(t)
-            trainer._optimise()
+            trainer._optimize()
 
-        return {"rasteriser": raster, "ssim": ssim, "optimiser": optimiser}
+        return {"rasterizer": raster, "ssim": ssim, "optimizer": optimizer}
 
     def _next(self) -> int:
         self._turn = (self._turn + 1) % len(self.trainer.scene.train_views)
@@ -141,7 +141,7 @@ class Plain:
     def __init__(self, scene: Scene, rows: dict[str, Tensor], device: torch.device) -> None:
         self._gsplat = importlib.import_module("gsplat")
         rates = RECIPES["3dgs"].rates
-        self.rows = GaussianRows({name: rows[name] for name in CORE_ROWS}, rates)
+        self.rows = Gaussians({name: rows[name] for name in CORE_SHAPES}, rates)
         self._views = []
         for view in scene.train_views:
             camera, matrix = view.camera, torch.eye(4, dtype=torch.float64)

@@ -19,7 +19,7 @@ def save_scene(scene: Scene, path: Path) -> None:
     """Write a scene without its truth. Pictures are kept exactly, as differences along rows."""
     arrays: dict[str, Any] = {
         "points": scene.points.numpy(),
-        "point_colours": scene.point_colours.numpy(),
+        "point_colors": scene.point_colors.numpy(),
         "about": np.array(json.dumps({"name": scene.name, "test": scene.test_names, "digest": scene.digest})),
     }
     for number, view in enumerate(scene.views):
@@ -48,7 +48,7 @@ def read_scene(path: Path) -> Scene:
             views=views,
             test_names=tuple(about["test"]),
             points=torch.from_numpy(file["points"]),
-            point_colours=torch.from_numpy(file["point_colours"]),
+            point_colors=torch.from_numpy(file["point_colors"]),
             refractive_index=None,
             downscale=1,
             transfer="linear",

@@ -23,12 +23,12 @@ import polarguide
 from polarguide.capture import Scene
 from polarguide.evaluation.metrics import psnr
 from polarguide.gaussians.densify import DensityStatistics
-from polarguide.gaussians.rows import GaussianRows
+from polarguide.gaussians.gaussians import Gaussians
 from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
-from polarguide.shading.render import render
-from polarguide.training.run import CHECKPOINT, load_checkpoint, save_checkpoint
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
+from polarguide.shading.deferred import render
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer, TrainSettings
 
@@ -82,7 +82,7 @@ def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
         "steps": trainer.state.step,
         "of": steps,
         "minutes": spent / 60,
-        "gaussians": len(trainer.state.rows),
+        "gaussians": len(trainer.state.gaussians),
     }
     found["psnr"] = mean_psnr(scene, trainer.state, job.backend) if finished else None
     return {"finished": finished, **found}
@@ -95,7 +95,9 @@ def mean_psnr(scene: Scene, state: TrainingState, backend: Backend) -> float:
     for view in scene.test_views:
         light = environment.parameters if environment else None
         shading = RECIPE.shading(1.5)
-        picture = render(state.rows, view.camera, backend.rasterise, environment=light, shading=shading).final
+        picture = render(
+            state.gaussians, view.camera, backend.rasterize, environment=light, shading=shading
+        ).final
         values.append(psnr(picture, view.photograph(), ~view.invalid))
     return sum(values) / len(values)
 
@@ -110,13 +112,13 @@ def bench(job: Job, scene: Scene, state: TrainingState) -> dict[str, Any]:
     """Ours against plain gsplat on the same Gaussians."""
     device, few = job.backend.device, job.tiny
     repeats, warm_up = (2, 1) if few else (40, max(10, len(scene.train_views) + 2))
-    begin_rows = state.rows.snapshot()
+    begin_rows = state.gaussians.snapshot()
 
     def timed(call: Callable[[], object]) -> float:
         return milliseconds(call, device, repeats=repeats, warm_up=warm_up)
 
     ours = Ours(scene, state, job.backend)
-    found: dict[str, Any] = {"gaussians": len(state.rows)}
+    found: dict[str, Any] = {"gaussians": len(state.gaussians)}
     camera = scene.train_views[0].camera
     found["size"] = [camera.width, camera.height]
     whole, forward, look = timed(ours.step), timed(ours.forward), timed(ours.look)
@@ -172,7 +174,7 @@ def stress(job: Job) -> dict[str, Any]:
     """A million Gaussians at 1224 x 1024."""
     count, size = (20_000, (160, 128)) if job.tiny else (1_000_000, (1224, 1024))
     state = trained(job, "spheres")
-    rows = GaussianRows(split_to(state, count), RECIPE.rates)
+    rows = Gaussians(split_to(state, count), RECIPE.rates)
     state = TrainingState(0, rows, state.environment, DensityStatistics(count, 1, job.backend.device))
     return bench(job, enlarged(job.scene("spheres"), *size, views=8), state)
 

@@ -13,7 +13,7 @@ def select_simd(name: str) -> None: ...
 def first_not_finite(array: Tensor) -> int: ...
 def fma_peak(seconds: float = 0.5) -> float: ...
 
-class Rasteriser:
+class Rasterizer:
     def __init__(
         self,
         rotation: Sequence[float],
@@ -76,12 +76,12 @@ def cubemap_backward(
     grad_directions: Tensor | None,
 ) -> None: ...
 def harmonics_forward(
-    degree: int, means: Tensor, centre: Tensor, dc: Tensor, rest: Tensor, out: Tensor
+    degree: int, means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, out: Tensor
 ) -> None: ...
 def harmonics_backward(
     degree: int,
     means: Tensor,
-    centre: Tensor,
+    center: Tensor,
     dc: Tensor,
     rest: Tensor,
     grad_out: Tensor,
@@ -93,7 +93,7 @@ def axes_forward(
     means: Tensor,
     quaternions: Tensor,
     log_scales: Tensor,
-    centre: Tensor,
+    center: Tensor,
     outward: Tensor | None,
     grazing: float,
     out: Tensor,
@@ -102,13 +102,13 @@ def axes_backward(
     means: Tensor,
     quaternions: Tensor,
     log_scales: Tensor,
-    centre: Tensor,
+    center: Tensor,
     outward: Tensor | None,
     grazing: float,
     grad_out: Tensor,
     grad_quaternions: Tensor,
 ) -> None: ...
-def mirrored_forward(means: Tensor, centre: Tensor, normals: Tensor, out: Tensor) -> None: ...
+def mirrored_forward(means: Tensor, center: Tensor, normals: Tensor, out: Tensor) -> None: ...
 def reflect_directions(features: Tensor, rays: Tensor, directions: Tensor) -> None: ...
 def reflect_layers(
     features: Tensor,

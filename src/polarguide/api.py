@@ -16,8 +16,8 @@ from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import validate_metrics
 from polarguide.raster import DeviceName
+from polarguide.runs.opened import TrainedRun, open_trained
 from polarguide.shading.result import LAYERS, RenderResult
-from polarguide.trained import TrainedRun, open_trained
 
 __all__ = ["LAYERS", "Model", "PolarguideError", "load"]
 
@@ -41,9 +41,7 @@ class Model:
         self._scene_folder = scene or Path(run.configuration.scene)
 
     def __repr__(self) -> str:
-        return (
-            f"<Model {self.folder}: {self.recipe}, {self.steps} steps, {len(self._run.state.rows)} Gaussians>"
-        )
+        return f"<Model {self.folder}: {self.recipe}, {self.steps} steps, {len(self._run.state.gaussians)} Gaussians>"
 
     @property
     def folder(self) -> Path:
@@ -63,7 +61,7 @@ class Model:
     @property
     def gaussians(self) -> dict[str, Tensor]:
         """The rows by name, one row a Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Not to be written to."""
-        return {name: self._run.state.rows[name].detach() for name in self._run.state.rows.names}
+        return {name: self._run.state.gaussians[name].detach() for name in self._run.state.gaussians.names}
 
     @property
     def environment(self) -> dict[str, Tensor] | None:

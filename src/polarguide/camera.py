@@ -1,6 +1,6 @@
 """A pinhole camera with a pose: the one camera type of the project.
 
-OpenCV axes (x right, y down, z forward), world-to-camera pose ``x_cam = R x_world + t``, and the centre of the
+OpenCV axes (x right, y down, z forward), world-to-camera pose ``x_cam = R x_world + t``, and the center of the
 top-left pixel at (0.5, 0.5), as in COLMAP.
 """
 
@@ -20,14 +20,14 @@ from polarguide.vectors import unit
 def _pixel_rays(
     size: tuple[int, int],
     focal: tuple[float, float],
-    centre: tuple[float, float],
+    center: tuple[float, float],
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor:
     """Rays of an internal calibration, which views share and every rendering asks for."""
     x, y = (
         (torch.arange(n, dtype=dtype, device=device) + 0.5 - c) / f
-        for n, f, c in zip(size, focal, centre, strict=True)
+        for n, f, c in zip(size, focal, center, strict=True)
     )
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     return unit(torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1))
@@ -37,12 +37,12 @@ class Pose(NamedTuple):
     """A pose on one device, in one dtype.
 
     Attributes:
-        rotation: world-to-camera, [3, 3]. translation: world-to-camera, [3]. centre: of the camera in the world, [3].
+        rotation: world-to-camera, [3, 3]. translation: world-to-camera, [3]. center: of the camera in the world, [3].
     """
 
     rotation: Tensor
     translation: Tensor
-    centre: Tensor
+    center: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +66,8 @@ class Camera:
     translation: Tensor
 
     @property
-    def centre(self) -> Tensor:
-        """Camera centre in the world, [3] float64."""
+    def center(self) -> Tensor:
+        """Camera center in the world, [3] float64."""
         return -self.rotation.T @ self.translation
 
     def pose(self, dtype: torch.dtype, device: torch.device) -> Pose:
@@ -75,16 +75,16 @@ class Camera:
         poses: dict[tuple[torch.dtype, torch.device], Pose] = self.__dict__.setdefault("_poses", {})
         key = (dtype, device)
         if key not in poses:
-            poses[key] = Pose(*(t.to(device, dtype) for t in (self.rotation, self.translation, self.centre)))
+            poses[key] = Pose(*(t.to(device, dtype) for t in (self.rotation, self.translation, self.center)))
         return poses[key]
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """Unit rays through the pixel centres in camera axes, [height, width, 3]; not to be written to."""
-        size, focal, centre = (self.width, self.height), (self.fx, self.fy), (self.cx, self.cy)
-        return _pixel_rays(size, focal, centre, dtype, torch.device(device))
+        """Unit rays through the pixel centers in camera axes, [height, width, 3]; not to be written to."""
+        size, focal, center = (self.width, self.height), (self.fx, self.fy), (self.cx, self.cy)
+        return _pixel_rays(size, focal, center, dtype, torch.device(device))
 
     def world_rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """Unit rays through the pixel centres in world axes, [height, width, 3]."""
+        """Unit rays through the pixel centers in world axes, [height, width, 3]."""
         return self.rays(dtype=dtype, device=device) @ self.pose(dtype, torch.device(device)).rotation
 
     def to_world(self, vectors: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
-from polarguide.surroundings import Surroundings, surroundings
+from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.vectors import dot, unit
 
 LARGEST_SIDE = 8192
@@ -29,7 +29,7 @@ MOST_FRAMES = 100_000
 
 
 def looking(lens: Camera, eye: Tensor, target: Tensor, up: Tensor) -> Camera:
-    """A camera with the lens and size of another at ``eye`` [3], looking at ``target`` [3], upright towards ``up``."""
+    """A camera with the lens and size of another at ``eye`` [3], looking at ``target`` [3], upright toward ``up``."""
     forward = unit(target - eye, 1e-12)
     right = unit(torch.linalg.cross(forward, up), 1e-12)
     rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
@@ -43,9 +43,9 @@ def orbit(cameras: Sequence[Camera], frames: int, *, swing: float = 0.0) -> list
         cameras: of the scene, at least one; the first one's lens is used.
         frames: pictures, the last a step before the first. swing: up and down by this share of the distance, twice.
     """
-    around = surroundings(cameras)
-    ahead, side = _level_axes(around, cameras[0].centre)
-    offsets = torch.stack([camera.centre for camera in cameras]) - around.centre
+    around = scene_frame(cameras)
+    ahead, side = _level_axes(around, cameras[0].center)
+    offsets = torch.stack([camera.center for camera in cameras]) - around.center
     height = float((offsets @ around.up).median())
     level = offsets - (offsets @ around.up)[:, None] * around.up
     radius = max(float(level.norm(dim=1).median()), 1e-6 * around.distance)
@@ -53,8 +53,8 @@ def orbit(cameras: Sequence[Camera], frames: int, *, swing: float = 0.0) -> list
     for k in range(frames):
         angle = 2 * math.pi * k / frames
         lift = height + swing * around.distance * math.sin(2 * angle)
-        eye = around.centre + radius * (math.cos(angle) * ahead + math.sin(angle) * side) + lift * around.up
-        path.append(looking(cameras[0], eye, around.centre, around.up))
+        eye = around.center + radius * (math.cos(angle) * ahead + math.sin(angle) * side) + lift * around.up
+        path.append(looking(cameras[0], eye, around.center, around.up))
     return path
 
 
@@ -70,24 +70,24 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """
     kept = list(cameras[:1])
     for camera in cameras[1:]:
-        if float((camera.centre - kept[-1].centre).norm()) > 1e-9:
+        if float((camera.center - kept[-1].center).norm()) > 1e-9:
             kept.append(camera)
     if len(kept) == 1:
         return kept * frames
     times, wanted = np.arange(len(kept)), np.linspace(0, len(kept) - 1, frames)
-    centres = CubicSpline(times, torch.stack([camera.centre for camera in kept]).numpy())(wanted)
+    centers = CubicSpline(times, torch.stack([camera.center for camera in kept]).numpy())(wanted)
     turns = Rotation.from_matrix(torch.stack([camera.rotation for camera in kept]).numpy())
     rotations = RotationSpline(times, turns)(wanted).as_matrix()
     path = []
-    for centre, matrix in zip(centres, rotations, strict=True):
+    for center, matrix in zip(centers, rotations, strict=True):
         rotation = torch.from_numpy(np.ascontiguousarray(matrix))
-        path.append(replace(kept[0], rotation=rotation, translation=-rotation @ torch.from_numpy(centre)))
+        path.append(replace(kept[0], rotation=rotation, translation=-rotation @ torch.from_numpy(center)))
     return path
 
 
-def _level_axes(around: Surroundings, begin: Tensor) -> tuple[Tensor, Tensor]:
-    """Level directions from the centre towards ``begin`` [3], and a quarter turn from it, counter-clockwise."""
-    offset = begin - around.centre
+def _level_axes(around: SceneFrame, begin: Tensor) -> tuple[Tensor, Tensor]:
+    """Level directions from the center toward ``begin`` [3], and a quarter turn from it, counter-clockwise."""
+    offset = begin - around.center
     level = offset - dot(offset, around.up) * around.up
     if float(level.norm()) < 1e-6 * around.distance:
         level = -around.panorama_axes()[:, 2]

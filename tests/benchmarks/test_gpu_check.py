@@ -31,7 +31,7 @@ def test_a_packed_scene_is_the_scene(demo_scene: Path, pack: Path) -> None:
     scene, again = load_scene(demo_scene, downscale=2), packed.read_scene(pack / f"demo{packed.SUFFIX}")
     assert again.test_names == scene.test_names
     assert torch.equal(again.points, scene.points)
-    assert torch.equal(again.point_colours, scene.point_colours)
+    assert torch.equal(again.point_colors, scene.point_colors)
     for a, b in zip(again.views, scene.views, strict=True):
         assert a.name == b.name
         for name in ("codes", "invalid", "saturated"):

@@ -15,8 +15,8 @@ from camera_files import ANGLES, behind, read_invalid, read_polar, smooth_light
 from polarguide.capture.filter import camera_raw
 from polarguide.capture.filter.camera_raw import read_camera_raw
 from polarguide.capture.filter.exif import turned
-from polarguide.capture.prepare import PrepareSettings, prepare_scene
 from polarguide.errors import PolarguideError
+from polarguide.preparation import PrepareSettings, prepare_scene
 
 PLAIN = PrepareSettings(poses="none", gains="none", align=False)
 UNIT = (1.0, 1.0, 1.0)

@@ -91,7 +91,7 @@ def test_bits_that_were_not_scaled(capture: TinyCapture, bits: int, factor: int)
 
 
 def test_full_scale_below_the_largest_code(capture: TinyCapture) -> None:
-    """Pictures quantised in steps of 64 saturate at 65472."""
+    """Pictures quantized in steps of 64 saturate at 65472."""
     capture.rewrite(lambda linear: np.floor(np.clip(linear * 2.5, 0, 1) * 1023.99) * 64 / 65535)
     scene = load_scene(capture.root)
     for view in scene.views:
@@ -127,7 +127,7 @@ def test_full_scale_of_eight_bits() -> None:
 
 
 def test_curvature_needs_polarized_light() -> None:
-    grey = np.full((4, 60, 60, 3), 30000, np.uint16)
+    gray = np.full((4, 60, 60, 3), 30000, np.uint16)
     usable = np.ones((60, 60), bool)
-    assert checks.curvature([checks.measure(grey, usable)]) is None
-    assert checks.curvature([checks.measure(grey, ~usable)]) is None
+    assert checks.curvature([checks.measure(gray, usable)]) is None
+    assert checks.curvature([checks.measure(gray, ~usable)]) is None

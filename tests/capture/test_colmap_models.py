@@ -45,7 +45,7 @@ def test_binary_and_text_models_read_the_same(capture: TinyCapture) -> None:
     to_binary(capture)
     binary = load_scene(capture.root)
     assert torch.equal(text.points, binary.points)
-    assert torch.equal(text.point_colours, binary.point_colours)
+    assert torch.equal(text.point_colors, binary.point_colors)
     for one, other in zip(text.views, binary.views, strict=True):
         torch.testing.assert_close(one.camera.rotation, other.camera.rotation, atol=1e-15, rtol=0)
         assert torch.equal(one.camera.translation, other.camera.translation)

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_capture import HEIGHT, WIDTH, TinyCapture, encode_srgb
 
-from polarguide.capture import boxes, load_scene
+from polarguide.capture import box_filter as boxes
+from polarguide.capture import load_scene
 
 
 def slow_boxes(values: np.ndarray, factor: int) -> list[list[np.ndarray]]:
@@ -83,9 +84,15 @@ def test_ground_truth(capture: TinyCapture, factor: int) -> None:
     normal[~mask] = 0.0
     specular, diffuse = rng.random((2, HEIGHT, WIDTH, 3))
     capture.write_truth("v000", normal=normal, depth=depth, mask=mask, specular=specular, diffuse=diffuse)
-    truth = load_scene(capture.root, downscale=factor).views[0].truth
-    assert truth is not None
-    fields = (truth.normal, truth.depth, truth.mask, truth.specular, truth.diffuse)
+    ground_truth = load_scene(capture.root, downscale=factor).views[0].ground_truth
+    assert ground_truth is not None
+    fields = (
+        ground_truth.normal,
+        ground_truth.depth,
+        ground_truth.mask,
+        ground_truth.specular,
+        ground_truth.diffuse,
+    )
     found = [field.numpy() for field in fields if field is not None]
     mean_normal = slow(lambda box: box.mean(axis=0), normal, factor)
     expected = [

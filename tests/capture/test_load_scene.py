@@ -39,7 +39,7 @@ def test_a_plain_capture_has_no_warnings_masks_or_truth(capture: TinyCapture) ->
     assert scene.refractive_index is None
     for view in scene.views:
         assert view.mask is None
-        assert view.truth is None
+        assert view.ground_truth is None
         assert not view.invalid.any()
         assert not view.saturated.any()
 
@@ -53,8 +53,8 @@ def test_cameras_and_points_are_those_of_the_model(capture: TinyCapture) -> None
     torch.testing.assert_close(camera.rotation, quarter_turn, atol=1e-12, rtol=0)
     torch.testing.assert_close(camera.translation, torch.tensor([0.3, -0.25, 2.5], dtype=torch.float64))
     assert scene.points.tolist() == [[-1, 0, 2], [0, 0, 3], [1, 1, 1], [0.5, 0.25, 1.5]]
-    assert scene.point_colours.dtype == torch.uint8
-    assert scene.point_colours.tolist() == [[255, 0, 128], [1, 2, 3], [4, 5, 6], [10, 20, 30]]
+    assert scene.point_colors.dtype == torch.uint8
+    assert scene.point_colors.tolist() == [[255, 0, 128], [1, 2, 3], [4, 5, 6], [10, 20, 30]]
 
 
 def test_every_eighth_view_is_held_out_by_default(capture: TinyCapture) -> None:
@@ -160,7 +160,7 @@ def test_records_are_frozen(capture: TinyCapture) -> None:
         scene.name = "other"  # type: ignore[misc]
 
 
-def test_unknown_view_names_its_neighbours(capture: TinyCapture) -> None:
+def test_unknown_view_names_its_neighbors(capture: TinyCapture) -> None:
     scene = load_scene(capture.root)
     with pytest.raises(PolarguideError, match=r"one of the 9 views, found 'v0O4'.*v004"):
         scene.view("v0O4")

@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_picture
 
 from polarguide.capture import load_scene
-from polarguide.capture.integrity import find_damage
-from polarguide.capture.pictures import decode_picture, linear_codes
+from polarguide.capture.formats.integrity import find_damage
+from polarguide.capture.formats.pictures import decode_picture, linear_codes
 from polarguide.errors import PolarguideError
 
 tifffile = pytest.importorskip("tifffile", reason="tifffile writes the unusual TIFF files")
 
-COLOURS = np.random.default_rng(0).integers(0, 65536, (20, 30, 3)).astype(np.uint16)
+COLORS = np.random.default_rng(0).integers(0, 65536, (20, 30, 3)).astype(np.uint16)
 
 
 def encoded(suffix: str, picture: np.ndarray, *options: int) -> bytes:
@@ -32,11 +32,11 @@ def encoded(suffix: str, picture: np.ndarray, *options: int) -> bytes:
 
 
 JPEGS = {
-    "baseline": encoded(".jpg", (COLOURS >> 8).astype(np.uint8)),
-    "progressive": encoded(".jpg", (COLOURS >> 8).astype(np.uint8), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
-    "restarts": encoded(".jpg", (COLOURS >> 8).astype(np.uint8), cv2.IMWRITE_JPEG_RST_INTERVAL, 1),
+    "baseline": encoded(".jpg", (COLORS >> 8).astype(np.uint8)),
+    "progressive": encoded(".jpg", (COLORS >> 8).astype(np.uint8), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "restarts": encoded(".jpg", (COLORS >> 8).astype(np.uint8), cv2.IMWRITE_JPEG_RST_INTERVAL, 1),
 }
-PNG = encoded(".png", COLOURS)
+PNG = encoded(".png", COLORS)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".tiff", ".PNG"])
@@ -66,12 +66,12 @@ def test_jpeg_is_read_within_its_loss(capture: TinyCapture) -> None:
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_grey_pictures_become_three_equal_channels(capture: TinyCapture, bits: int) -> None:
+def test_gray_pictures_become_three_equal_channels(capture: TinyCapture, bits: int) -> None:
     capture.rewrite(lambda linear: linear[..., 0], bits=bits)
     view = load_scene(capture.root).views[0]
-    grey = torch.from_numpy(capture.linear["v000"][..., :1]).float()
+    gray = torch.from_numpy(capture.linear["v000"][..., :1]).float()
     torch.testing.assert_close(
-        view.intensities(), grey.expand(-1, -1, -1, 3), atol=0.51 / (2**bits - 1), rtol=0
+        view.intensities(), gray.expand(-1, -1, -1, 3), atol=0.51 / (2**bits - 1), rtol=0
     )
 
 
@@ -146,10 +146,10 @@ def test_png_with_one_flipped_bit(at: int, bit: int) -> None:
 )
 def test_tiff_variants(tmp_path: Path, options: dict[str, object]) -> None:
     path = tmp_path / "picture.tif"
-    tifffile.imwrite(path, COLOURS, photometric="rgb", **options)
+    tifffile.imwrite(path, COLORS, photometric="rgb", **options)
     data = path.read_bytes()
     assert find_damage(data) is None
-    np.testing.assert_array_equal(decode_picture(path, data), COLOURS)
+    np.testing.assert_array_equal(decode_picture(path, data), COLORS)
     if "bigtiff" not in options:
         last_strip = int(len(data) * 0.97)
         assert "a TIFF file cut short" in str(find_damage(data[:last_strip]))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import COLOUR, MONO, pack, write_mosaic
+from camera_files import COLOR, MONO, pack, write_mosaic
 
 from polarguide.capture.sensor import (
     PACKINGS,
@@ -51,7 +51,7 @@ def test_files_that_know_their_size(tmp_path: Path, name: str, bits: int) -> Non
 
 
 @pytest.mark.parametrize(
-    ("sensor", "rows"), [("IMX250MYR", COLOUR), ("IMX264MYR", COLOUR), ("IMX250MZR", MONO)]
+    ("sensor", "rows"), [("IMX250MYR", COLOR), ("IMX264MYR", COLOR), ("IMX250MZR", MONO)]
 )
 def test_patterns_and_their_offsets(sensor: str, rows: tuple[str, ...]) -> None:
     pattern = sensor_pattern(sensor)

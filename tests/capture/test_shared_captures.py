@@ -30,17 +30,17 @@ def test_demo(place: str) -> None:
     assert scene.warnings == ()
     assert scene.points.shape == (4846, 3)
     for view in scene.test_views:
-        truth = view.truth
-        assert truth is not None
-        assert truth.normal is not None
-        assert truth.mask is not None
-        assert truth.specular is not None
-        assert truth.diffuse is not None
-        lengths = truth.normal[truth.mask].norm(dim=-1)
+        ground_truth = view.ground_truth
+        assert ground_truth is not None
+        assert ground_truth.normal is not None
+        assert ground_truth.mask is not None
+        assert ground_truth.specular is not None
+        assert ground_truth.diffuse is not None
+        lengths = ground_truth.normal[ground_truth.mask].norm(dim=-1)
         torch.testing.assert_close(lengths, torch.ones_like(lengths))
         # On surfaces the two lobes add up to S0, which is twice the photograph.
-        light = (truth.specular + truth.diffuse)[truth.mask] / 2
-        assert (view.photograph()[truth.mask] - light).abs().median() < 5e-3
+        light = (ground_truth.specular + ground_truth.diffuse)[ground_truth.mask] / 2
+        assert (view.photograph()[ground_truth.mask] - light).abs().median() < 5e-3
 
 
 @pytest.mark.shared

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from camera_files import read_invalid, read_polar
 
-from polarguide.capture.prepare import PrepareSettings, prepare_scene
+from polarguide.preparation import PrepareSettings, prepare_scene
 
 FOLDER = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "mosaic_mono"
 SETTINGS = PrepareSettings(sensor="IMX250MZR", poses="none")

@@ -21,7 +21,7 @@ import polarguide
 from polarguide.cli.app import run
 from polarguide.export import extras, points
 from polarguide.gaussians.ply import read_ply
-from polarguide.training.run import CHECKPOINT, CONFIGURATION
+from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 from polarguide.trajectory import camera_record
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[2] / "examples").glob("*.py"))
@@ -80,7 +80,7 @@ def test_splats_are_read_back(kind: str, trained: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(ours[:, axis]), atol=0.02, rtol=2e-3)
 
 
-def test_points_have_unit_normals_and_colours(
+def test_points_have_unit_normals_and_colors(
     trained: Path, tmp_path: Path, refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trimesh = pytest.importorskip("trimesh")
@@ -127,7 +127,7 @@ def test_cameras_are_read_by_pycolmap_and_as_opengl_poses(trained: Path, tmp_pat
     for frame in data["frames"]:
         camera = cameras[Path(frame["file_path"]).stem]
         pose = np.array(frame["transform_matrix"])
-        np.testing.assert_allclose(pose[:3, 3], camera.centre.numpy())
+        np.testing.assert_allclose(pose[:3, 3], camera.center.numpy())
         np.testing.assert_allclose(-pose[:3, 2], camera.rotation[2].numpy())  # looks along -z
         np.testing.assert_allclose(pose[:3, 1], -camera.rotation[1].numpy())  # y is up
 
@@ -187,7 +187,7 @@ def test_load(trained: Path, demo_scene: Path) -> None:
     assert len(model.gaussians["means"]) == len(model.gaussians["opacity_logits"])
     assert "Gaussians" in repr(model)
     for wrong in (
-        lambda: model.render("v000", layers=["colour"]),
+        lambda: model.render("v000", layers=["color"]),
         lambda: model.render("nowhere"),
         model.metrics,
     ):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from polarguide.training.run import CHECKPOINT
+from polarguide.runs.folder import CHECKPOINT
 
 pytestmark = pytest.mark.slow
 PATIENCE = 120.0

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from polarguide.cli.app import run
 from polarguide.evaluation import validate_metrics
-from polarguide.training.run import CHECKPOINT, CONFIGURATION, LOG, PLY
+from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, LOG, PLY
 from polarguide.training.trainer import StepReport, Trainer
 
 SIZE = (24, 32)  # the demo scene over 4

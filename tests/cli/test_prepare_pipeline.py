@@ -16,7 +16,7 @@ CELL = ((90, 45), (135, 0))
 
 
 def demo_mosaics(demo: Path, folder: Path, views: list[str]) -> None:
-    """What a colour sensor of twice the size would have seen: each picture pixel becomes one 2x2 cell."""
+    """What a color sensor of twice the size would have seen: each picture pixel becomes one 2x2 cell."""
     folder.mkdir()
     for view in views:
         raw = np.empty((192, 256), np.uint16)

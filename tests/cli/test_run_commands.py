@@ -12,9 +12,9 @@ import pytest
 
 from polarguide.cli import compare as verb
 from polarguide.cli.app import run
-from polarguide.cli.collect import BESIDE_OTHERS, collect
-from polarguide.cli.comparison import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
-from polarguide.cli.jobs import Job
+from polarguide.experiments.collect import BESIDE_OTHERS, collect
+from polarguide.experiments.jobs import Job
+from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
 from polarguide.recipes import recipe_named
 from polarguide.training.trainer import TrainSettings
 

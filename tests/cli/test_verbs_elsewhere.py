@@ -18,7 +18,7 @@ from polarguide.cli.evaluate import evaluate_run
 from polarguide.cli.render import render_views
 from polarguide.evaluation import ViewTarget, score_view
 from polarguide.inspection.short_run import short_run, surface_of
-from polarguide.surroundings import surroundings
+from polarguide.scene_frame import scene_frame
 from polarguide.viewer import shown_run
 from polarguide.viewer.appearance import Appearance, Crop, Painter
 
@@ -26,7 +26,7 @@ from polarguide.viewer.appearance import Appearance, Crop, Painter
 @pytest.fixture
 def run(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run folder, which is opened on the other device unless the CPU is asked for."""
-    from polarguide import trained as opening
+    from polarguide.runs import opened as opening
 
     choose = opening.choose_backend
     monkeypatch.setattr(
@@ -42,7 +42,7 @@ def test_scores_are_made_there_and_read_once_a_view(run: Path) -> None:
         record = evaluate_run(opened, speed=False)
         assert device.waits - before == len(record["views"]) > 1
         view = opened.scene.test_views[0]
-        given = view.photograph(), view.invalid, view.truth
+        given = view.photograph(), view.invalid, view.ground_truth
         result = opened.draw(view)
         there = score_view(ViewTarget.of(*given, BACKEND.device), result)
         here = score_view(ViewTarget.of(*given, torch.device("cpu")), result.to("cpu"))
@@ -67,7 +67,7 @@ def test_pictures_by_other_light_and_along_a_path(run: Path, tmp_path: Path) -> 
         there = shown("auto", tmp_path / "there")
         render_views(run, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path)
     assert len(list(tmp_path.glob("path_*.png"))) == 2
-    # Depth's colours jump where nothing is seen, so a few pixels may differ by much.
+    # Depth's colors jump where nothing is seen, so a few pixels may differ by much.
     assert float((np.abs(there - shown("cpu", tmp_path / "here")) > 2).mean()) < 0.01
 
 
@@ -100,7 +100,7 @@ def test_the_viewer_draws_what_lies_there(run: Path) -> None:
 
     def drawn(opened: OpenRun) -> list[np.ndarray]:
         view = opened.scene.test_views[0]
-        painter = Painter(surroundings(list(opened.cameras.values())))
+        painter = Painter(scene_frame(list(opened.cameras.values())))
         pictures = [painter.paint(shown_run(opened), view.camera, look, view) for look in chosen]
         return [picture.astype(float) for picture in pictures if picture is not None]
 

@@ -15,7 +15,7 @@ import pytest
 from safetensors.torch import load_file
 
 from polarguide.cli.app import run
-from polarguide.training.run import CHECKPOINT
+from polarguide.runs.folder import CHECKPOINT
 
 PATIENCE = 120.0
 

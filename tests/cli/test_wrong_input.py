@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.cli.app import run
-from polarguide.training.run import CHECKPOINT, CONFIGURATION
+from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 
 
 @pytest.fixture
@@ -129,7 +129,7 @@ def test_a_folder_that_is_no_run(refused, tmp_path: Path, verb: str) -> None:
 
 
 def test_unknown_layers_and_views(refused, trained: Path, demo_scene: Path, tmp_path: Path) -> None:
-    assert "found colour" in refused("render", trained, "--layers", "final,colour")
+    assert "found color" in refused("render", trained, "--layers", "final,color")
     line = refused("render", trained, "--views", "v001", "--out", tmp_path / "r")
     assert "found 'v001'" in line
     assert "The nearest names are: v0" in line

@@ -209,7 +209,7 @@ def test_aligned_layer_forgives_one_factor_per_channel_and_no_more():
     assert layer_psnr(tinted, lobe, keep) < 20
 
 
-def test_alignment_minimises_the_linear_error():
+def test_alignment_minimizes_the_linear_error():
     pred, lobe = noise(15) * 0.5, noise(16) * 0.5
     flat_pred, half = pred.flatten(0, 1).double(), lobe.flatten(0, 1).double() / 2
     scales = [

@@ -25,8 +25,8 @@ def rand(seed, *shape):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def score(photograph, invalid, truth, rendered):
-    target = ViewTarget.of(photograph, invalid, truth, torch.device("cpu"))
+def score(photograph, invalid, ground_truth, rendered):
+    target = ViewTarget.of(photograph, invalid, ground_truth, torch.device("cpu"))
     return scores.score_view(target, rendered)
 
 
@@ -36,34 +36,38 @@ def scene(seed=0, height=36, width=40):
     mask[5:30, 5:30] = True
     normal = torch.nn.functional.normalize(rand(seed + 2, height, width, 3) - 0.5, dim=-1)
     normal[8:11, 8:11] = 0  # foreground without a true normal
-    truth = SimpleNamespace(normal=normal, mask=mask, specular=specular, diffuse=diffuse)
-    return (specular + diffuse) / 2, truth
+    ground_truth = SimpleNamespace(normal=normal, mask=mask, specular=specular, diffuse=diffuse)
+    return (specular + diffuse) / 2, ground_truth
 
 
-def rendering(photograph, truth):
+def rendering(photograph, ground_truth):
     return SimpleNamespace(
         final=photograph * 0.9,
-        normal=truth.normal * 0.3 + 0.02,
-        specular=truth.specular * 0.4,
-        diffuse=truth.diffuse * 0.5,
+        normal=ground_truth.normal * 0.3 + 0.02,
+        specular=ground_truth.specular * 0.4,
+        diffuse=ground_truth.diffuse * 0.5,
     )
 
 
 def test_every_key_has_its_definition():
-    photograph, truth = scene()
-    rendered = rendering(photograph, truth)
-    got = score(photograph, None, truth, rendered)
-    reflective = metrics.reflective_mask(truth.specular, 2 * photograph, truth.mask)
-    assert 0 < reflective.sum() < truth.mask.sum()
+    photograph, ground_truth = scene()
+    rendered = rendering(photograph, ground_truth)
+    got = score(photograph, None, ground_truth, rendered)
+    reflective = metrics.reflective_mask(ground_truth.specular, 2 * photograph, ground_truth.mask)
+    assert 0 < reflective.sum() < ground_truth.mask.sum()
     expected = {
         "psnr": metrics.psnr(rendered.final, photograph),
-        "psnr_foreground": metrics.psnr(rendered.final, photograph, truth.mask),
+        "psnr_foreground": metrics.psnr(rendered.final, photograph, ground_truth.mask),
         "psnr_reflective": metrics.psnr(rendered.final, photograph, reflective),
         "ssim": float(metrics.ssim(rendered.final, photograph)),
-        "normal_mae_deg": float(metrics.normal_mae_deg(rendered.normal, truth.normal, truth.mask)),
-        "normal_within_11": float(metrics.normal_within_11(rendered.normal, truth.normal, truth.mask)),
+        "normal_mae_deg": float(
+            metrics.normal_mae_deg(rendered.normal, ground_truth.normal, ground_truth.mask)
+        ),
+        "normal_within_11": float(
+            metrics.normal_within_11(rendered.normal, ground_truth.normal, ground_truth.mask)
+        ),
         "specular_psnr": metrics.decibels(
-            float(metrics.layer_error(rendered.specular, truth.specular, truth.mask))
+            float(metrics.layer_error(rendered.specular, ground_truth.specular, ground_truth.mask))
         ),
         "specular_psnr_aligned": scores.PERFECT_PSNR,
         "diffuse_psnr": scores.PERFECT_PSNR,
@@ -75,44 +79,46 @@ def test_every_key_has_its_definition():
 
 
 def test_invalid_pixels_count_in_no_score():
-    photograph, truth = scene()
-    rendered = rendering(photograph, truth)
+    photograph, ground_truth = scene()
+    rendered = rendering(photograph, ground_truth)
     invalid = torch.zeros(photograph.shape[:2], dtype=torch.bool)
     invalid[8:20, 12:22] = True
-    before = score(photograph, invalid, truth, rendered)
-    assert before != score(photograph, None, truth, rendered)
+    before = score(photograph, invalid, ground_truth, rendered)
+    assert before != score(photograph, None, ground_truth, rendered)
     spoiled = SimpleNamespace(
         **{k: torch.where(invalid[..., None], 0.3, v) for k, v in vars(rendered).items()}
     )
     photograph = torch.where(invalid[..., None], 1.0, photograph)
-    assert score(photograph, invalid, truth, spoiled) == before
+    assert score(photograph, invalid, ground_truth, spoiled) == before
 
 
 def test_what_is_missing_is_none():
-    photograph, truth = scene()
+    photograph, ground_truth = scene()
     plain = SimpleNamespace(final=photograph * 0.9, normal=None, specular=None, diffuse=None)
     without_truth = score(photograph, None, None, plain)
     assert {k for k in scores.MEAN_KEYS if without_truth[k] is not None} <= {"psnr", "ssim", "lpips"}
-    without_layers = score(photograph, None, truth, plain)
+    without_layers = score(photograph, None, ground_truth, plain)
     assert without_layers["psnr_reflective"] is not None
     for key in ("normal_mae_deg", "normal_within_11", "specular_psnr", "diffuse_psnr_aligned"):
         assert without_layers[key] is None
-    truth.mask = torch.zeros_like(truth.mask)
-    assert score(photograph, None, truth, rendering(photograph, truth))["psnr_foreground"] is None
+    ground_truth.mask = torch.zeros_like(ground_truth.mask)
+    assert (
+        score(photograph, None, ground_truth, rendering(photograph, ground_truth))["psnr_foreground"] is None
+    )
 
 
 def test_broken_pixels_are_scored_and_counted():
-    photograph, truth = scene()
-    rendered = rendering(photograph, truth)
+    photograph, ground_truth = scene()
+    rendered = rendering(photograph, ground_truth)
     rendered.final[10, 10, 1] = math.nan
     rendered.specular[10, 10] = math.inf
     rendered.normal[7, 7, 0] = math.nan
-    got = score(photograph, None, truth, rendered)
+    got = score(photograph, None, ground_truth, rendered)
     assert got["nonfinite_pixels"] == 2
     rendered.final[10, 10] = 0
     rendered.specular[10, 10] = 0
     rendered.normal[7, 7] = 0
-    clean = score(photograph, None, truth, rendered)
+    clean = score(photograph, None, ground_truth, rendered)
     assert "nonfinite_pixels" not in clean
     assert {k: v for k, v in got.items() if k != "nonfinite_pixels"} == clean
 
@@ -141,7 +147,7 @@ def test_summary_is_the_plain_mean_of_what_is_there():
             "lpips_reason": "no network",
         },
     }
-    means = scores.summarise(views)
+    means = scores.summarize(views)
     assert means["psnr"] == 30
     assert means["ssim"] == pytest.approx(0.6)
     assert means["psnr_reflective"] == 18
@@ -151,12 +157,12 @@ def test_summary_is_the_plain_mean_of_what_is_there():
 
 @pytest.fixture
 def views():
-    photograph, truth = scene()
-    perfect = rendering(photograph, truth)
+    photograph, ground_truth = scene()
+    perfect = rendering(photograph, ground_truth)
     perfect.final = photograph
     return {
-        "v1": score(photograph, None, truth, rendering(photograph, truth)),
-        "v2": score(photograph, None, truth, perfect),
+        "v1": score(photograph, None, ground_truth, rendering(photograph, ground_truth)),
+        "v2": score(photograph, None, ground_truth, perfect),
     }
 
 

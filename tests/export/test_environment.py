@@ -21,12 +21,12 @@ from polarguide.export.environment import (
     turned_cubemap,
     write_exr,
 )
+from polarguide.scene_frame import scene_frame
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
+from polarguide.shading.deferred import Shading
 from polarguide.shading.directional import DirectionalShading
-from polarguide.shading.render import Shading
-from polarguide.surroundings import surroundings
 
-AROUND = surroundings(list(ring().values()))
+AROUND = scene_frame(list(ring().values()))
 LERP, FRESNEL = Shading(), Shading("fresnel")
 
 

@@ -12,28 +12,28 @@ from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.export.fusion import Surface, box_around, fuse, largest_pieces, seen_points
 from polarguide.export.mesh import scene_mesh, write_mesh
+from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import RenderResult
-from polarguide.surroundings import surroundings
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
 CAMERAS = ring(10, width=96, height=72)
-COLOUR = torch.tensor([0.8, 0.2, 0.05])
+COLOR = torch.tensor([0.8, 0.2, 0.05])
 
 
 def sphere(camera: Camera) -> RenderResult:
-    """A unit sphere about the origin, of one colour, as the renderer would show it."""
+    """A unit sphere about the origin, of one color, as the renderer would show it."""
     rays = camera.world_rays(dtype=torch.float64)
-    centre = camera.centre
-    along = rays @ centre
-    root = along**2 - (centre @ centre - 1)
+    center = camera.center
+    along = rays @ center
+    root = along**2 - (center @ center - 1)
     hit = root > 0
     distance = -along - root.clamp(min=0).sqrt()
-    points = centre + distance[..., None] * rays
-    depth = torch.where(hit, (points - centre) @ camera.rotation[2], torch.zeros(()).double())
+    points = center + distance[..., None] * rays
+    depth = torch.where(hit, (points - center) @ camera.rotation[2], torch.zeros(()).double())
     alpha, zero = hit.float(), torch.zeros(*hit.shape, 3)
     normal = torch.where(hit[..., None], points, torch.zeros(()).double()).float()
-    base = alpha[..., None] * COLOUR
+    base = alpha[..., None] * COLOR
     return RenderResult(base, zero, base, base, None, None, normal, depth.float(), alpha, Tensor())
 
 
@@ -65,9 +65,9 @@ def test_a_mesh_of_the_sphere(tmp_path) -> None:  # type: ignore[no-untyped-def]
     corners = mesh.surface.vertices[mesh.surface.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert float(((across * corners.mean(axis=1)).sum(axis=1) > 0).mean()) > 0.97, "faces turn outward"
-    np.testing.assert_allclose(np.median(mesh.colours, axis=0), COLOUR.numpy(), atol=0.02)
+    np.testing.assert_allclose(np.median(mesh.colors, axis=0), COLOR.numpy(), atol=0.02)
 
-    around = surroundings(list(CAMERAS.values()))
+    around = scene_frame(list(CAMERAS.values()))
     for name in ("mesh.ply", "mesh.glb"):
         write_mesh(tmp_path / name, mesh, around)
     ply = trimesh.load(tmp_path / "mesh.ply", process=False)

@@ -24,7 +24,7 @@ def page(recipe: str = "3dgs-dr", name: str = "cup") -> str:
     state, shading = random_state(recipe)
     cameras = {f"{name}{key}": camera for key, camera in ring().items()}
     return share_page(
-        state.rows,
+        state.gaussians,
         state.environment.parameters if state.environment else None,
         shading,
         cameras,
@@ -101,7 +101,7 @@ def test_an_unknown_shading_says_what_is_left_out() -> None:
 
     state, _ = random_state("3dgs-dr")
     assert state.environment is not None
-    text = share_page(state.rows, state.environment.parameters, Other(), ring(), first="v0", title="t")  # type: ignore[arg-type]
+    text = share_page(state.gaussians, state.environment.parameters, Other(), ring(), first="v0", title="t")  # type: ignore[arg-type]
     assert LEFT_OUT in text
     assert json.loads(Reader(text).scripts["scene"])["kind"] == "plain"
 
@@ -115,19 +115,19 @@ def test_records_are_close_to_what_they_stand_for(recipe: str) -> None:
     state, shading = random_state(recipe)
     kind = shading_kind(shading, lit=state.environment is not None)
     assert kind == KINDS[recipe]
-    data = records(state.rows, kind).data
-    seen = torch.sigmoid(state.rows["opacity_logits"].detach()) >= 1 / 255
+    data = records(state.gaussians, kind).data
+    seen = torch.sigmoid(state.gaussians["opacity_logits"].detach()) >= 1 / 255
     assert len(data) == int(seen.sum())
     means = data[:, :12].copy().view("<f4")
-    kept = state.rows["means"].detach()[seen].numpy()
+    kept = state.gaussians["means"].detach()[seen].numpy()
     order = [int(np.flatnonzero((kept == mean).all(axis=1))[0]) for mean in means]
     assert sorted(order) == list(range(len(kept))), "every visible Gaussian once"
     opacity = data[:, 12:14].copy().view("<u2")[:, 0] / 65535
-    expected = torch.sigmoid(state.rows["opacity_logits"].detach())[seen].numpy()[order]
+    expected = torch.sigmoid(state.gaussians["opacity_logits"].detach())[seen].numpy()[order]
     np.testing.assert_allclose(opacity, expected, atol=1e-5)
     scales = data[:, 24:30].copy().view("<f2").astype(np.float32)
     np.testing.assert_allclose(
-        np.exp(scales), state.rows["log_scales"].detach()[seen].exp().numpy()[order], rtol=2e-3
+        np.exp(scales), state.gaussians["log_scales"].detach()[seen].exp().numpy()[order], rtol=2e-3
     )
 
 

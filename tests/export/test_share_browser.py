@@ -1,4 +1,4 @@
-"""The page in a browser: what it draws against our rasteriser, every control pressed, and no request made.
+"""The page in a browser: what it draws against our rasterizer, every control pressed, and no request made.
 
 Needs Playwright (``pip install polarguide[browser]``) and a Chromium of the system.
 """
@@ -19,10 +19,10 @@ from browsers import PATIENCE, chromium
 from random_runs import KINDS, random_state, ring
 
 from polarguide.camera import Camera
-from polarguide.evaluation.pictures import layer_picture
 from polarguide.export.share import share_page, write_page
-from polarguide.raster.cpu import rasterise_cpu
-from polarguide.shading.render import render
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.shading.deferred import render
+from polarguide.visualization.layers import layer_picture
 
 pytestmark = pytest.mark.slow
 LEAST = 40.0  # dB; the promise is 30, what is seen is above 55
@@ -90,7 +90,8 @@ def written(recipe: str, folder: Path) -> Path:
     light = state.environment.parameters if state.environment else None
     path = folder / f"{recipe}.html"
     write_page(
-        path, share_page(state.rows, light, shading, ring(), first="v0", title="<b>title</b>", caption="&")
+        path,
+        share_page(state.gaussians, light, shading, ring(), first="v0", title="<b>title</b>", caption="&"),
     )
     return path
 
@@ -99,14 +100,14 @@ def written(recipe: str, folder: Path) -> Path:
 def ours(recipe: str, layer: str, camera: Camera) -> np.ndarray:
     state, shading = random_state(recipe)
     light = state.environment.parameters if state.environment else None
-    result = render(state.rows, camera, rasterise_cpu, environment=light, shading=shading)
+    result = render(state.gaussians, camera, rasterize_cpu, environment=light, shading=shading)
     picture = layer_picture(result, layer, camera)
     assert picture is not None
     return picture
 
 
 @pytest.mark.parametrize("recipe", KINDS)
-def test_layers_agree_with_the_rasteriser(recipe: str, browser: Any, tmp_path: Path) -> None:
+def test_layers_agree_with_the_rasterizer(recipe: str, browser: Any, tmp_path: Path) -> None:
     opened = Opened(browser, written(recipe, tmp_path), 200, 300)
     cameras = ring()
     layers = opened.page.evaluate("polarguide.scene.layers")
@@ -248,12 +249,12 @@ def test_the_slider_parts_diffuse_from_final(fresh: Opened) -> None:
 
 def test_views_are_chosen_by_name(fresh: Opened) -> None:
     fresh.page.select_option("#view", label="v3")
-    expected = ring()["v3"].centre.tolist()
+    expected = ring()["v3"].center.tolist()
     np.testing.assert_allclose(fresh.look()["eye"], expected, atol=1e-6)
 
 
 def test_the_screen_shows_what_pictures_gives(fresh: Opened) -> None:
-    """At rest the whole photograph fits the stage: its middle rows are those of our rasteriser at that size."""
+    """At rest the whole photograph fits the stage: its middle rows are those of our rasterizer at that size."""
     size = fresh.page.evaluate("[polarguide.canvas.width, polarguide.canvas.height]")
     record = fresh.page.evaluate(f"polarguide.navigation.camera({size[0]}, {size[1]})")
     camera = ring()["v0"]

@@ -96,7 +96,7 @@ def test_what_is_read_back_is_what_was_written(ply: Path, tmp_path: Path) -> Non
     assert np.abs(found["opacity"][at] - opacity).max() <= 0.5 / 255 + 1e-6
     unit = torch.nn.functional.normalize(ours["quaternions"], dim=1).numpy()
     assert (1 - np.abs((found["turns"][at] * unit).sum(axis=1))).max() < 1e-4
-    seen = opacity > 0.002  # what cannot be seen may lose its colour
+    seen = opacity > 0.002  # what cannot be seen may lose its color
     for name, error in (("log_scales", 0.1), ("sh_dc", 0.1)):
         expected = ours[name].reshape(COUNT, -1).numpy()
         assert np.quantile(np.abs(found[name][at] - expected)[seen], 0.99) < error, name

@@ -1,4 +1,4 @@
-"""The PLY of a run with each shading model: display colours, and the model's own fields."""
+"""The PLY of a run with each shading model: display colors, and the model's own fields."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import torch
 from random_runs import random_state
 from torch.nn.functional import normalize
 
-from polarguide.export import write_run_ply
-from polarguide.export.splats import shown_colours
+from polarguide.color import srgb_encode
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import read_ply
-from polarguide.shading.display import srgb_encode
+from polarguide.runs.point_cloud import shown_colors, write_run_ply
 
 COUNT = 7
 FIELDS = {
@@ -24,32 +23,32 @@ FIELDS = {
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_the_file_holds_display_colours_and_the_fields_of_the_model(name: str, tmp_path: Path) -> None:
+def test_the_file_holds_display_colors_and_the_fields_of_the_model(name: str, tmp_path: Path) -> None:
     state, shading = random_state(name, COUNT)
     write_run_ply(tmp_path / "run.ply", state, shading)
     read = read_ply(tmp_path / "run.ply")
     assert set(read["extra"]) == FIELDS[name]
     assert all(bool(torch.isfinite(t).all()) for t in (read["sh_dc"], read["sh_rest"]))
-    for field, values in shading.fields(state.rows).items():
+    for field, values in shading.fields(state.gaussians).items():
         torch.testing.assert_close(read["extra"][field], values.detach())
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_colours_are_in_range_and_change_with_the_view(name: str) -> None:
+def test_colors_are_in_range_and_change_with_the_view(name: str) -> None:
     state, shading = random_state(name, COUNT)
     directions = normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
-    colours = shown_colours(state, shading, directions)
-    assert colours.shape == (COUNT, 5, 3)
-    assert 0 <= float(colours.min()) <= float(colours.max()) <= 1
-    assert float(colours.std(dim=1).max()) > 1e-4
+    colors = shown_colors(state, shading, directions)
+    assert colors.shape == (COUNT, 5, 3)
+    assert 0 <= float(colors.min()) <= float(colors.max()) <= 1
+    assert float(colors.std(dim=1).max()) > 1e-4
 
 
 def test_a_directional_gaussian_shows_its_albedo_and_the_light_in_its_mirror() -> None:
     state, shading = random_state("ref-gs", COUNT)
     assert state.environment is not None
-    rows, ray = state.rows, torch.tensor([[0.0, 0.6, 0.8]])
+    rows, ray = state.gaussians, torch.tensor([[0.0, 0.6, 0.8]])
     normals = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], torch.zeros(3))
     facing = torch.where(normals @ ray[0][:, None] > 0, -normals, normals)
-    linear = shading.colours(rows, state.environment.parameters, ray.expand(COUNT, 3), facing)
+    linear = shading.colors(rows, state.environment.parameters, ray.expand(COUNT, 3), facing)
     expected = srgb_encode(linear.detach().clamp(0, 1))
-    torch.testing.assert_close(shown_colours(state, shading, ray)[:, 0], expected)
+    torch.testing.assert_close(shown_colors(state, shading, ray)[:, 0], expected)

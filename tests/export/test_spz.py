@@ -8,11 +8,11 @@ import torch
 from random_runs import random_state
 from torch.nn.functional import normalize
 
-from polarguide.export import write_run_ply
 from polarguide.export.spz import _half_turned
 from polarguide.gaussians.geometry import quaternions_to_rotations
+from polarguide.gaussians.harmonics import sh_basis
 from polarguide.gaussians.ply import read_ply
-from polarguide.gaussians.spherical_harmonics import sh_basis
+from polarguide.runs.point_cloud import write_run_ply
 
 TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 

@@ -10,23 +10,23 @@ from torch import Tensor
 
 from polarguide.gaussians.densify import Densification, DensityStatistics, densify
 from polarguide.gaussians.free_space import FreeSpace
+from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 from polarguide.gaussians.geometry import quaternions_to_rotations
-from polarguide.gaussians.rows import CORE_ROWS, GaussianRows
 
 SETTINGS = Densification(gradient=1.0, dense_share=0.1, minimum_opacity=0.05, maximum_scale_share=0.5)
 EXTENT = 2.0
 SMALL, LARGE = 0.05, 0.5  # the border is dense_share * extent = 0.2
-RATES = dict.fromkeys(CORE_ROWS, 0.01)
+RATES = dict.fromkeys(CORE_SHAPES, 0.01)
 
 
-def rows_of(sizes: list[float], opacities: list[float] | None = None) -> GaussianRows:
+def rows_of(sizes: list[float], opacities: list[float] | None = None) -> Gaussians:
     generator = torch.Generator().manual_seed(0)
     count = len(sizes)
-    tensors = {name: torch.randn(count, *shape, generator=generator) for name, shape in CORE_ROWS.items()}
+    tensors = {name: torch.randn(count, *shape, generator=generator) for name, shape in CORE_SHAPES.items()}
     shape = torch.tensor([1.0, 0.5, 0.1])
     tensors["log_scales"] = (torch.tensor(sizes)[:, None] * shape).log()
     tensors["opacity_logits"] = torch.logit(torch.tensor(opacities or [0.5] * count))
-    return GaussianRows(tensors, RATES)
+    return Gaussians(tensors, RATES)
 
 
 def pulled(gradients: list[float]) -> DensityStatistics:
@@ -37,7 +37,7 @@ def pulled(gradients: list[float]) -> DensityStatistics:
 
 
 def round_of(
-    rows: GaussianRows,
+    rows: Gaussians,
     statistics: DensityStatistics,
     settings: Densification = SETTINGS,
     *,
@@ -59,7 +59,7 @@ def round_of(
     )
 
 
-def counted(rows: GaussianRows, before: dict[str, Tensor], name: str = "sh_rest") -> list[int]:
+def counted(rows: Gaussians, before: dict[str, Tensor], name: str = "sh_rest") -> list[int]:
     """How many rows there are now of each row before, told by a tensor that neither edit changes."""
     return [int((rows[name].detach() == row).flatten(1).all(dim=1).sum()) for row in before[name]]
 
@@ -119,7 +119,7 @@ def test_the_last_one_is_never_pruned() -> None:
 
 
 def test_huge_ones_are_pruned_only_when_asked_and_far_ones_are_exempt() -> None:
-    def scene() -> GaussianRows:
+    def scene() -> Gaussians:
         rows = rows_of([0.9, 1.1, 1.1])  # the border is maximum_scale_share * extent = 1 near the middle
         rows.overwrite("means", torch.tensor([[0.1, 0, 0], [0.1, 0, 0], [0, 30.0, 0]]))
         return rows

@@ -20,8 +20,8 @@ def shapes(dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor, 
 
 
 def test_the_normal_is_the_shortest_axis() -> None:
-    means, quaternions, log_scales, centre = shapes()
-    normals = shortest_axis_normals(means, quaternions, log_scales, centre)
+    means, quaternions, log_scales, center = shapes()
+    normals = shortest_axis_normals(means, quaternions, log_scales, center)
     axes = quaternions_to_rotations(quaternions)
     shortest = axes[torch.arange(COUNT), :, log_scales.argmin(dim=1)]
     torch.testing.assert_close((normals * shortest).sum(dim=1).abs(), torch.ones(COUNT))
@@ -30,40 +30,40 @@ def test_the_normal_is_the_shortest_axis() -> None:
 
 
 def test_the_normal_faces_the_camera() -> None:
-    means, quaternions, log_scales, centre = shapes()
-    normals = shortest_axis_normals(means, quaternions, log_scales, centre)
-    towards = torch.nn.functional.normalize(centre - means, dim=1)
-    assert float((normals * towards).sum(dim=1).min()) >= -1e-6
-    opposite = shortest_axis_normals(means, quaternions, log_scales, 2 * means.mean(dim=0) - centre)
+    means, quaternions, log_scales, center = shapes()
+    normals = shortest_axis_normals(means, quaternions, log_scales, center)
+    toward = torch.nn.functional.normalize(center - means, dim=1)
+    assert float((normals * toward).sum(dim=1).min()) >= -1e-6
+    opposite = shortest_axis_normals(means, quaternions, log_scales, 2 * means.mean(dim=0) - center)
     assert float((opposite * normals).sum(dim=1).min()) == pytest.approx(-1.0, abs=1e-5), "some turn over"
 
 
 @pytest.mark.parametrize("factor", [0.01, -3.0])
 def test_length_and_sign_of_the_quaternion_do_not_matter(factor: float) -> None:
-    means, quaternions, log_scales, centre = shapes()
+    means, quaternions, log_scales, center = shapes()
     torch.testing.assert_close(
-        shortest_axis_normals(means, factor * quaternions, log_scales, centre),
-        shortest_axis_normals(means, quaternions, log_scales, centre),
+        shortest_axis_normals(means, factor * quaternions, log_scales, center),
+        shortest_axis_normals(means, quaternions, log_scales, center),
     )
 
 
 def test_gradient_in_the_quaternions_against_finite_differences() -> None:
-    means, quaternions, log_scales, centre = shapes(torch.float64)
+    means, quaternions, log_scales, center = shapes(torch.float64)
     facing = torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    away = ((centre - means) * shortest_axis_normals(means, quaternions, log_scales, centre)).sum(1) > 0.1
+    away = ((center - means) * shortest_axis_normals(means, quaternions, log_scales, center)).sum(1) > 0.1
     few = away.nonzero()[:6, 0]
     assert len(few) == 6
 
     def normals(q: Tensor) -> Tensor:
-        return shortest_axis_normals(means[few], q, log_scales[few], centre) * facing[few]
+        return shortest_axis_normals(means[few], q, log_scales[few], center) * facing[few]
 
     assert torch.autograd.gradcheck(normals, (quaternions[few].clone().requires_grad_(),), atol=1e-7)
 
 
 def test_means_and_scales_get_no_gradient() -> None:
-    means, quaternions, log_scales, centre = shapes()
+    means, quaternions, log_scales, center = shapes()
     inputs = [t.clone().requires_grad_() for t in (means, quaternions, log_scales)]
-    shortest_axis_normals(*inputs, centre).sum().backward()
+    shortest_axis_normals(*inputs, center).sum().backward()
     assert inputs[0].grad is None
     assert inputs[1].grad is not None
     assert inputs[2].grad is None

@@ -1,4 +1,4 @@
-"""The PLY module: the release's layout to the byte, round trips, colours refitted for ordinary viewers."""
+"""The PLY module: the release's layout to the byte, round trips, colors refitted for ordinary viewers."""
 
 import re
 import struct
@@ -174,8 +174,8 @@ def test_what_does_not_fit_is_refused(tmp_path, change, message):
     assert not list(tmp_path.iterdir())
 
 
-def release_colour(dc, rest, directions):
-    """The colour a 3DGS viewer shows, from the real spherical harmonics written out in full: [N, K, 3]."""
+def release_color(dc, rest, directions):
+    """The color a 3DGS viewer shows, from the real spherical harmonics written out in full: [N, K, 3]."""
     x, y, z = directions.double().unbind(-1)
     terms = [0.28209479177387814 * torch.ones_like(x)]
     terms += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
@@ -193,13 +193,13 @@ def release_colour(dc, rest, directions):
 def test_refit_reproduces_harmonics(degree):
     dc, rest = rand(1, 20, 1, 3) * 0.3, rand(2, 20, 15, 3) * 0.3
     rest[:, (degree + 1) ** 2 - 1 :] = 0
-    got_dc, got_rest = refit_sh_to_display(lambda d: release_colour(dc, rest, d), 20, degree)
+    got_dc, got_rest = refit_sh_to_display(lambda d: release_color(dc, rest, d), 20, degree)
     assert torch.allclose(got_dc, dc, atol=1e-5)
     assert torch.allclose(got_rest, rest, atol=1e-5)
 
 
 def highlight(directions):
-    """A narrow bright spot over a flat colour, clipped to the display's range: [5, K, 3]."""
+    """A narrow bright spot over a flat color, clipped to the display's range: [5, K, 3]."""
     axes = torch.nn.functional.normalize(rand(3, 5, 3), dim=-1)
     spot = torch.exp(8 * (axes @ directions.T.to(axes) - 1))
     return (0.2 + 0.9 * spot[..., None] * torch.tensor([1.0, 0.8, 0.6])).clamp(0, 1)
@@ -210,7 +210,7 @@ def test_refit_gets_closer_with_every_degree():
     errors = []
     for degree in range(4):
         dc, rest = refit_sh_to_display(highlight, 5, degree)
-        errors.append(float((release_colour(dc, rest, probe) - highlight(probe)).square().mean().sqrt()))
+        errors.append(float((release_color(dc, rest, probe) - highlight(probe)).square().mean().sqrt()))
     assert errors[0] > errors[1] > errors[2] > errors[3]
     assert errors[3] < errors[0] / 2
 
@@ -230,8 +230,8 @@ def test_refit_in_small_pieces_is_the_same(monkeypatch):
         assert torch.allclose(a, b, atol=1e-6)
 
 
-def test_refit_refuses_colours_of_another_shape():
-    with pytest.raises(ValueError, match=r"colours: expected \[6, 64, 3\], found \[5, 64, 3\]"):
+def test_refit_refuses_colors_of_another_shape():
+    with pytest.raises(ValueError, match=r"colors: expected \[6, 64, 3\], found \[5, 64, 3\]"):
         refit_sh_to_display(highlight, 6)
 
 

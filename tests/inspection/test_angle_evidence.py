@@ -10,7 +10,7 @@ from glossy_ball import INDEX, mistaken, model_of, surfaces, views_around
 
 from polarguide.inspection.angle_checks import handedness_check, order_check, weigh, zero_check
 from polarguide.inspection.dielectric import dielectric_check, unexplained
-from polarguide.inspection.odds import odds
+from polarguide.inspection.likelihood import odds
 from polarguide.inspection.orders import ORDERS, PAIRINGS
 from polarguide.inspection.points import point_evidence
 from polarguide.inspection.readings import read_view_figures
@@ -61,7 +61,7 @@ def test_the_zero_is_measured(ball_views, zero: float, source: str) -> None:
 
 
 def test_without_pixels_that_must_be_specular_the_quarter_turn_stays_open() -> None:
-    # A matt ball: DoLP as diffuse light has it, so specular light at another zenith explains it as well.
+    # A matte ball: DoLP as diffuse light has it, so specular light at another zenith explains it as well.
     views = views_around(specular=0.0, diffuse=0.5, noise=0.0)
     pixels = surface_pixels(surfaces(views))
     assert not pixels.must_be_specular(INDEX).any()
@@ -112,9 +112,9 @@ def test_zeniths_of_points_are_those_of_the_ball(ball_views) -> None:
     assert pixels is not None
     assert not unexplained(pixels, INDEX).any()
     # The normal of a point of the unit ball is its place.
-    centres = torch.stack([view.camera.centre.float() for view in ball_views if view.camera])
-    towards = torch.nn.functional.normalize(centres[None] - pixels.place[:, None], dim=-1)
-    zeniths = torch.acos((towards * pixels.place[:, None]).sum(-1).clamp(-1, 1))
+    centers = torch.stack([view.camera.center.float() for view in ball_views if view.camera])
+    toward = torch.nn.functional.normalize(centers[None] - pixels.place[:, None], dim=-1)
+    zeniths = torch.acos((toward * pixels.place[:, None]).sum(-1).clamp(-1, 1))
     nearest = (zeniths - pixels.zenith[:, None]).abs().amin(dim=1)
     assert math.degrees(float(nearest.quantile(0.9))) < 3
 

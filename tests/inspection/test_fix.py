@@ -14,7 +14,7 @@ from polarguide.capture.calibration import Calibration, oriented
 from polarguide.errors import PolarguideError
 from polarguide.inspection import fix
 from polarguide.inspection.angle_checks import Angles
-from polarguide.inspection.odds import Odds
+from polarguide.inspection.likelihood import Odds
 from polarguide.inspection.orders import ORDERS, PAIRINGS
 from polarguide.inspection.pictures import read_capture
 

@@ -42,7 +42,7 @@ def ring(bad: int, count: int = 12) -> list[PairError]:
     return pairs(found)
 
 
-def test_a_bad_view_does_not_spoil_its_neighbours() -> None:
+def test_a_bad_view_does_not_spoil_its_neighbors() -> None:
     errors = view_errors(ring(bad=4))
     assert errors["v04"] == 6.0
     assert all(error == 0.5 for name, error in errors.items() if name != "v04")

@@ -74,7 +74,7 @@ def test_gradient_of_the_twin(resolution: int) -> None:
 
 
 def test_faces_follow_opengl(simd: str) -> None:
-    """Table 8.19 of the OpenGL 4.6 specification: the directions of each face's middle, right and lower neighbour."""
+    """Table 8.19 of the OpenGL 4.6 specification: the directions of each face's middle, right and lower neighbor."""
     texture = torch.zeros(6, 3, 3, 1)
     texture[:, 1, 1], texture[:, 1, 2], texture[:, 2, 1] = 1, 2, 3
     texture += 10 * torch.arange(6)[:, None, None, None]
@@ -87,7 +87,7 @@ def test_faces_follow_opengl(simd: str) -> None:
 
 
 @resolutions
-def test_texel_centres_read_their_texel(simd: str, resolution: int) -> None:
+def test_texel_centers_read_their_texel(simd: str, resolution: int) -> None:
     texture = texture_of(resolution)
     found = cubemap_lookup(texture, 7 * texel_directions(resolution).reshape(-1, 3))
     assert_close(found, texture.reshape(-1, 3), rtol=0, atol=1e-5)

@@ -7,8 +7,8 @@ from torch.testing import assert_close
 
 from polarguide import _native
 from polarguide.camera import Camera
-from polarguide.shading.reflection import reflect_native
-from polarguide.shading.render import Shading, reflect
+from polarguide.shading.deferred import Shading, reflect
+from polarguide.shading.native import reflect_native
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 8
 MODELS = [
@@ -31,8 +31,8 @@ def buffers(spare: int = 1) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(HEIGHT, WIDTH, 10 + spare, generator=generator)
     rays = camera().world_rays()
-    towards = (features[..., 3:6] * rays).sum(-1, keepdim=True) < 0
-    features[..., 3:6] = torch.where(towards, features[..., 3:6], -features[..., 3:6])  # most face the camera
+    toward = (features[..., 3:6] * rays).sum(-1, keepdim=True) < 0
+    features[..., 3:6] = torch.where(toward, features[..., 3:6], -features[..., 3:6])  # most face the camera
     features[0, :, 3:6] *= -1
     features[1, :, 3:6] *= 1e-4  # below the shortest length
     features[2, :, 3:6] = 0
@@ -98,5 +98,5 @@ def test_threads_do_not_change_the_result() -> None:
 
 def test_too_few_channels_are_refused() -> None:
     features, texels = buffers()
-    with pytest.raises(ValueError, match="features: expected base colour, normal, strength"):
+    with pytest.raises(ValueError, match="features: expected base color, normal, strength"):
         native(features[..., :8], texels, MODELS[2])

@@ -8,10 +8,10 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide import _native
-from polarguide.gaussians.spherical_harmonics import evaluate_sh, evaluate_sh_reference, sh_basis
+from polarguide.gaussians.harmonics import evaluate_sh, evaluate_sh_reference, sh_basis
 
 degrees = pytest.mark.parametrize("degree", [0, 1, 2, 3])
-CENTRE = torch.tensor([0.3, -0.2, 0.1])
+CENTER = torch.tensor([0.3, -0.2, 0.1])
 
 
 def gaussians(count: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor]:
@@ -24,7 +24,7 @@ def gaussians(count: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, T
 def with_gradients(function, inputs: tuple[Tensor, ...], degree: int) -> list[Tensor]:
     """Output and gradients of a fixed weighted sum of it."""
     leaves = [t.detach().clone().requires_grad_() for t in inputs]
-    out = function(leaves[0], CENTRE.to(leaves[0]), leaves[1], leaves[2], degree)
+    out = function(leaves[0], CENTER.to(leaves[0]), leaves[1], leaves[2], degree)
     weights = torch.linspace(-1, 1, out.numel(), dtype=out.dtype).reshape(out.shape)
     (out * weights).sum().backward()
     gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in leaves]
@@ -44,7 +44,7 @@ def test_kernel_agrees_with_the_twin(simd: str, degree: int, count: int) -> None
 def test_gradient_of_the_twin(degree: int) -> None:
     inputs = [t.requires_grad_() for t in gaussians(3, torch.float64)]
     torch.autograd.gradcheck(
-        lambda m, d, r: evaluate_sh_reference(m, CENTRE.double(), d, r, degree),
+        lambda m, d, r: evaluate_sh_reference(m, CENTER.double(), d, r, degree),
         inputs,
         check_undefined_grad=False,
     )
@@ -85,7 +85,7 @@ def test_coefficients_beyond_the_degree_get_no_gradient(simd: str, degree: int) 
 def test_moving_along_the_ray_changes_nothing(simd: str) -> None:
     inputs = gaussians(40)
     means, to_means = inputs[0], with_gradients(evaluate_sh, inputs, 3)[1]
-    along = ((means - CENTRE) * to_means).sum(dim=1)
+    along = ((means - CENTER) * to_means).sum(dim=1)
     assert_close(along, torch.zeros(40), rtol=0, atol=1e-5)
 
 
@@ -97,9 +97,9 @@ def test_threads_do_not_change_a_bit(simd: str) -> None:
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_gaussian_at_the_camera_centre(simd: str) -> None:
+def test_gaussian_at_the_camera_center(simd: str) -> None:
     means, dc, rest = gaussians(2)
-    means[1] = CENTRE
+    means[1] = CENTER
     for function in (evaluate_sh, evaluate_sh_reference):
         out, to_means, _, _ = with_gradients(function, (means, dc, rest), 1)
         assert_close(out[1], 0.28209479 * dc[1])
@@ -123,20 +123,20 @@ def test_no_gaussians(simd: str) -> None:
     ]
 
 
-def test_other_memory_layouts_and_centre_types() -> None:
+def test_other_memory_layouts_and_center_types() -> None:
     means, dc, rest = gaussians(33)
-    expected = evaluate_sh(means, CENTRE, dc, rest, 3)
+    expected = evaluate_sh(means, CENTER, dc, rest, 3)
     strided = rest.transpose(0, 1).contiguous().transpose(0, 1)
-    assert torch.equal(evaluate_sh(means, CENTRE.double(), dc, strided, 3), expected)
+    assert torch.equal(evaluate_sh(means, CENTER.double(), dc, strided, 3), expected)
 
 
 def test_errors_name_what_was_expected() -> None:
     means, dc, rest = gaussians(4)
     with pytest.raises(ValueError, match=r"rest: expected shape \[4, 15, 3\], found \[4, 8, 3\]"):
-        evaluate_sh(means, CENTRE, dc, rest[:, :8], 2)
+        evaluate_sh(means, CENTER, dc, rest[:, :8], 2)
     with pytest.raises(ValueError, match="degree: expected 0 to 3, found 4"):
-        evaluate_sh(means, CENTRE, dc, rest, 4)
+        evaluate_sh(means, CENTER, dc, rest, 4)
     with pytest.raises(ValueError, match="degree: expected 0 to 3, found 4"):
         sh_basis(means, 4)
     with pytest.raises(ValueError, match=r"dc: expected shape \[4, 3\], found \[3, 3\]"):
-        _native.harmonics_forward(1, means, CENTRE, dc[:3], rest, torch.empty(4, 3))
+        _native.harmonics_forward(1, means, CENTER, dc[:3], rest, torch.empty(4, 3))

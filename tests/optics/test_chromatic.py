@@ -1,4 +1,4 @@
-"""Normals from the polarization of colour differences, on light that Fresnel's equations predict."""
+"""Normals from the polarization of color differences, on light that Fresnel's equations predict."""
 
 import math
 from pathlib import Path
@@ -38,7 +38,7 @@ def texture(seed: int = 0) -> Tensor:
 @pytest.mark.parametrize("index", [1.33, 1.5, 1.8])
 @pytest.mark.parametrize("zenith", [0.4, 0.8, 1.2])
 @pytest.mark.parametrize("share", [0.3, 1.0, 3.0])
-def test_neutral_reflection_over_body_colours_gives_both_angles_exactly(
+def test_neutral_reflection_over_body_colors_gives_both_angles_exactly(
     index: float, zenith: float, share: float
 ) -> None:
     neutral = share * torch.ones(*SIZE, 1, dtype=F64).expand(-1, -1, 3)
@@ -50,7 +50,7 @@ def test_neutral_reflection_over_body_colours_gives_both_angles_exactly(
 
 
 def test_the_wrong_lobe_of_the_mixture_does_not_matter() -> None:
-    """The mean points across the plane of incidence; the colour differences still point along it."""
+    """The mean points across the plane of incidence; the color differences still point along it."""
     neutral = 0.8 * torch.ones(*SIZE, 3, dtype=F64)
     light = optics.predicted_stokes(neutral, 0.3 * texture(), surface(0.9, -0.4), rays())
     across = half_turn_distance(optics.aolp(optics.luminance(light)), -0.4)
@@ -60,15 +60,15 @@ def test_the_wrong_lobe_of_the_mixture_does_not_matter() -> None:
     assert half_turn_distance(found.azimuth, -0.4).abs().max() < 1e-6
 
 
-def test_a_pure_coloured_reflection_is_not_taken_for_diffuse_light() -> None:
+def test_a_pure_colored_reflection_is_not_taken_for_diffuse_light() -> None:
     nothing = torch.zeros(*SIZE, 3, dtype=F64)
     light = optics.predicted_stokes(texture(), nothing, surface(0.8, 0.7), rays())
     assert not optics.chromatic_normals(light).decided.any()
 
 
-def test_a_picture_without_colour_decides_nothing() -> None:
-    grey = texture()[..., :1].expand(-1, -1, 3)
-    light = optics.predicted_stokes(0.3 * torch.ones_like(grey), grey, surface(0.8, 0.7), rays())
+def test_a_picture_without_color_decides_nothing() -> None:
+    gray = texture()[..., :1].expand(-1, -1, 3)
+    light = optics.predicted_stokes(0.3 * torch.ones_like(gray), gray, surface(0.8, 0.7), rays())
     found = optics.chromatic_normals(light)
     assert not found.decided.any()
     assert torch.equal(found.certainty, torch.zeros(SIZE, dtype=F64))
@@ -110,15 +110,15 @@ def angles_against_truth(scene: Path, downscale: int) -> tuple[float, float, flo
     """Share of the foreground that is decided, and there mean errors of azimuth and zenith in degrees."""
     decided, total, azimuth, zenith = 0, 0, 0.0, 0.0
     for view in load_scene(scene, downscale=downscale).test_views:
-        truth = view.truth
-        assert truth is not None
-        assert truth.normal is not None
-        assert truth.mask is not None
+        ground_truth = view.ground_truth
+        assert ground_truth is not None
+        assert ground_truth.normal is not None
+        assert ground_truth.mask is not None
         view_rays = view.camera.rays()
-        normal = view.camera.to_camera(truth.normal.float())
+        normal = view.camera.to_camera(ground_truth.normal.float())
         polar = optics.zenith(normal, view_rays)
         found = optics.chromatic_normals(optics.stokes(view.intensities()))
-        steep = truth.mask & (polar > math.radians(15)) & (dot(normal, view_rays) < 0)
+        steep = ground_truth.mask & (polar > math.radians(15)) & (dot(normal, view_rays) < 0)
         where = steep & found.decided & ~view.saturated
         turn = half_turn_distance(found.azimuth - optics.azimuth(normal, view_rays), 0.0)
         decided, total = decided + int(where.sum()), total + int(steep.sum())

@@ -18,7 +18,7 @@ def ray(x: float, y: float) -> torch.Tensor:
 
 
 def rolled(angle: float) -> torch.Tensor:
-    """Rotation about the optical axis that turns image right towards image down."""
+    """Rotation about the optical axis that turns image right toward image down."""
     c, s = math.cos(angle), math.sin(angle)
     return torch.tensor(((c, -s, 0), (s, c, 0), (0, 0, 1)), dtype=torch.float64)
 
@@ -44,8 +44,8 @@ def test_frame_is_the_smallest_rotation_from_the_axis(x: float, y: float) -> Non
     forward = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
     axis = torch.nn.functional.normalize(torch.linalg.cross(forward, d), dim=0)
     angle = math.acos(float(d[2]))
-    for moved, at_centre in zip(optics.lens_frame(d), ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0)), strict=True):
-        v = torch.tensor(at_centre, dtype=torch.float64)
+    for moved, at_center in zip(optics.lens_frame(d), ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0)), strict=True):
+        v = torch.tensor(at_center, dtype=torch.float64)
         turned = v * math.cos(angle) + torch.linalg.cross(axis, v) * math.sin(angle)
         turned = turned + axis * (axis @ v) * (1 - math.cos(angle))
         assert torch.allclose(moved, turned, atol=1e-12)
@@ -71,10 +71,10 @@ def test_azimuth_turns_with_the_camera_and_zenith_does_not(x: float, y: float, r
     normal = optics.normal_from_angles(
         torch.tensor(0.7, dtype=torch.float64), torch.tensor(1.1, dtype=torch.float64), d
     )
-    seen, towards = turn @ normal, turn @ d
-    assert float(optics.zenith(seen, towards)) == pytest.approx(0.7, abs=1e-12)
-    # Right turns towards down, which is clockwise as displayed, so azimuths shrink.
-    difference = float(optics.azimuth(seen, towards)) - (1.1 - roll)
+    seen, toward = turn @ normal, turn @ d
+    assert float(optics.zenith(seen, toward)) == pytest.approx(0.7, abs=1e-12)
+    # Right turns toward down, which is clockwise as displayed, so azimuths shrink.
+    difference = float(optics.azimuth(seen, toward)) - (1.1 - roll)
     assert math.remainder(difference, 2 * math.pi) == pytest.approx(0, abs=1e-11)
 
 

@@ -73,13 +73,14 @@ def camera(scene: Path, view: str) -> Camera:
 
 def load(scene: Path, name: str) -> View:
     view = camera(scene, name)
-    images = [cv2.imread(str(scene / f"polar/{name}_{angle:03d}.png"), -1) for angle in optics.ANGLES_DEG]
+    images = [cv2.imread(str(scene / f"polar/{name}_{angle:03d}.png"), -1) for angle in optics.ANGLES]
     intensities = torch.from_numpy(np.stack(images)[..., ::-1] / 65535.0)
-    with np.load(scene / f"gt/{name}.npz") as truth:
+    with np.load(scene / f"gt/{name}.npz") as ground_truth:
         normal, specular, diffuse = (
-            torch.from_numpy(truth[key].astype(np.float64)) for key in ("normal", "specular", "diffuse")
+            torch.from_numpy(ground_truth[key].astype(np.float64))
+            for key in ("normal", "specular", "diffuse")
         )
-        mask = torch.from_numpy(truth["mask"])
+        mask = torch.from_numpy(ground_truth["mask"])
     normal = torch.nn.functional.normalize(view.to_camera(normal), dim=-1)
     return View(optics.stokes(intensities), view.rays(dtype=torch.float64), normal, mask, specular, diffuse)
 
@@ -96,8 +97,8 @@ def shown(linear: Tensor) -> Tensor:
     return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def psnr(layer: Tensor, truth: Tensor, mask: Tensor) -> float:
-    return -10 * math.log10(float(((shown(layer / 2) - shown(truth / 2))[mask] ** 2).mean()))
+def psnr(layer: Tensor, ground_truth: Tensor, mask: Tensor) -> float:
+    return -10 * math.log10(float(((shown(layer / 2) - shown(ground_truth / 2))[mask] ** 2).mean()))
 
 
 def polarized(view: View) -> tuple[Tensor, Tensor]:

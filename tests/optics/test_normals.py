@@ -175,7 +175,7 @@ def test_noise_of_dolp_is_what_a_simulation_finds() -> None:
     sigma, count = 0.002, 200_000
     for degree in (0.2, 0.9):
         light = torch.tensor((0.5, 0.5 * degree * math.cos(0.8), 0.5 * degree * math.sin(0.8)), dtype=F64)
-        images = torch.stack([optics.intensity(light, math.radians(a)) for a in optics.ANGLES_DEG])
+        images = torch.stack([optics.intensity(light, math.radians(a)) for a in optics.ANGLES])
         noise = torch.randn(4, count, generator=generator, dtype=F64) * sigma
         measured = optics.dolp(optics.stokes(images[:, None] + noise))
         assert float(optics.dolp_noise(light, sigma)) == pytest.approx(float(measured.std()), rel=0.01)
@@ -205,7 +205,7 @@ def test_noise_of_the_intensities_is_read_from_their_sums_whatever_the_gains(sig
     generator = torch.Generator().manual_seed(0)
     light = torch.rand(3, 60, 80, generator=generator, dtype=torch.float64) * 0.3
     light[0] += 0.5
-    clean = torch.stack([optics.intensity(light, math.radians(a)) for a in optics.ANGLES_DEG])
+    clean = torch.stack([optics.intensity(light, math.radians(a)) for a in optics.ANGLES])
     noise = torch.randn(clean.shape, generator=generator, dtype=torch.float64) * sigma
     found = optics.intensity_noise(clean + noise)
     assert float((found / sigma - 1)[8:-8, 8:-8].abs().max()) < 0.3

@@ -123,7 +123,7 @@ def test_paper_separation_is_the_mean_over_the_polarizer_angles() -> None:
     light = optics.predicted_stokes(specular, diffuse, normals, rays)
     polar = optics.zenith(normals, rays)
     s_direction = optics.azimuth(normals, rays) + math.pi / 2
-    images = [optics.paper_intensities(light, polar, s_direction, math.radians(a)) for a in optics.ANGLES_DEG]
+    images = [optics.paper_intensities(light, polar, s_direction, math.radians(a)) for a in optics.ANGLES]
     found = optics.paper_separation(light, polar)
     for layer, mean in zip(
         found[:2], (torch.stack(pair).mean(0) for pair in zip(*images, strict=True)), strict=True
@@ -156,7 +156,7 @@ def test_separation_does_not_change_when_the_camera_rolls(roll: float) -> None:
     rays_rolled, normals_rolled = rays @ turn.T, normals @ turn.T
     light = optics.predicted_stokes(specular, diffuse, normals, rays)
     rolled = optics.predicted_stokes(specular, diffuse, normals_rolled, rays_rolled)
-    # Image right turns towards image down, so angles measured counter-clockwise shrink by the roll.
+    # Image right turns toward image down, so angles measured counter-clockwise shrink by the roll.
     expected_s1 = light[1] * math.cos(2 * roll) + light[2] * math.sin(2 * roll)
     assert torch.allclose(rolled[1], expected_s1, atol=1e-12)
     before = optics.exact_separation(light, normals, rays)

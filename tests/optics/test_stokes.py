@@ -38,7 +38,7 @@ def test_polarizer_angle_per_pixel() -> None:
 @given(s0=st.floats(0.01, 100), degree=degrees_of_polarization, angle=angles)
 def test_four_polarizer_angles_determine_the_stokes_vector(s0: float, degree: float, angle: float) -> None:
     light = beam(s0, degree, angle)
-    images = torch.stack([optics.intensity(light, math.radians(a)) for a in optics.ANGLES_DEG])
+    images = torch.stack([optics.intensity(light, math.radians(a)) for a in optics.ANGLES])
     assert torch.allclose(optics.stokes(images), light, rtol=0, atol=1e-13 * s0)
     assert float(optics.photograph(light)) == pytest.approx(float(images.mean()), rel=1e-13)
 
@@ -124,7 +124,7 @@ def test_average_stokes_vectors_never_angles() -> None:
     assert float(optics.aolp(light).mean()) > 1.0
 
 
-def test_luminance_is_the_mean_over_the_colours() -> None:
+def test_luminance_is_the_mean_over_the_colors() -> None:
     light = torch.tensor([[0.1, 0.2, 0.6], [0.0, 0.1, 0.2], [-0.3, 0.0, 0.0]], dtype=torch.float64)
     assert optics.luminance(light).tolist() == pytest.approx([0.3, 0.1, -0.1])
 

@@ -9,12 +9,12 @@ import torch
 from raster_scenes import Gaussians, Outcome, differences, in_view, outcome, posed, same_bits
 
 from polarguide import _native
-from polarguide.raster import choose_backend, rasterise_reference
-from polarguide.raster.cpu import rasterise_cpu
+from polarguide.raster import choose_backend, rasterize_reference
+from polarguide.raster.cpu import rasterize_cpu
 
 # Float32 against float64. Sums over some hundred pixels and some ten layers round off about 1e-6.
 TOLERANCE = 1e-5
-# A lone pixel's pull is summed about the tile's centre, eight pixels away: nothing averages the rounding out.
+# A lone pixel's pull is summed about the tile's center, eight pixels away: nothing averages the rounding out.
 LONE_PIXEL_TOLERANCE = 1e-4
 CHANNELS = (1, 3, 4, 5, 7, 8, 11, 12, 16, 20, 32)
 SIZES = ((1, 1), (3, 2), (16, 16), (17, 33), (31, 18), (50, 37))
@@ -52,8 +52,8 @@ def threads() -> Iterator[None]:
 
 def compared(gaussians: Gaussians, width: int, height: int, statistic: tuple[int, ...] | None) -> None:
     camera = posed(width, height)
-    found = outcome(rasterise_cpu, gaussians, camera, statistic)
-    expected = outcome(rasterise_reference, gaussians, camera, statistic, dtype=torch.float64)
+    found = outcome(rasterize_cpu, gaussians, camera, statistic)
+    expected = outcome(rasterize_reference, gaussians, camera, statistic, dtype=torch.float64)
     assert torch.equal(found.radii > 0, expected.radii > 0)
     worst = differences(found, expected)
     assert max(worst.values()) < (TOLERANCE if width * height > 1 else LONE_PIXEL_TOLERANCE), worst
@@ -79,11 +79,11 @@ def test_every_picture_size_agrees_with_the_twin(simd: str, width: int, height: 
 def test_statistic_counts_its_own_channels_alone(statistic: tuple[int, ...] | None) -> None:
     camera = posed(20, 20)
     gaussians = in_view(camera, 30, 7, seed=5)
-    first = outcome(rasterise_cpu, gaussians, camera, statistic)
+    first = outcome(rasterize_cpu, gaussians, camera, statistic)
     other = gaussians.features.clone()
     ignored = [k for k in range(7) if statistic is None or k not in statistic]
     other[:, ignored] *= -3
-    second = outcome(rasterise_cpu, gaussians._replace(features=other), camera, statistic)
+    second = outcome(rasterize_cpu, gaussians._replace(features=other), camera, statistic)
     assert not torch.allclose(first.gradients.means, second.gradients.means)
     if statistic is None:
         assert first.statistic is None
@@ -96,9 +96,9 @@ def test_statistic_counts_its_own_channels_alone(statistic: tuple[int, ...] | No
 def test_statistic_does_not_change_the_gradients() -> None:
     camera = posed(20, 20)
     gaussians = in_view(camera, 30, 7, seed=6)
-    plain = outcome(rasterise_cpu, gaussians, camera)
+    plain = outcome(rasterize_cpu, gaussians, camera)
     for channels in ((0, 1, 2), (1, 4), tuple(range(7)), ()):
-        watched = outcome(rasterise_cpu, gaussians, camera, channels)
+        watched = outcome(rasterize_cpu, gaussians, camera, channels)
         worst = differences(watched._replace(statistic=None), plain)
         assert max(worst.values()) < TOLERANCE, (channels, worst)
 
@@ -108,7 +108,7 @@ def runs(simd_gaussians: Gaussians, thread_counts: tuple[int, ...]) -> list[Outc
     for count in thread_counts:
         _native.set_thread_count(count)
         assert _native.thread_count() == count
-        results.append(outcome(rasterise_cpu, simd_gaussians, posed(70, 45), (0, 1, 2)))
+        results.append(outcome(rasterize_cpu, simd_gaussians, posed(70, 45), (0, 1, 2)))
     return results
 
 
@@ -125,7 +125,7 @@ def test_same_bits_for_any_number_of_threads(simd: str) -> None:
 
 def test_same_bits_in_repeated_runs(simd: str) -> None:
     gaussians = in_view(posed(40, 30), 60, 8, seed=2)
-    first, *others = (outcome(rasterise_cpu, gaussians, posed(40, 30), (1, 4)) for _ in range(4))
+    first, *others = (outcome(rasterize_cpu, gaussians, posed(40, 30), (1, 4)) for _ in range(4))
     assert all(same_bits(other, first) for other in others)
 
 
@@ -140,16 +140,16 @@ def test_auto_and_cpu_choose_the_native_backend() -> None:
     for name in ("auto", "cpu"):
         backend = choose_backend(name)
         assert backend.device == torch.device("cpu")
-        assert backend.rasterise is rasterise_cpu
+        assert backend.rasterize is rasterize_cpu
 
 
 def test_gradients_follow_inputs_that_are_views_or_not_contiguous() -> None:
     camera = posed(16, 16)
     gaussians = in_view(camera, 20, 4, seed=3)
-    expected = outcome(rasterise_cpu, gaussians, camera)
+    expected = outcome(rasterize_cpu, gaussians, camera)
     wide = torch.cat((gaussians.features, torch.zeros_like(gaussians.features)), dim=1).requires_grad_()
     turned = gaussians.means.T.contiguous().requires_grad_()
-    picture = rasterise_cpu(turned.T, *gaussians[1:4], wide[:, :4], camera)
+    picture = rasterize_cpu(turned.T, *gaussians[1:4], wide[:, :4], camera)
     assert torch.equal(picture.features, expected.features)
     generator = torch.Generator().manual_seed(7)
     to_features = torch.randn(picture.features.shape, generator=generator)

@@ -13,8 +13,8 @@ import torch
 from raster_scenes import differences, in_view, outcome, posed
 
 from polarguide.errors import PolarguideError
-from polarguide.raster import ScreenStatistic, backends, choose_backend, cuda, rasterise_reference
-from polarguide.raster.cuda import load_gsplat, rasterise_cuda
+from polarguide.raster import ScreenStatistic, backends, choose_backend, cuda, rasterize_reference
+from polarguide.raster.cuda import load_gsplat, rasterize_cuda
 
 TOLERANCE = 2e-5
 
@@ -39,8 +39,8 @@ def test_pictures_gradients_and_statistics_are_those_of_the_twin(
 ) -> None:
     camera = posed(23, 21)
     gaussians = in_view(camera, 40, channels, seed=channels)
-    found = outcome(rasterise_cuda, gaussians, camera, statistic)
-    expected = outcome(rasterise_reference, gaussians, camera, statistic, dtype=torch.float64)
+    found = outcome(rasterize_cuda, gaussians, camera, statistic)
+    expected = outcome(rasterize_reference, gaussians, camera, statistic, dtype=torch.float64)
     worst = differences(found, expected)
     worst.pop("radii")  # gsplat's are of another kind
     assert max(worst.values()) < TOLERANCE, worst
@@ -54,11 +54,11 @@ def test_a_statistic_costs_one_more_call_where_other_channels_are_there(
     camera = posed(16, 16)
     inputs = [t.requires_grad_() for t in in_view(camera, 10, channels, seed=1)]
     statistic = ScreenStatistic((0, 1, 2))
-    rasterise_cuda(*inputs, camera, statistic=statistic).features.sum().backward()
+    rasterize_cuda(*inputs, camera, statistic=statistic).features.sum().backward()
     assert gsplat_stand_in.calls == blended
     assert statistic.gradient is not None
     with torch.no_grad():
-        rasterise_cuda(*inputs, camera, statistic=statistic)
+        rasterize_cuda(*inputs, camera, statistic=statistic)
     assert len(gsplat_stand_in.calls) == len(blended) + 1
 
 
@@ -142,7 +142,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch, *, gpus: int, gsplat: bool) -> None
 def test_auto_takes_the_gpu_that_can_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
     pretend(monkeypatch, gpus=2, gsplat=True)
     assert choose_backend("auto").device == torch.device("cuda", 0)
-    assert choose_backend("cuda", local_rank=1) == (torch.device("cuda", 1), rasterise_cuda)
+    assert choose_backend("cuda", local_rank=1) == (torch.device("cuda", 1), rasterize_cuda)
     assert choose_backend("cpu").device == torch.device("cpu")
     with pytest.raises(PolarguideError, match="a GPU for each process, found 2"):
         choose_backend("cuda", local_rank=2)

@@ -17,9 +17,9 @@ from raster_scenes import (
     round_gaussian,
 )
 
-from polarguide.raster import choose_backend, rasterise_reference
-from polarguide.raster.cpu import rasterise_cpu
-from polarguide.raster.cuda import has_gsplat, rasterise_cuda
+from polarguide.raster import choose_backend, rasterize_reference
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.raster.cuda import has_gsplat, rasterize_cuda
 
 pytestmark = [
     pytest.mark.gpu,
@@ -62,8 +62,8 @@ def test_gsplat_agrees_with_the_twin(channels: int, statistic: tuple[int, ...] |
         statistic = tuple(range(channels))
     camera = posed(50, 37)
     gaussians = in_view(camera, 60, channels, seed=channels)
-    found = here(outcome(rasterise_cuda, there(gaussians), camera, statistic))
-    expected = outcome(rasterise_reference, gaussians, camera, statistic, dtype=torch.float64)
+    found = here(outcome(rasterize_cuda, there(gaussians), camera, statistic))
+    expected = outcome(rasterize_reference, gaussians, camera, statistic, dtype=torch.float64)
     worst = differences(found, expected)
     worst.pop("radii")  # of another kind
     assert {name: d for name, d in worst.items() if not d < TOLERANCES[name]} == {}
@@ -76,8 +76,8 @@ def test_a_large_picture_agrees_with_the_cpu() -> None:
     jitter = torch.randn(50 * 40, 3, generator=torch.Generator().manual_seed(0))
     many = Gaussians(*(torch.cat([t] * 50) for t in small))
     many = many._replace(means=many.means + 0.3 * jitter, opacities=many.opacities * 0.3)
-    found = here(outcome(rasterise_cuda, there(many), camera, (0, 1, 2)))
-    expected = outcome(rasterise_cpu, many, camera, (0, 1, 2))
+    found = here(outcome(rasterize_cuda, there(many), camera, (0, 1, 2)))
+    expected = outcome(rasterize_cpu, many, camera, (0, 1, 2))
     # Pixels near a cut-off may fall on either side: few, so the whole is close.
     assert differences(found, expected)["features"] < 1e-3
     assert differences(found, expected)["statistic"] < 1e-2
@@ -86,15 +86,15 @@ def test_a_large_picture_agrees_with_the_cpu() -> None:
 def test_alpha_is_capped_later_than_ours_in_the_first_version() -> None:
     """0.999 in 1.5.3, 0.99 in 1.6.0 and here: an opaque Gaussian hides more."""
     camera, opaque = looking_ahead(9, 9), round_gaussian(5.0, 0.9999)
-    assert float(rasterise_reference(*opaque, camera).alpha.max()) == pytest.approx(0.99, abs=1e-4)
-    found = rasterise_cuda(*there(opaque), camera).alpha
+    assert float(rasterize_reference(*opaque, camera).alpha.max()) == pytest.approx(0.99, abs=1e-4)
+    found = rasterize_cuda(*there(opaque), camera).alpha
     cap = 0.999 if version("gsplat").startswith("1.5") else 0.99
     assert float(found.max()) == pytest.approx(cap, abs=1e-4)
 
 
 def test_nothing_in_view_is_an_empty_picture() -> None:
     camera, behind = looking_ahead(9, 9), round_gaussian(0.1, 0.5, depth=-3.0)
-    found = outcome(rasterise_cuda, there(behind), camera, (0,))
+    found = outcome(rasterize_cuda, there(behind), camera, (0,))
     assert not bool(found.features.any())
     assert not bool(found.radii.any())
     assert all(bool(torch.isfinite(t).all()) for t in found.gradients)

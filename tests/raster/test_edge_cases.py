@@ -18,10 +18,10 @@ from raster_scenes import (
     round_gaussian,
 )
 
-from polarguide.raster import Rasterise, rasterise_reference
-from polarguide.raster.cpu import rasterise_cpu
+from polarguide.raster import Rasterize, rasterize_reference
+from polarguide.raster.cpu import rasterize_cpu
 
-BOTH = pytest.mark.parametrize("rasterise", [rasterise_cpu, rasterise_reference], ids=["cpu", "twin"])
+BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "twin"])
 
 
 def finite(result: object) -> bool:
@@ -30,9 +30,9 @@ def finite(result: object) -> bool:
 
 
 @BOTH
-def test_no_gaussians_give_an_empty_picture(rasterise: Rasterise) -> None:
+def test_no_gaussians_give_an_empty_picture(rasterize: Rasterize) -> None:
     none = Gaussians(*(t[:0] for t in round_gaussian(1.0, 0.5)))
-    result = outcome(rasterise, none, looking_ahead(20, 18), (0,))
+    result = outcome(rasterize, none, looking_ahead(20, 18), (0,))
     assert result.features.shape == (18, 20, 2)
     assert not result.features.any()
     assert not result.alpha.any()
@@ -42,11 +42,11 @@ def test_no_gaussians_give_an_empty_picture(rasterise: Rasterise) -> None:
 
 
 @BOTH
-def test_gaussians_behind_the_camera_are_culled(rasterise: Rasterise) -> None:
+def test_gaussians_behind_the_camera_are_culled(rasterize: Rasterize) -> None:
     camera = looking_ahead(20, 18)
     ahead = in_view(camera, 12, 3, seed=0)
     behind = ahead._replace(means=ahead.means * torch.tensor([1.0, 1.0, -1.0]))
-    result = outcome(rasterise, behind, camera, (0, 1, 2))
+    result = outcome(rasterize, behind, camera, (0, 1, 2))
     assert not result.features.any()
     assert not result.alpha.any()
     assert not result.radii.any()
@@ -56,13 +56,13 @@ def test_gaussians_behind_the_camera_are_culled(rasterise: Rasterise) -> None:
 
 
 @BOTH
-def test_gradients_are_zero_where_culled_and_right_elsewhere(rasterise: Rasterise) -> None:
+def test_gradients_are_zero_where_culled_and_right_elsewhere(rasterize: Rasterize) -> None:
     camera = looking_ahead(20, 18)
     ahead = in_view(camera, 12, 3, seed=0)
-    alone = outcome(rasterise, ahead, camera, (0, 1, 2))
+    alone = outcome(rasterize, ahead, camera, (0, 1, 2))
     behind = ahead._replace(means=ahead.means * torch.tensor([1.0, 1.0, -1.0]))
     mixed = Gaussians(*(torch.stack(pair, dim=1).flatten(0, 1) for pair in zip(behind, ahead, strict=True)))
-    result = outcome(rasterise, mixed, camera, (0, 1, 2))
+    result = outcome(rasterize, mixed, camera, (0, 1, 2))
     torch.testing.assert_close(result.features, alone.features)
     for gradient, expected in zip(result.gradients, alone.gradients, strict=True):
         assert not gradient[0::2].any()
@@ -71,25 +71,25 @@ def test_gradients_are_zero_where_culled_and_right_elsewhere(rasterise: Rasteris
 
 
 @BOTH
-def test_opacity_below_the_cut_off_is_culled(rasterise: Rasterise) -> None:
+def test_opacity_below_the_cut_off_is_culled(rasterize: Rasterize) -> None:
     camera = looking_ahead(9, 9)
-    below = outcome(rasterise, round_gaussian(1.0, 0.999 / 255), camera, (0,))
+    below = outcome(rasterize, round_gaussian(1.0, 0.999 / 255), camera, (0,))
     assert not below.alpha.any()
     assert not below.radii.any()
     assert all(not gradient.any() for gradient in below.gradients)
-    above = outcome(rasterise, round_gaussian(1.0, 1.02 / 255), camera, (0,))
+    above = outcome(rasterize, round_gaussian(1.0, 1.02 / 255), camera, (0,))
     assert float(above.alpha.max()) > 0
     assert float(above.radii[0]) > 0
 
 
 @BOTH
 @pytest.mark.parametrize("sigma", [30.0, 1e3, 1e5])
-def test_a_gaussian_that_covers_the_picture(rasterise: Rasterise, sigma: float) -> None:
+def test_a_gaussian_that_covers_the_picture(rasterize: Rasterize, sigma: float) -> None:
     camera = looking_ahead(37, 21)
-    result = outcome(rasterise, round_gaussian(sigma, 0.7), camera, (0, 1))
+    result = outcome(rasterize, round_gaussian(sigma, 0.7), camera, (0, 1))
     assert finite(result)
     assert 0.68 < float(result.alpha.min()) <= float(result.alpha.max()) <= 0.7 + 1e-6
-    twin = outcome(rasterise_reference, round_gaussian(sigma, 0.7), camera, dtype=torch.float64)
+    twin = outcome(rasterize_reference, round_gaussian(sigma, 0.7), camera, dtype=torch.float64)
     assert difference(result.features, twin.features) < 1e-5
     assert difference(result.gradients.features, twin.gradients.features) < 1e-5
 
@@ -99,14 +99,14 @@ def test_scales_beyond_what_float32_can_square_do_not_break_the_picture(size: fl
     camera = looking_ahead(20, 20)
     good = in_view(camera, 10, 2, seed=1)
     huge = round_gaussian(size, 0.5)
-    result = outcome(rasterise_cpu, Gaussians(*(torch.cat(p) for p in zip(good, huge, strict=True))), camera)
+    result = outcome(rasterize_cpu, Gaussians(*(torch.cat(p) for p in zip(good, huge, strict=True))), camera)
     assert finite(result)
     assert 0 <= float(result.alpha.min()) <= float(result.alpha.max()) <= 1
 
 
 @BOTH
-def test_a_picture_of_one_pixel(rasterise: Rasterise) -> None:
-    result = outcome(rasterise, round_gaussian(2.0, 0.6), looking_ahead(1, 1), (0, 1))
+def test_a_picture_of_one_pixel(rasterize: Rasterize) -> None:
+    result = outcome(rasterize, round_gaussian(2.0, 0.6), looking_ahead(1, 1), (0, 1))
     assert result.features.shape == (1, 1, 2)
     assert float(result.alpha) == pytest.approx(0.6, abs=1e-6)
     torch.testing.assert_close(result.features[0, 0], torch.full((2,), 0.6))
@@ -123,7 +123,7 @@ def test_a_stack_of_opaque_gaussians_ends_early(count: int) -> None:
         scales=40 * depth[:, None].repeat(1, 3),
         features=features,
     )
-    result = outcome(rasterise_cpu, stack, camera, (0, 1))
+    result = outcome(rasterize_cpu, stack, camera, (0, 1))
     assert finite(result)
     assert result.statistic is not None
     torch.testing.assert_close(result.alpha, torch.full((18, 18), 1 - 0.02**2), atol=1e-5, rtol=0)
@@ -137,8 +137,8 @@ def test_early_ends_agree_with_the_twin() -> None:
     camera = posed(30, 26)
     gaussians = in_view(camera, 150, 4, seed=21)
     gaussians = gaussians._replace(opacities=gaussians.opacities.clamp(min=0.8, max=0.97))
-    found = outcome(rasterise_cpu, gaussians, camera, (0, 1, 2))
-    expected = outcome(rasterise_reference, gaussians, camera, (0, 1, 2), dtype=torch.float64)
+    found = outcome(rasterize_cpu, gaussians, camera, (0, 1, 2))
+    expected = outcome(rasterize_reference, gaussians, camera, (0, 1, 2), dtype=torch.float64)
     assert float(expected.alpha.max()) > 0.9995, "no pixel ends early"
     # A pixel whose transmittance lies within rounding of the end may end one Gaussian apart.
     same = (found.alpha - expected.alpha).abs() < 1e-6
@@ -158,8 +158,8 @@ def test_needles_and_discs(length: float, thickness: float) -> None:
     disc = torch.tensor([length, length, thickness])
     shapes = torch.where((torch.arange(30) % 2 == 0)[:, None], needle, disc)
     gaussians = gaussians._replace(scales=pixel * shapes)
-    found = outcome(rasterise_cpu, gaussians, camera, (0, 1, 2))
-    expected = outcome(rasterise_reference, gaussians, camera, (0, 1, 2), dtype=torch.float64)
+    found = outcome(rasterize_cpu, gaussians, camera, (0, 1, 2))
+    expected = outcome(rasterize_reference, gaussians, camera, (0, 1, 2), dtype=torch.float64)
     assert finite(found)
     worst = differences(found, expected)
     assert max(worst["features"], worst["alpha"], worst["radii"], worst["gradient of features"]) < 1e-4, worst
@@ -173,8 +173,8 @@ def test_zero_quaternions_and_zero_scales_are_points() -> None:
         gaussians._replace(quats=0 * gaussians.quats),
         gaussians._replace(scales=0 * gaussians.scales),
     ):
-        found = outcome(rasterise_cpu, changed, camera)
-        expected = outcome(rasterise_reference, changed, camera, dtype=torch.float64)
+        found = outcome(rasterize_cpu, changed, camera)
+        expected = outcome(rasterize_reference, changed, camera, dtype=torch.float64)
         assert finite(found)
         worst = differences(found, expected)
         assert max(worst["features"], worst["alpha"], worst["gradient of means"]) < 1e-5, worst
@@ -192,8 +192,8 @@ def test_gaussians_across_the_near_plane() -> None:
         torch.full((count,), 0.4),
         torch.randn(count, 3, generator=torch.Generator().manual_seed(2)),
     )
-    found = outcome(rasterise_cpu, gaussians, camera, (0, 1, 2))
-    expected = outcome(rasterise_reference, gaussians, camera, (0, 1, 2), dtype=torch.float64)
+    found = outcome(rasterize_cpu, gaussians, camera, (0, 1, 2))
+    expected = outcome(rasterize_reference, gaussians, camera, (0, 1, 2), dtype=torch.float64)
     assert finite(found)
     assert not found.radii[depth <= 0.01].any()
     assert all(not gradient[depth <= 0.01].any() for gradient in found.gradients)
@@ -204,12 +204,12 @@ def test_gaussians_across_the_near_plane() -> None:
 
 
 @BOTH
-def test_radii_are_zero_outside_the_picture_and_three_sigma_inside(rasterise: Rasterise) -> None:
+def test_radii_are_zero_outside_the_picture_and_three_sigma_inside(rasterize: Rasterize) -> None:
     camera = looking_ahead(20, 20, focal=100.0)
     inside = round_gaussian(0.15, 0.5)
     outside = inside._replace(means=torch.tensor([[9.0, 0.0, 3.0]]))
     pair = Gaussians(*(torch.cat(p) for p in zip(inside, outside, strict=True)))
-    radii = rasterise(*pair, camera).radii
+    radii = rasterize(*pair, camera).radii
     assert float(radii[1]) == 0
     # 5 pixels of spread and the blur; the definition adds a little under the root to round ellipses.
     variance = (100 / 3 * 0.15) ** 2 + 0.3

@@ -10,7 +10,7 @@ from raster_scenes import Gaussians, looking_ahead, posed
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.raster import ScreenStatistic, rasterise_reference
+from polarguide.raster import ScreenStatistic, rasterize_reference
 
 
 def smooth(camera: Camera, count: int = 4, channels: int = 2) -> Gaussians:
@@ -36,10 +36,10 @@ def test_the_smooth_scene_is_far_from_every_cut_off() -> None:
     gaussians = smooth(camera)
     for index in range(len(gaussians.means)):
         alone = Gaussians(*(t[index : index + 1] for t in gaussians))
-        alpha = rasterise_reference(*alone, camera).alpha
+        alpha = rasterize_reference(*alone, camera).alpha
         assert float(alpha.min()) > 2 / 255
         assert float(alpha.max()) < 0.9
-    assert float(rasterise_reference(*gaussians, camera).alpha.max()) < 0.99
+    assert float(rasterize_reference(*gaussians, camera).alpha.max()) < 0.99
 
 
 @pytest.mark.parametrize("name", Gaussians._fields)
@@ -48,7 +48,7 @@ def test_each_gradient_against_finite_differences(camera: Camera, name: str) -> 
     gaussians = smooth(camera)
 
     def pictures(values: Tensor) -> tuple[Tensor, Tensor]:
-        return rasterise_reference(*gaussians._replace(**{name: values}), camera)[:2]
+        return rasterize_reference(*gaussians._replace(**{name: values}), camera)[:2]
 
     values = getattr(gaussians, name).clone().requires_grad_()
     assert torch.autograd.gradcheck(pictures, (values,), eps=1e-6, atol=1e-7, rtol=1e-5)
@@ -59,7 +59,7 @@ def test_all_gradients_together() -> None:
     inputs = tuple(t.clone().requires_grad_() for t in smooth(camera, count=3))
 
     def pictures(*values: Tensor) -> tuple[Tensor, Tensor]:
-        return rasterise_reference(*values, camera)[:2]
+        return rasterize_reference(*values, camera)[:2]
 
     assert torch.autograd.gradcheck(pictures, inputs, eps=1e-6, atol=1e-7, rtol=1e-5)
 
@@ -68,8 +68,8 @@ def test_length_of_a_quaternion_does_not_matter_and_has_no_gradient() -> None:
     camera = posed(5, 4)
     gaussians = smooth(camera)
     quats = gaussians.quats.clone().requires_grad_()
-    picture = rasterise_reference(*gaussians._replace(quats=quats), camera).features
-    longer = rasterise_reference(*gaussians._replace(quats=3.7 * gaussians.quats), camera).features
+    picture = rasterize_reference(*gaussians._replace(quats=quats), camera).features
+    longer = rasterize_reference(*gaussians._replace(quats=3.7 * gaussians.quats), camera).features
     torch.testing.assert_close(longer, picture.detach())
     (gradient,) = torch.autograd.grad(picture.square().sum(), quats)
     assert float(gradient.norm()) > 1e-3
@@ -105,11 +105,11 @@ def test_statistic_is_the_derivative_by_the_projected_mean() -> None:
     statistic = ScreenStatistic((1, 2))
     weights = torch.rand(10, 12, 4, generator=generator, dtype=torch.float64)
     watched = gaussians._replace(means=gaussians.means.clone().requires_grad_())
-    picture = rasterise_reference(*watched, camera, statistic=statistic)
+    picture = rasterize_reference(*watched, camera, statistic=statistic)
     (picture.features * weights).sum().backward()
 
     def loss(means: Tensor) -> float:
-        shown = rasterise_reference(*gaussians._replace(means=means), camera).features
+        shown = rasterize_reference(*gaussians._replace(means=means), camera).features
         return float((shown * weights)[..., [1, 2]].sum())
 
     assert statistic.gradient is not None

@@ -8,13 +8,13 @@ import pytest
 import torch
 from raster_scenes import Gaussians, in_view, looking_ahead, posed
 
-from polarguide.raster import Rasterise, rasterise_reference
-from polarguide.raster.cpu import rasterise_cpu
+from polarguide.raster import Rasterize, rasterize_reference
+from polarguide.raster.cpu import rasterize_cpu
 
-BOTH = pytest.mark.parametrize("rasterise", [rasterise_cpu, rasterise_reference], ids=["cpu", "twin"])
+BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "twin"])
 
 
-def at_depths(depths: list[float], opacities: list[float], colours: list[list[float]]) -> Gaussians:
+def at_depths(depths: list[float], opacities: list[float], colors: list[list[float]]) -> Gaussians:
     """Round Gaussians on the optical axis, each of 2 pixels' spread for a focal length of 20 pixels."""
     depth = torch.tensor(depths)
     return Gaussians(
@@ -22,15 +22,15 @@ def at_depths(depths: list[float], opacities: list[float], colours: list[list[fl
         torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(depths), 1),
         (depth / 10)[:, None].repeat(1, 3),
         torch.tensor(opacities),
-        torch.tensor(colours),
+        torch.tensor(colors),
     )
 
 
 @BOTH
 @pytest.mark.parametrize("opacity", [0.05, 0.5, 0.98])
-def test_one_round_gaussian_in_closed_form(rasterise: Rasterise, opacity: float) -> None:
+def test_one_round_gaussian_in_closed_form(rasterize: Rasterize, opacity: float) -> None:
     camera = looking_ahead(21, 15, focal=20.0)
-    picture = rasterise(*at_depths([4.0], [opacity], [[2.0, -1.0]]), camera)
+    picture = rasterize(*at_depths([4.0], [opacity], [[2.0, -1.0]]), camera)
     assert float(picture.alpha[7, 10]) == pytest.approx(opacity, rel=1e-5)
     y, x = torch.meshgrid(torch.arange(15.0) - 7, torch.arange(21.0) - 10, indexing="ij")
     alpha = opacity * torch.exp(-(x**2 + y**2) / (2 * (2.0**2 + 0.3)))
@@ -40,33 +40,33 @@ def test_one_round_gaussian_in_closed_form(rasterise: Rasterise, opacity: float)
 
 
 @BOTH
-def test_alpha_never_exceeds_its_cap(rasterise: Rasterise) -> None:
-    picture = rasterise(*at_depths([4.0], [0.9999], [[1.0]]), looking_ahead(21, 15, focal=20.0))
+def test_alpha_never_exceeds_its_cap(rasterize: Rasterize) -> None:
+    picture = rasterize(*at_depths([4.0], [0.9999], [[1.0]]), looking_ahead(21, 15, focal=20.0))
     assert float(picture.alpha.max()) == pytest.approx(0.99, abs=1e-6)
 
 
 @BOTH
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_the_nearer_gaussian_is_in_front_whatever_its_index(
-    rasterise: Rasterise, order: tuple[int, int]
+    rasterize: Rasterize, order: tuple[int, int]
 ) -> None:
     near, far, red, blue = 0.6, 0.9, [1.0, 0.0], [0.0, 1.0]
     gaussians = at_depths([3.0, 5.0], [near, far], [red, blue])
     shuffled = Gaussians(*(t[list(order)] for t in gaussians))
-    centre = rasterise(*shuffled, looking_ahead(21, 15, focal=20.0)).features[7, 10]
-    torch.testing.assert_close(centre, torch.tensor([near, (1 - near) * far]), atol=1e-6, rtol=1e-5)
+    center = rasterize(*shuffled, looking_ahead(21, 15, focal=20.0)).features[7, 10]
+    torch.testing.assert_close(center, torch.tensor([near, (1 - near) * far]), atol=1e-6, rtol=1e-5)
 
 
 @BOTH
-def test_equal_depths_blend_by_index(rasterise: Rasterise) -> None:
+def test_equal_depths_blend_by_index(rasterize: Rasterize) -> None:
     gaussians = at_depths([4.0, 4.0, 4.0], [0.5, 0.5, 0.5], [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
-    centre = rasterise(*gaussians, looking_ahead(21, 15, focal=20.0)).features[7, 10]
-    torch.testing.assert_close(centre, torch.tensor([0.5, 0.25, 0.125]), atol=1e-6, rtol=1e-5)
+    center = rasterize(*gaussians, looking_ahead(21, 15, focal=20.0)).features[7, 10]
+    torch.testing.assert_close(center, torch.tensor([0.5, 0.25, 0.125]), atol=1e-6, rtol=1e-5)
 
 
 @BOTH
-def test_order_is_depth_along_the_axis_of_the_camera(rasterise: Rasterise) -> None:
-    """A Gaussian farther from the camera's centre but at less depth is in front."""
+def test_order_is_depth_along_the_axis_of_the_camera(rasterize: Rasterize) -> None:
+    """A Gaussian farther from the camera's center but at less depth is in front."""
     camera = looking_ahead(41, 15, focal=20.0)
     gaussians = Gaussians(
         torch.tensor([[0.0, 0.0, 4.0], [3.9, 0.0, 3.9]]),
@@ -76,8 +76,8 @@ def test_order_is_depth_along_the_axis_of_the_camera(rasterise: Rasterise) -> No
         torch.tensor([[1.0, 0.0], [0.0, 1.0]]),
     )
     assert gaussians.means[1].norm() > gaussians.means[0].norm()
-    row = rasterise(*gaussians, camera).features[7]
-    alone = [rasterise(*(t[i : i + 1] for t in gaussians), camera).alpha[7] for i in range(2)]
+    row = rasterize(*gaussians, camera).features[7]
+    alone = [rasterize(*(t[i : i + 1] for t in gaussians), camera).alpha[7] for i in range(2)]
     torch.testing.assert_close(row[:, 1], alone[1], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(row[:, 0], alone[0] * (1 - alone[1]), atol=1e-5, rtol=1e-4)
 
@@ -86,17 +86,17 @@ def test_any_permutation_of_the_rows_gives_the_same_picture() -> None:
     camera = posed(33, 20)
     gaussians = in_view(camera, 50, 5, seed=8)
     order = torch.randperm(50, generator=torch.Generator().manual_seed(1))
-    straight = rasterise_cpu(*gaussians, camera)
-    shuffled = rasterise_cpu(*(t[order] for t in gaussians), camera)
+    straight = rasterize_cpu(*gaussians, camera)
+    shuffled = rasterize_cpu(*(t[order] for t in gaussians), camera)
     assert torch.equal(shuffled.features, straight.features)
     assert torch.equal(shuffled.radii, straight.radii[order])
 
 
 @BOTH
-def test_constant_features_blend_to_alpha(rasterise: Rasterise) -> None:
+def test_constant_features_blend_to_alpha(rasterize: Rasterize) -> None:
     camera = posed(33, 20)
     gaussians = in_view(camera, 50, 5, seed=8)
-    picture = rasterise(*gaussians._replace(features=torch.full((50, 5), 3.0)), camera)
+    picture = rasterize(*gaussians._replace(features=torch.full((50, 5), 3.0)), camera)
     expected = 3 * picture.alpha[..., None].expand(-1, -1, 5)
     torch.testing.assert_close(picture.features, expected, atol=1e-5, rtol=1e-5)
 
@@ -120,7 +120,7 @@ def test_moving_camera_and_gaussians_together_changes_nothing() -> None:
     )
     eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     still = type(camera)(24, 24, camera.fx, camera.fy, camera.cx, camera.cy, eye, zero)
-    expected = rasterise_cpu(*gaussians, camera)
-    moved = rasterise_cpu(*gaussians._replace(means=local, quats=turned), still)
+    expected = rasterize_cpu(*gaussians, camera)
+    moved = rasterize_cpu(*gaussians._replace(means=local, quats=turned), still)
     torch.testing.assert_close(moved.features, expected.features, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(moved.radii, expected.radii, atol=1e-3, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""What a rasteriser refuses, and how it says so."""
+"""What a rasterizer refuses, and how it says so."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import torch
 from raster_scenes import Gaussians, looking_ahead, repeated, round_gaussian
 
 from polarguide.errors import PolarguideError
-from polarguide.raster import Rasterise, ScreenStatistic, choose_backend, rasterise_reference
-from polarguide.raster.cpu import rasterise_cpu
+from polarguide.raster import Rasterize, ScreenStatistic, choose_backend, rasterize_reference
+from polarguide.raster.cpu import rasterize_cpu
 
-BOTH = pytest.mark.parametrize("rasterise", [rasterise_cpu, rasterise_reference], ids=["cpu", "twin"])
+BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "twin"])
 
 
 @BOTH
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", Gaussians._fields)
-def test_what_is_not_finite_is_refused_with_its_row(rasterise: Rasterise, name: str, value: float) -> None:
+def test_what_is_not_finite_is_refused_with_its_row(rasterize: Rasterize, name: str, value: float) -> None:
     camera = looking_ahead(8, 8)
     for row in (0, 3, 5):
         gaussians = repeated(round_gaussian(1.0, 0.5), 6)
         broken = getattr(gaussians, name).clone()
         broken.view(6, -1)[row, -1] = value
-        with pytest.raises(PolarguideError, match=re.escape(f"rasterise({name})")) as error:
-            rasterise(*gaussians._replace(**{name: broken}), camera)
+        with pytest.raises(PolarguideError, match=re.escape(f"rasterize({name})")) as error:
+            rasterize(*gaussians._replace(**{name: broken}), camera)
         assert error.value.found == f"NaN or infinity in row {row}"
 
 
@@ -48,35 +48,35 @@ def test_what_is_not_finite_is_refused_with_its_row(rasterise: Rasterise, name: 
         ("features", (6, 3, 1)),
     ],
 )
-def test_wrong_shapes_are_refused(rasterise: Rasterise, name: str, shape: tuple[int, ...]) -> None:
+def test_wrong_shapes_are_refused(rasterize: Rasterize, name: str, shape: tuple[int, ...]) -> None:
     gaussians = repeated(round_gaussian(1.0, 0.5), 6)
     with pytest.raises(PolarguideError, match=r"expected shape .* found"):
-        rasterise(*gaussians._replace(**{name: torch.ones(shape)}), looking_ahead(8, 8))
+        rasterize(*gaussians._replace(**{name: torch.ones(shape)}), looking_ahead(8, 8))
 
 
 @BOTH
 @pytest.mark.parametrize("channels", [0, 33, 100])
-def test_channels_beyond_the_interface_are_refused(rasterise: Rasterise, channels: int) -> None:
+def test_channels_beyond_the_interface_are_refused(rasterize: Rasterize, channels: int) -> None:
     gaussians = round_gaussian(1.0, 0.5)._replace(features=torch.ones(1, channels))
     with pytest.raises(PolarguideError, match=f"1 to 32 channels, found {channels}"):
-        rasterise(*gaussians, looking_ahead(8, 8))
+        rasterize(*gaussians, looking_ahead(8, 8))
 
 
 @BOTH
 @pytest.mark.parametrize("channels", [(2,), (0, -1), (1, 1)])
 def test_statistic_over_channels_that_do_not_exist_is_refused(
-    rasterise: Rasterise, channels: tuple[int, ...]
+    rasterize: Rasterize, channels: tuple[int, ...]
 ) -> None:
     with pytest.raises(PolarguideError, match="statistic"):
-        rasterise(*round_gaussian(1.0, 0.5), looking_ahead(8, 8), statistic=ScreenStatistic(channels))
+        rasterize(*round_gaussian(1.0, 0.5), looking_ahead(8, 8), statistic=ScreenStatistic(channels))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64])
 def test_native_backend_refuses_other_number_types(dtype: torch.dtype) -> None:
     gaussians = round_gaussian(1.0, 0.5)
     for name in Gaussians._fields:
-        with pytest.raises(PolarguideError, match=re.escape(f"rasterise({name}): expected float32")):
-            rasterise_cpu(
+        with pytest.raises(PolarguideError, match=re.escape(f"rasterize({name}): expected float32")):
+            rasterize_cpu(
                 *gaussians._replace(**{name: getattr(gaussians, name).to(dtype)}), looking_ahead(8, 8)
             )
 

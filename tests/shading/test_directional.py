@@ -11,11 +11,11 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from polarguide.camera import Camera
-from polarguide.raster.cpu import rasterise_cpu
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.shading.deferred import render
 from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, mirrored
-from polarguide.shading.render import render
 
 SHADING = DirectionalShading(width=8)
 COUNT, RESOLUTION, LEVELS = 30, 8, 5
@@ -43,7 +43,7 @@ def rows() -> dict[str, Tensor]:
         "log_scales": -1.5 + 0.5 * normal(3, COUNT, 3),
         "opacity_logits": normal(4, COUNT),
     }
-    return core | SHADING.first_rows(torch.rand(COUNT, 3), torch.Generator().manual_seed(5))
+    return core | SHADING.first_parameters(torch.rand(COUNT, 3), torch.Generator().manual_seed(5))
 
 
 def plainly(values: dict[str, Tensor], ray: Tensor, roughness: Tensor, feature: Tensor) -> Tensor:
@@ -104,7 +104,7 @@ def test_length_of_a_feature_does_not_matter_and_brightness_has_an_end() -> None
 
 
 def test_layers_add_up_to_the_final_picture(rows: dict[str, Tensor]) -> None:
-    result = render(rows, camera(), rasterise_cpu, environment=light(), shading=SHADING, depth=True)
+    result = render(rows, camera(), rasterize_cpu, environment=light(), shading=SHADING, depth=True)
     assert result.specular is not None
     assert result.diffuse is not None
     assert torch.equal(result.specular + result.diffuse, result.final)
@@ -120,16 +120,16 @@ def test_without_harmonics_the_view_changes_only_the_specular_layer(rows: dict[s
     """Of one opaque Gaussian that fills the picture the albedo is that of its row, wherever the camera stands."""
     one = {name: t[:1].clone() for name, t in rows.items()}
     one["means"], one["log_scales"] = torch.zeros(1, 3), torch.full((1, 3), 3.0)
-    result = render(one, camera(), rasterise_cpu, environment=light(), shading=SHADING)
-    colour = result.diffuse[10, 12] / result.alpha[10, 12]  # type: ignore[index]
-    assert_close(colour, albedo_of(one)[0], rtol=1e-4, atol=1e-5)
+    result = render(one, camera(), rasterize_cpu, environment=light(), shading=SHADING)
+    color = result.diffuse[10, 12] / result.alpha[10, 12]  # type: ignore[index]
+    assert_close(color, albedo_of(one)[0], rtol=1e-4, atol=1e-5)
 
 
 def test_first_values_are_those_asked_for() -> None:
     shading = DirectionalShading(width=8, first_albedo=0.4, first_roughness=0.3, first_light=0.1)
-    colours = torch.tensor([[0.5, 0.2, 0.1], [0.0, 1.0, 0.3]])
-    rows = shading.first_rows(colours, torch.Generator().manual_seed(0))
-    assert_close(albedo_of(rows), (0.4 * colours).clamp(min=1e-3))
+    colors = torch.tensor([[0.5, 0.2, 0.1], [0.0, 1.0, 0.3]])
+    rows = shading.first_parameters(colors, torch.Generator().manual_seed(0))
+    assert_close(albedo_of(rows), (0.4 * colors).clamp(min=1e-3))
     assert_close(torch.sigmoid(rows["roughness_logits"]), torch.full((2,), 0.3))
     values = shading.first_light_values(4, 0.5, torch.Generator().manual_seed(0))
     assert values["texels"].shape == (6, 4, 4, CHANNELS)
@@ -155,7 +155,7 @@ def test_degenerate_normals_and_features_stay_finite_with_gradients(scale: float
 def test_every_row_and_parameter_gets_a_gradient(rows: dict[str, Tensor]) -> None:
     trained = {name: t.clone().requires_grad_() for name, t in rows.items()}
     values = {name: t.requires_grad_() for name, t in light().items()}
-    result = render(trained, camera(), rasterise_cpu, environment=values, shading=SHADING)
+    result = render(trained, camera(), rasterize_cpu, environment=values, shading=SHADING)
     result.final.square().mean().backward()
     for name, tensor in (trained | values).items():
         assert tensor.grad is not None, name
@@ -176,4 +176,4 @@ def test_a_gaussian_alone_is_its_albedo_and_the_light_in_its_mirror(rows: dict[s
     expected = fields["albedo"] + SHADING.radiance(
         light(), mirrored(rays, normals), fields["roughness"], fields["feature"]
     )
-    assert_close(SHADING.colours(rows, light(), rays, normals), expected)
+    assert_close(SHADING.colors(rows, light(), rays, normals), expected)

@@ -71,7 +71,7 @@ def test_gradients_against_finite_differences() -> None:
 
 
 def test_the_sharpest_level_still_says_what_blurring_would_change() -> None:
-    """At level 0, where every roughness may begin, the gradient is that towards level 1."""
+    """At level 0, where every roughness may begin, the gradient is that toward level 1."""
     levels = box_mips(texture())
     level = torch.zeros(60, dtype=torch.float64, requires_grad=True)
     mip_lookup(levels, directions(), level).sum().backward()

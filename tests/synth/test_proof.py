@@ -32,7 +32,7 @@ BALL = {
         {
             "name": "ball",
             "shape": {"type": "ball", "radius": 1},
-            "material": {"colour": [0.6, 0.3, 0.15], "roughness": 0.001, "index": INDEX},
+            "material": {"color": [0.6, 0.3, 0.15], "roughness": 0.001, "index": INDEX},
         }
     ],
 }
@@ -52,13 +52,13 @@ def ball(variant: Variant, tmp_path_factory: pytest.TempPathFactory) -> Built:
 
 @pytest.fixture(scope="module")
 def light(ball: Built, camera: Camera) -> Light:
-    return expose(ball.scenes, camera, 64, seed=3, walk=Walk(depth=3), centre=True)
+    return expose(ball.scenes, camera, 64, seed=3, walk=Walk(depth=3), center=True)
 
 
 @pytest.fixture(scope="module")
 def normals(camera: Camera) -> tuple[Tensor, Tensor]:
     """Analytic normals of the unit ball in camera axes, [H, W, 3] float64, and where there is one."""
-    eye = camera.centre.numpy()
+    eye = camera.center.numpy()
     rays = camera.world_rays(dtype=torch.float64).numpy()
     along = rays @ eye
     inside = along**2 - (eye @ eye - 1)
@@ -148,15 +148,15 @@ def test_what_is_seen_directly_is_the_sky(light: Light, normals: tuple[Tensor, T
 def test_pixel_truth_agrees_with_the_geometry(
     ball: Built, camera: Camera, normals: tuple[Tensor, Tensor]
 ) -> None:
-    truth = pixel_truth(ball, camera)
+    ground_truth = pixel_truth(ball, camera)
     normal, where = normals
-    found = camera.to_camera(torch.from_numpy(truth["normal"].astype(np.float64)))
+    found = camera.to_camera(torch.from_numpy(ground_truth["normal"].astype(np.float64)))
     assert ((torch.nn.functional.normalize(found, dim=-1) * normal).sum(-1)[where] > 0.99999).all()
-    assert (torch.from_numpy(truth["mask"])[where]).all()
-    eye = camera.centre.numpy()
+    assert (torch.from_numpy(ground_truth["mask"])[where]).all()
+    eye = camera.center.numpy()
     places = (
         eye
-        + truth["depth"].astype(np.float64)[..., None]
+        + ground_truth["depth"].astype(np.float64)[..., None]
         * (camera.world_rays(dtype=torch.float64) / camera.rays(dtype=torch.float64)[..., 2:]).numpy()
     )
     size = np.linalg.norm(places[where.numpy()], axis=-1)
@@ -171,7 +171,7 @@ def test_lobes_add_up_to_mitsubas_own_path_tracer(
 
     axes = np.eye(4)
     rows = camera.rotation.numpy()
-    axes[:3] = np.stack((-rows[0], -rows[1], rows[2], camera.centre.numpy()), -1)
+    axes[:3] = np.stack((-rows[0], -rows[1], rows[2], camera.center.numpy()), -1)
     sensor = mi.load_dict({
         "type": "perspective", "fov_axis": "x", "fov": math.degrees(2 * math.atan(camera.width / 2 / camera.fx)),
         "to_world": mi.ScalarTransform4f(axes), "near_clip": 1e-3,

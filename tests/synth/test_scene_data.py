@@ -33,14 +33,14 @@ SHAPES = [
         "type": "solid",
         "detail": 32,
         "parts": [
-            {"kind": "ellipsoid", "at": [0, 0, 0], "size": [1, 0.7, 0.6], "colour": [1, 0, 0]},
+            {"kind": "ellipsoid", "at": [0, 0, 0], "size": [1, 0.7, 0.6], "color": [1, 0, 0]},
             {
                 "kind": "capsule",
                 "from": [0, 0.3, 0],
                 "to": [0, 0.5, 1],
                 "radius": 0.2,
                 "mirror": "y",
-                "colour": [0, 0, 1],
+                "color": [0, 0, 1],
             },
             {"kind": "box", "at": [0, 0, -0.6], "size": [0.3, 0.3, 0.3], "cut": True},
         ],
@@ -103,13 +103,13 @@ def test_shapes_face_outwards(shape: dict[str, object]) -> None:
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
 
 
-def test_a_painted_solid_keeps_its_colours() -> None:
+def test_a_painted_solid_keeps_its_colors() -> None:
     mesh = make_mesh(SHAPES[-1], "test")
     assert mesh.palette is not None
-    colours = mesh.palette[(mesh.uv[:, 0] * len(mesh.palette)).astype(int)]
+    colors = mesh.palette[(mesh.uv[:, 0] * len(mesh.palette)).astype(int)]
     top = mesh.points[:, 2] > 0.9
-    assert (colours[top] == [0, 0, 1]).all()
-    assert len(np.unique(colours, axis=0)) == 2
+    assert (colors[top] == [0, 0, 1]).all()
+    assert len(np.unique(colors, axis=0)) == 2
 
 
 @pytest.mark.parametrize(
@@ -161,16 +161,16 @@ def test_cameras_look_at_the_target() -> None:
     assert len(cameras) == 72
     for camera in cameras:
         ahead = camera.rotation[2].numpy()
-        towards = np.array([0, 0, 0.42]) - camera.centre.numpy()
-        assert ahead @ towards / np.linalg.norm(towards) > 0.99
+        toward = np.array([0, 0, 0.42]) - camera.center.numpy()
+        assert ahead @ toward / np.linalg.norm(toward) > 0.99
         assert camera.rotation[1, 2] < 0  # y goes down
         np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
 
 
-def test_spacing_sets_the_angle_between_neighbours() -> None:
+def test_spacing_sets_the_angle_between_neighbors() -> None:
     spec = Overrides(views=5, spacing=10.0).apply(parsed())  # type: ignore[arg-type]
-    centres = np.stack([camera.centre.numpy() for camera in place_cameras(spec.camera, 64, 48, 0)])
-    turns = np.degrees(np.arctan2(centres[:, 1], centres[:, 0])) % 360
+    centers = np.stack([camera.center.numpy() for camera in place_cameras(spec.camera, 64, 48, 0)])
+    turns = np.degrees(np.arctan2(centers[:, 1], centers[:, 0])) % 360
     np.testing.assert_allclose(np.diff(turns), 10, atol=3.1)
 
 

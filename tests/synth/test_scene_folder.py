@@ -16,13 +16,13 @@ import torch
 
 from polarguide import optics
 from polarguide.capture import load_scene
-from polarguide.capture.prepare import Reporter
 from polarguide.cli.app import run
 from polarguide.errors import PolarguideError
-from polarguide.synth import run as runner
+from polarguide.preparation import Reporter
+from polarguide.synth import render as runner
 from polarguide.synth import sweep as sweeps
 from polarguide.synth.manifest import MANIFEST, scene_digest, verify_scene
-from polarguide.synth.run import synthesise
+from polarguide.synth.render import synthesise
 from polarguide.synth.schema import SceneSpec, parse_scene
 from polarguide.synth.sensor import Sensor
 from polarguide.synth.settings import Overrides, SynthSettings
@@ -37,9 +37,9 @@ TINY = {
     "depth": 2,
     "things": [
         {"name": "ground", "foreground": False, "shape": {"type": "plane", "size": [6, 6]},
-         "material": {"colour": {"type": "checker", "pixels": 64}}},
+         "material": {"color": {"type": "checker", "pixels": 64}}},
         {"name": "ball", "shape": {"type": "sphere", "radius": 0.6, "detail": 32}, "position": [0, 0, 0.6],
-         "material": {"colour": [0.2, 0.3, 0.1]}},
+         "material": {"color": [0.2, 0.3, 0.1]}},
     ],
 }  # fmt: skip
 SETTINGS = SynthSettings(width=16, height=16, samples=1, points=60)
@@ -63,14 +63,14 @@ def test_the_folder_is_read_like_a_capture(scene: Path) -> None:
     assert not [text for text in found.warnings if "belong to no view" in text]
     assert len(found.points) > 20
     (view,) = found.test_views
-    truth = view.truth
-    assert truth is not None
+    ground_truth = view.ground_truth
+    assert ground_truth is not None
     stokes = optics.stokes(view.intensities())
-    assert truth.specular is not None
-    assert truth.diffuse is not None
-    assert truth.mask is not None
-    total = truth.specular + truth.diffuse
-    everywhere = truth.mask & ~view.saturated
+    assert ground_truth.specular is not None
+    assert ground_truth.diffuse is not None
+    assert ground_truth.mask is not None
+    total = ground_truth.specular + ground_truth.diffuse
+    everywhere = ground_truth.mask & ~view.saturated
     off = (stokes[0] - total)[everywhere].abs().amax(-1)
     assert off.median() < 5e-4
     assert (
@@ -165,7 +165,7 @@ def test_mosaics_come_back_through_prepare(
     out = tmp_path / "scene"
     ground, ball = TINY["things"]
     # Dark, so that reflections polarize its light.
-    things = [ground, {**ball, "material": {"colour": [0.04, 0.05, 0.03]}}]
+    things = [ground, {**ball, "material": {"color": [0.04, 0.05, 0.03]}}]
     dark = {**TINY, "camera": {**TINY["camera"], "views": 2}, "things": things}
     (tmp_path / "dark.json").write_text(json.dumps(dark))
     wishes = ["--sensor", sensor, "--size", "48x48", "--samples", "32", "--threads", "1"]
@@ -175,8 +175,11 @@ def test_mosaics_come_back_through_prepare(
     prepared = load_scene(Path(f"{out}-prepared"))
     for mine, other in zip(load_scene(out).test_views, prepared.test_views, strict=True):
         assert (other.name, other.camera.fx) == (mine.name, pytest.approx(mine.camera.fx))
-        with np.load(out / "gt" / f"{mine.name}.npz") as truth:
-            light, ball = torch.from_numpy(truth["stokes"]).float(), torch.from_numpy(truth["objid"]) == 2
+        with np.load(out / "gt" / f"{mine.name}.npz") as ground_truth:
+            light, ball = (
+                torch.from_numpy(ground_truth["stokes"]).float(),
+                torch.from_numpy(ground_truth["objid"]) == 2,
+            )
         ball = torch.from_numpy(scipy.ndimage.binary_erosion(ball.numpy(), iterations=4))
         usable = ball & ~other.invalid & ~other.saturated
         found, known = optics.stokes(other.intensities()), light
@@ -244,7 +247,7 @@ def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch:
     try:
         found = choose_variant("rgb")
         assert not found.fast
-        assert found.colour == "spectral"
+        assert found.color == "spectral"
         assert f"LLVM {OLDEST_LLVM}" in found.note
         assert "\n" not in found.note
     finally:

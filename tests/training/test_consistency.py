@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from polarguide.camera import Camera
 from polarguide.shading.result import RenderResult
-from polarguide.training.consistency import consistency_loss, depth_normals
+from polarguide.training.losses import consistency_loss, depth_normals
 
 TURN = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)).Q
 CAMERA = Camera(

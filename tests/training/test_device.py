@@ -1,7 +1,7 @@
 """A training step on another device: nothing of it lies on the CPU, and nothing is asked back.
 
 The device is torch's ``meta``, which has shapes and no values: it refuses every question about a value, and a watcher
-refuses what it lets pass, tensors of the CPU and copies. The rasteriser is a stand-in that only gets the shapes right.
+refuses what it lets pass, tensors of the CPU and copies. The rasterizer is a stand-in that only gets the shapes right.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from torch.utils._pytree import tree_leaves
 
 from polarguide.camera import Camera
 from polarguide.capture import Scene
-from polarguide.raster import Backend, Rasterised, ScreenStatistic
+from polarguide.raster import Backend, Rasterized, ScreenStatistic
 from polarguide.recipes import RECIPES
-from polarguide.training.stages import Recipe
+from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import Trainer, TrainSettings, first_state
 
 META = torch.device("meta")
@@ -52,7 +52,7 @@ class Watcher(TorchDispatchMode):
 
 
 class _Splat(torch.autograd.Function):
-    """Shapes and devices of a rasteriser, forward and backward."""
+    """Shapes and devices of a rasterizer, forward and backward."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -82,8 +82,8 @@ def stand_in(
     camera: Camera,
     *,
     statistic: ScreenStatistic | None = None,
-) -> Rasterised:
-    return Rasterised(*_Splat.apply(means, quats, scales, opacities, features, camera, statistic))
+) -> Rasterized:
+    return Rasterized(*_Splat.apply(means, quats, scales, opacities, features, camera, statistic))
 
 
 @pytest.fixture(autouse=True)
@@ -115,7 +115,7 @@ def look_at_all(trainer: Trainer, step: int) -> None:
         trainer.state.step = step
         trainer._look(slot, trainer.schedule.at(step).stage, True)
         trainer._join_gradients(idle=False)
-        trainer._optimise()
+        trainer._optimize()
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -139,7 +139,7 @@ def test_several_views_a_step_stay_there_too(tiny_scene: Scene) -> None:
         report = trainer.step()
     assert watcher.count > 100
     assert report.measured.device == META
-    assert trainer.state.statistics.gradient.shape == (2, len(trainer.state.rows))
+    assert trainer.state.statistics.gradient.shape == (2, len(trainer.state.gaussians))
     assert trainer.state.statistics.gradient.device == META
 
 
@@ -147,7 +147,7 @@ def test_what_happens_between_steps_stays_there_too(tiny_scene: Scene, busy_reci
     trainer = started(tiny_scene, busy_recipe)
     for action in ("reset_opacity", "propagate_normals", "refresh_priors"):
         trainer._act(action)
-    assert all(trainer.state.rows[name].device == META for name in trainer.state.rows.names)
+    assert all(trainer.state.gaussians[name].device == META for name in trainer.state.gaussians.names)
 
 
 def test_the_watcher_sees_what_it_is_there_for() -> None:

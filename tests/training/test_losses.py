@@ -12,8 +12,8 @@ from torch.nn.functional import normalize
 
 from polarguide import optics
 from polarguide.camera import Camera
+from polarguide.color import srgb_encode
 from polarguide.errors import PolarguideError
-from polarguide.shading.display import srgb_encode
 from polarguide.shading.result import RenderResult
 from polarguide.training.losses import (
     azimuth_loss,
@@ -25,7 +25,7 @@ from polarguide.training.losses import (
 )
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
-from polarguide.training.stages import Weights
+from polarguide.training.recipe import Weights
 
 SIZE = (12, 14)
 SCALES = torch.tensor([[-3.0, -2.0, -1.0], [-1.0, -4.0, -2.0], [0.0, 0.0, -5.0]])
@@ -155,11 +155,11 @@ def test_stokes_loss_is_zero_for_the_layers_and_normals_that_were_measured(prior
 def test_stokes_loss_turns_a_normal_to_the_one_that_was_measured(priors: ViewPriors) -> None:
     start = normalize(FACING + 0.2 * unit(23), dim=-1)
     normal = start.clone().requires_grad_()
-    optimiser = torch.optim.Adam([normal], lr=0.01)
+    optimizer = torch.optim.Adam([normal], lr=0.01)
     for _ in range(300):
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         stokes_loss(result(specular=LAYERS[0], diffuse=LAYERS[1], normal=normal), priors, 1.5).backward()
-        optimiser.step()
+        optimizer.step()
     before = (start * FACING).sum(-1).clamp(-1, 1).acos().mean()
     after = (normalize(normal.detach(), dim=-1) * FACING).sum(-1).clamp(-1, 1).acos().mean()
     assert float(after) < 0.3 * float(before)

@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from polarguide.capture import GroundTruth, View, load_scene
-from polarguide.shading.display import srgb_decode, srgb_encode
+from polarguide.color import srgb_decode, srgb_encode
 from polarguide.training.losses import azimuth_loss
 from polarguide.training.priors import ViewPriors, guide_normals, view_priors
-from polarguide.training.stages import Priors
+from polarguide.training.recipe import Priors
 
 INDEX = 1.5
 PAPER = Priors(candidates="paper", separation="paper", azimuth_weight=0.0)
@@ -26,13 +26,13 @@ def view(demo_scene: Path) -> View:
     return load_scene(demo_scene, views=["v022"]).view("v022")
 
 
-def truth_of(view: View) -> GroundTruth:
-    assert view.truth is not None
-    return view.truth
+def ground_truth_of(view: View) -> GroundTruth:
+    assert view.ground_truth is not None
+    return view.ground_truth
 
 
 def guide_of(view: View) -> Tensor:
-    normal = truth_of(view).normal
+    normal = ground_truth_of(view).normal
     assert normal is not None
     return normal
 
@@ -43,13 +43,15 @@ def psnr(found: Tensor, linear: Tensor, where: Tensor) -> float:
 
 
 def layers_psnr(priors: ViewPriors, view: View) -> tuple[float, float]:
-    truth = truth_of(view)
-    assert truth.specular is not None
-    assert truth.diffuse is not None
-    assert truth.mask is not None
-    where = truth.mask & (priors.separated > 0)
-    assert float(where.sum() / truth.mask.sum()) > 0.5
-    return psnr(priors.specular, truth.specular / 2, where), psnr(priors.diffuse, truth.diffuse / 2, where)
+    ground_truth = ground_truth_of(view)
+    assert ground_truth.specular is not None
+    assert ground_truth.diffuse is not None
+    assert ground_truth.mask is not None
+    where = ground_truth.mask & (priors.separated > 0)
+    assert float(where.sum() / ground_truth.mask.sum()) > 0.5
+    return psnr(priors.specular, ground_truth.specular / 2, where), psnr(
+        priors.diffuse, ground_truth.diffuse / 2, where
+    )
 
 
 def test_exact_separation_is_near_the_truth_and_nearer_than_the_papers(view: View) -> None:
@@ -87,16 +89,16 @@ def test_the_true_normals_lie_near_the_planes_of_incidence(view: View) -> None:
     assert float(azimuth_loss(turned, priors)) > 0.3
 
 
-def test_colour_differences_find_the_plane_that_a_wrong_guide_misses(view: View) -> None:
+def test_color_differences_find_the_plane_that_a_wrong_guide_misses(view: View) -> None:
     """The guide is turned by a quarter about each ray, so that it prefers the other lobe everywhere."""
     rays = view.camera.world_rays()
-    truth = guide_of(view)
-    along = (truth * rays).sum(-1, keepdim=True) * rays
-    turned = along + torch.linalg.cross(rays, truth - along)
+    ground_truth = guide_of(view)
+    along = (ground_truth * rays).sum(-1, keepdim=True) * rays
+    turned = along + torch.linalg.cross(rays, ground_truth - along)
     distance = {}
     for chromatic in (False, True):
         priors = view_priors(view, turned, replace(EXACT, chromatic=chromatic), INDEX)
-        distance[chromatic] = (priors.plane * truth).sum(-1).abs()
+        distance[chromatic] = (priors.plane * ground_truth).sum(-1).abs()
         if chromatic:
             decided = priors.chromatic_weight > 0
             assert float(decided.sum()) > 1000

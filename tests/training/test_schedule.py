@@ -8,7 +8,8 @@ import pytest
 
 from polarguide.errors import PolarguideError
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
-from polarguide.training.stages import Recipe, Repeat, Schedule, Stage
+from polarguide.training.recipe import Recipe, Repeat, Stage
+from polarguide.training.schedule import Schedule
 
 EVERY_RECIPE = pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES.keys())
 

@@ -14,8 +14,8 @@ from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.training.run import load_checkpoint, save_checkpoint
-from polarguide.training.stages import Recipe
+from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import StepReport, Trainer, TrainSettings, first_state
 
 STEPS, STOP = 60, 25
@@ -51,7 +51,7 @@ def test_every_recipe_trains(tiny_scene: Scene, name: str) -> None:
     assert all(bool(torch.isfinite(t).all()) for t in floats.values())
     assert ("environment.texels" in floats) == RECIPES[name].reflects
     side = {"strength_logits"} if RECIPES[name].directional is None else set(DIRECTIONAL_ROWS)
-    assert {f"rows.{row}" for row in side} <= set(floats) or not RECIPES[name].reflects
+    assert {f"gaussians.{row}" for row in side} <= set(floats) or not RECIPES[name].reflects
 
 
 @pytest.mark.parametrize("name", ["3dgs", "polarguide"])
@@ -94,7 +94,7 @@ def test_a_directional_light_is_resumed_bit_by_bit(
     recipe = dataclasses.replace(
         RECIPES["ref-gs"],
         densification=dataclasses.replace(busy_recipe.densification, every=4, pixels_each=1.0),
-        initialisation=busy_recipe.initialisation,
+        initialization=busy_recipe.initialization,
         environment_resolution=8,
     )
     whole, reports = train(tiny_scene, recipe)
@@ -109,7 +109,7 @@ def test_a_directional_light_is_resumed_bit_by_bit(
     moved = [f"adam.{row}.exp_avg" for row in DIRECTIONAL_ROWS]
     moved += [f"environment.adam.mlp_weight_{layer}.exp_avg" for layer in range(3)]
     assert all(bool(tensors[name].any()) for name in (*moved, "environment.adam.exp_avg"))
-    assert all(tensors[f"rows.{row}"].shape[0] == len(state.rows) for row in DIRECTIONAL_ROWS)
+    assert all(tensors[f"gaussians.{row}"].shape[0] == len(state.gaussians) for row in DIRECTIONAL_ROWS)
 
 
 @pytest.mark.parametrize("stop", [1, 6, 7, 16, 24, 40, 59])
@@ -133,9 +133,9 @@ def test_what_a_stage_gives_no_rate_rests_in_it(tiny_scene: Scene) -> None:
     resting = dataclasses.replace(last, rate_factors={"quaternions": 0.0, "means": 0.0})
     recipe = dataclasses.replace(recipe, stages=(first, resting))
     trainer, _ = train(tiny_scene, recipe, until=STEPS // 2)
-    before = trainer.state.rows.snapshot()
+    before = trainer.state.gaussians.snapshot()
     trainer.run(lambda _: None, until=STEPS // 2 + 3)
-    after = trainer.state.rows.snapshot()
+    after = trainer.state.gaussians.snapshot()
     assert sorted(set(before) - set(different(before, after))) == ["means", "quaternions"]
 
 
@@ -144,7 +144,7 @@ def test_the_seed_decides(tiny_scene: Scene, busy_recipe: Recipe) -> None:
     again, _ = train(tiny_scene, busy_recipe, until=20)
     other, _ = train(tiny_scene, busy_recipe, until=20, seed=4)
     assert different(first.state.tensors(), again.state.tensors()) == []
-    assert "rows.means" in different(first.state.tensors(), other.state.tensors())
+    assert "gaussians.means" in different(first.state.tensors(), other.state.tensors())
 
 
 def test_global_random_state_neither_matters_nor_changes(tiny_scene: Scene, busy_recipe: Recipe) -> None:
@@ -189,16 +189,16 @@ def test_the_first_state_has_one_row_per_point_and_added_gaussian(
     tiny_scene: Scene, busy_recipe: Recipe
 ) -> None:
     state = first_state(tiny_scene, busy_recipe, TrainSettings(10, 0))
-    count = len(tiny_scene.points) + busy_recipe.initialisation.shell
-    assert len(state.rows) == count
+    count = len(tiny_scene.points) + busy_recipe.initialization.shell
+    assert len(state.gaussians) == count
     assert state.step == 0
     assert state.statistics.seen.shape == (count,)
-    assert torch.equal(state.rows["means"][: len(tiny_scene.points)].detach(), tiny_scene.points)
+    assert torch.equal(state.gaussians["means"][: len(tiny_scene.points)].detach(), tiny_scene.points)
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(tiny_scene: Scene) -> None:
     trainer = Trainer(tiny_scene, RECIPES["polarguide"], TrainSettings(30, 0), choose_backend("cpu"))
     with torch.no_grad():
-        trainer.state.rows["sh_dc"][0, 0] = math.nan
+        trainer.state.gaussians["sh_dc"][0, 0] = math.nan
     with pytest.raises(PolarguideError, match="finite"):
         trainer.step()

@@ -11,12 +11,12 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from polarguide.capture import Scene
-from polarguide.export import write_run_ply
 from polarguide.gaussians.ply import read_ply
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.training.run import CHECKPOINT, load_checkpoint, save_checkpoint
-from polarguide.training.stages import Recipe
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
+from polarguide.runs.point_cloud import write_run_ply
+from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import Trainer, TrainSettings
 
 STEPS = TrainSettings(30, 3)
@@ -43,7 +43,7 @@ def test_a_training_stays_there_and_goes_on_from_its_checkpoint(
     densified = busy_recipe.densification.every
     with OtherDevice() as device:
         trainer = Trainer(tiny_scene, busy_recipe, STEPS, BACKEND)
-        counts = [len(trainer.state.rows)]
+        counts = [len(trainer.state.gaussians)]
         for step in range(STEPS.steps):
             if step == HALF:
                 checkpoint(tmp_path / "half", trainer)
@@ -51,7 +51,7 @@ def test_a_training_stays_there_and_goes_on_from_its_checkpoint(
             before = device.waits
             trainer.step()
             assert due or device.waits == before, step
-            counts.append(len(trainer.state.rows))
+            counts.append(len(trainer.state.gaussians))
         assert len(set(counts)) > 2
         assert trainer.state.opacity_was_reset
         # Plain Adam counts its steps on the CPU.
@@ -77,7 +77,7 @@ def test_what_a_recipe_begins_and_ends_with(tiny_scene: Scene, tmp_path: Path, n
             trainer = Trainer(tiny_scene, RECIPES[name], STEPS, backend)
             if RECIPES[name].oriented:
                 trainer._act("orient_normals")
-                outward[here] = trainer.state.rows["outward"].detach().to("cpu")
+                outward[here] = trainer.state.gaussians["outward"].detach().to("cpu")
             path = tmp_path / f"{here}.ply"
             write_run_ply(path, trainer.state, RECIPES[name].shading(1.5))
             written[here] = read_ply(path)

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from polarguide.capture import Scene
-from polarguide.raster import Backend, Rasterised, choose_backend
+from polarguide.raster import Backend, Rasterized, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
-from polarguide.training.run import load_checkpoint, save_checkpoint
-from polarguide.training.stages import Recipe
+from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import Trainer, TrainSettings
 
 pytestmark = [
@@ -66,15 +66,15 @@ def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str)
     backend = choose_backend("cuda")
     strict = False
 
-    def rasterise(*inputs: Any, **named: Any) -> Rasterised:
+    def rasterize(*inputs: Any, **named: Any) -> Rasterized:
         torch.cuda.set_sync_debug_mode("default")
         try:
-            return backend.rasterise(*inputs, **named)
+            return backend.rasterize(*inputs, **named)
         finally:
             torch.cuda.set_sync_debug_mode("error" if strict else "default")
 
     settings = TrainSettings(10_000, 0)
-    trainer = Trainer(tiny_scene, RECIPES[name], settings, backend._replace(rasterise=rasterise))
+    trainer = Trainer(tiny_scene, RECIPES[name], settings, backend._replace(rasterize=rasterize))
     views, begin = len(tiny_scene.train_views), 1
     for stage in RECIPES[name].stages:
         trainer.state.step = begin
@@ -85,7 +85,7 @@ def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str)
         try:
             for slot in range(views):
                 trainer._look(slot, stage, True)
-                trainer._optimise()
+                trainer._optimize()
         finally:
             strict = False
             torch.cuda.set_sync_debug_mode("default")

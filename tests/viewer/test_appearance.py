@@ -10,10 +10,10 @@ import torch
 from random_runs import KINDS, ring
 from sights import around, photograph, shown
 
-from polarguide.evaluation import figures
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.appearance import MEASURED, Appearance, Crop, Painter
 from polarguide.viewer.lens import fit
+from polarguide.visualization import figures
 
 CAMERAS = ring()
 CAMERA = CAMERAS["v1"]
@@ -30,7 +30,7 @@ def paint(seen, appearance=PLAIN, view=None, camera=CAMERA, **named):
 @pytest.mark.parametrize("recipe", KINDS)
 def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
     seen = shown(recipe)
-    result = seen.render(CAMERA, seen.rows, seen.environment, depth=True)
+    result = seen.render(CAMERA, seen.gaussians, seen.environment, depth=True)
     for layer in LAYERS:
         picture = paint(seen, Appearance(layer=layer))
         if getattr(result, layer) is None:
@@ -45,7 +45,7 @@ def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
 
 def test_exposure_and_reflection():
     seen = shown()
-    result = seen.render(CAMERA, seen.rows, seen.environment, depth=False)
+    result = seen.render(CAMERA, seen.gaussians, seen.environment, depth=False)
     brighter = paint(seen, Appearance(exposure=-1.5))
     assert np.array_equal(brighter, figures.radiance_to_rgb(result.final / 2**1.5))
     without = paint(seen, Appearance(strength=0.0))
@@ -118,13 +118,13 @@ def test_what_was_measured_there():
     assert np.abs(found["DoLP"].astype(int) - dolp)[there].max() <= 3
     aolp = figures.aolp_to_rgb(torch.zeros(there.shape))
     assert np.abs(found["AoLP"].astype(int) - aolp)[there].max() <= 3
-    final = seen.render(CAMERA, seen.rows, seen.environment, depth=False).final
+    final = seen.render(CAMERA, seen.gaussians, seen.environment, depth=False).final
     assert np.array_equal(found["error"], figures.error_to_rgb(final, view.photograph()))
-    right = paint(replace(seen, rows=seen.rows), Appearance(layer="error"), view)
+    right = paint(replace(seen, gaussians=seen.gaussians), Appearance(layer="error"), view)
     assert np.array_equal(right, found["error"])
 
 
-def test_colours_of_depths_stay_while_the_camera_moves():
+def test_colors_of_depths_stay_while_the_camera_moves():
     seen, painter, depth = shown(), Painter(around()), Appearance(layer="depth")
     first = painter.paint(seen, CAMERA, depth)
     nearer = replace(CAMERA, translation=0.7 * CAMERA.translation)

@@ -21,7 +21,7 @@ def test_a_path_goes_through_its_poses(tmp_path):
     assert (speed, len(cameras)) == (FRAMES_PER_SECOND, 1 + 2 * step)
     assert {(c.width, c.height) for c in cameras} == {(80, 50)}
     for pose, camera in zip(poses, cameras[::step], strict=True):
-        assert torch.allclose(camera.centre, pose.centre, atol=1e-9)
+        assert torch.allclose(camera.center, pose.center, atol=1e-9)
         assert torch.allclose(camera.rotation, pose.rotation, atol=1e-9)
         # The same from top to bottom.
         assert camera.height / camera.fy == pytest.approx(pose.height / pose.fy)

@@ -20,12 +20,12 @@ def project(camera, point):
 
 
 def test_a_free_camera_takes_the_pose_of_its_quaternion_and_the_fov_from_top_to_bottom():
-    camera = free_camera(quaternion(CAMERA), CAMERA.centre.tolist(), 2 * math.atan(0.5), (300, 200))
+    camera = free_camera(quaternion(CAMERA), CAMERA.center.tolist(), 2 * math.atan(0.5), (300, 200))
     assert torch.allclose(camera.rotation, CAMERA.rotation, atol=1e-9)
-    assert torch.allclose(camera.centre, CAMERA.centre, atol=1e-9)
+    assert torch.allclose(camera.center, CAMERA.center, atol=1e-9)
     ahead, down = CAMERA.rotation[2], CAMERA.rotation[1]
-    assert project(camera, camera.centre + 3 * ahead) == pytest.approx((150, 100))
-    assert project(camera, camera.centre + 2 * ahead + down) == pytest.approx((150, 200))
+    assert project(camera, camera.center + 3 * ahead) == pytest.approx((150, 100))
+    assert project(camera, camera.center + 2 * ahead + down) == pytest.approx((150, 200))
 
 
 @pytest.mark.parametrize("size", [(640, 480), (1000, 300), (200, 900), (64, 48), (31, 17)])
@@ -38,7 +38,7 @@ def test_a_photograph_fits_into_a_window_and_its_camera_with_it(size):
     assert (inside >= -1e-9).all()
     assert (inside <= np.array(size) + 1e-9).all()
     assert np.isclose(inside, [(0, 0), size]).all(axis=0).any()  # it touches two borders
-    point = CAMERA.centre + CAMERA.rotation.T @ torch.tensor([0.3, -0.2, 2.0], dtype=torch.float64)
+    point = CAMERA.center + CAMERA.rotation.T @ torch.tensor([0.3, -0.2, 2.0], dtype=torch.float64)
     before, after = np.array(project(CAMERA, point)), np.array(project(camera, point))
     assert after == pytest.approx(before * place.scale + (place.left, place.top))
 

@@ -18,8 +18,8 @@ from browsers import PATIENCE, chromium
 from random_runs import ring
 from sights import photograph, shown
 
-from polarguide.evaluation import figures
 from polarguide.viewer import Viewer
+from polarguide.visualization import figures
 
 pytestmark = pytest.mark.slow
 WIDTH, HEIGHT = 960, 600
@@ -78,7 +78,7 @@ class Opened:
         lens = self.photographs[name].view.camera
         scaled = {key: 4 * getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
         camera = replace(lens, **scaled)
-        result = self.seen.render(camera, self.seen.rows, self.seen.environment, depth=True)
+        result = self.seen.render(camera, self.seen.gaussians, self.seen.environment, depth=True)
         if layer == "normal":
             return figures.normal_to_rgb(result.normal, camera)
         return figures.radiance_to_rgb(getattr(result, layer))

@@ -10,10 +10,10 @@ import pytest
 from sights import around, photographs_of, shown
 from stand_in import StandIn
 
-from polarguide.evaluation import figures
 from polarguide.viewer.lens import fit
 from polarguide.viewer.panel import NOWHERE, Offer
 from polarguide.viewer.visitor import NO_LAYER, PATH_FILE, PICTURE_FILE, Visitor
+from polarguide.visualization import figures
 
 
 class Looking:
@@ -63,7 +63,7 @@ def looking(monkeypatch):
 
 
 def rendered(seen, camera):
-    result = seen.render(camera, seen.rows, seen.environment, depth=False)
+    result = seen.render(camera, seen.gaussians, seen.environment, depth=False)
     return figures.radiance_to_rgb(result.final)
 
 
@@ -115,10 +115,10 @@ def test_a_late_word_from_before_a_jump_does_not_undo_it(looking):
 def test_jumping_by_list_by_buttons_and_by_a_click_on_a_camera(looking):
     client = looking.client
     client.control("Go to").value = "v2"
-    assert np.allclose(client.camera.position, looking.at("v2").camera.centre)
+    assert np.allclose(client.camera.position, looking.at("v2").camera.center)
     step = client.control("")
     step.value = "next"
-    assert np.allclose(client.camera.position, looking.at("v3").camera.centre)
+    assert np.allclose(client.camera.position, looking.at("v3").camera.center)
     step.value = "previous"
     step.click()
     assert client.control("Go to").value == "v1"
@@ -129,7 +129,7 @@ def test_jumping_by_list_by_buttons_and_by_a_click_on_a_camera(looking):
 def test_cameras_that_would_cover_the_picture_are_left_out(looking):
     looking.rest()
     assert not any(frustum.visible for frustum in looking.client.scene.frusta)
-    near = looking.at("v2").camera.centre.numpy()
+    near = looking.at("v2").camera.center.numpy()
     looking.client.camera.drag(tuple(1.05 * near))
     looking.rest()
     visible = [frustum.visible for frustum in looking.client.scene.frusta]
@@ -166,7 +166,7 @@ def test_a_path_is_set_down_played_and_saved(looking):
     looking.clock.now += 1.0
     assert looking.visitor.wants() == "coarse"
     middle = client.camera.position
-    ends = [looking.at(name).camera.centre.numpy() for name in ("v1", "v2")]
+    ends = [looking.at(name).camera.center.numpy() for name in ("v1", "v2")]
     assert np.linalg.norm(middle - ends[0]) < 0.7 * np.linalg.norm(ends[1] - ends[0])
     assert np.linalg.norm(middle - ends[1]) < 0.7 * np.linalg.norm(ends[1] - ends[0])
     looking.clock.now += 5.0

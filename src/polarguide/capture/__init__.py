@@ -1,6 +1,6 @@
 """Capture: files -> Scene. Views with four polarizer angles, COLMAP models, ground truth."""
 
-from polarguide.capture.colmap import ColmapModel, read_model
+from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.reader import load_scene
 from polarguide.capture.view import ANGLES, GroundTruth, Scene, View
 

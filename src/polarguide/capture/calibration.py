@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.pictures import read_file
-from polarguide.capture.sidecars import parse_json
+from polarguide.capture.formats.pictures import read_file
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
+from polarguide.records import parse_json
 
 Gains = tuple[float, float, float, float]
 UNIT_GAINS: Gains = (1.0, 1.0, 1.0, 1.0)
 LARGEST_IMBALANCE = 0.1
 """Pair sums that differ by more than this share are no gain differences: files are swapped, or not linear."""
 ROTATED_PEAK = (1.0 + math.sqrt(2.0)) / 2.0
-"""The most a turned analyser can measure where four angles stay under 1."""
+"""The most a turned analyzer can measure where four angles stay under 1."""
 UNIDENTIFIED = (
     "Only the ratio of the pair sums is estimated: I0/I90 and I45/I135 of the instrument cannot be told from the "
     "polarization of the scene, nor the common gain from its brightness."
@@ -119,7 +119,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> float | None:
-    """Median of (I0 + I90) / (I45 + I135), which is 1 for ideal analysers whatever the light.
+    """Median of (I0 + I90) / (I45 + I135), which is 1 for ideal analyzers whatever the light.
 
     Args:
         angles: linear intensities [4, ...], without channels.

@@ -58,8 +58,8 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_]) -> Measures:
     step = max(1, math.ceil(math.sqrt(usable.size / _SAMPLES)))
     sample = codes[:, ::step, ::step].astype(np.float64)
     bright = float(np.percentile(sample, 99.0)) / FULL_CODE
-    grey = sample.mean(axis=3)
-    angles = grey[:, usable[::step, ::step] & (grey.min(axis=0) > _LOW_CODE)]
+    gray = sample.mean(axis=3)
+    angles = gray[:, usable[::step, ::step] & (gray.min(axis=0) > _LOW_CODE)]
     if angles.shape[1] < 16:
         return Measures(bright, (0.0, 0.0, 0.0), np.zeros(5))
     i0, i45, i90, i135 = angles

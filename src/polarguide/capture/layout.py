@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from polarguide.capture.pictures import SUFFIXES
+from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.view import ANGLES, listed, unknown_view
 from polarguide.errors import PolarguideError
 
@@ -34,7 +34,7 @@ class Layout:
     pictures: dict[str, dict[int, Path]]
     masks: dict[str, Path]
     invalid: dict[str, Path]
-    truth: dict[str, Path]
+    ground_truth: dict[str, Path]
     warnings: tuple[str, ...]
 
     @property

@@ -13,13 +13,14 @@ import numpy as np
 
 from polarguide.camera import Camera
 from polarguide.capture import checks
-from polarguide.capture.colmap import ColmapModel, fit_camera, read_model, unused_poses
+from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unused_poses
+from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.layout import find_layout, select_views
-from polarguide.capture.pictures import TRANSFERS
-from polarguide.capture.sidecars import held_out, parse_json, refractive_index_of
+from polarguide.capture.metadata import held_out, refractive_index_of
 from polarguide.capture.view import Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, read_view
 from polarguide.errors import PolarguideError
+from polarguide.records import parse_json
 
 _THREADS = 4
 
@@ -91,7 +92,7 @@ def load_scene(
         ),
         test_names=tuple(name for name in tests if name in names),
         points=model.points,
-        point_colours=model.point_colours,
+        point_colors=model.point_colors,
         refractive_index=index,
         downscale=downscale,
         transfer=transfer,

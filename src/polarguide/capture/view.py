@@ -45,7 +45,7 @@ class View:
     Attributes:
         name: name of the view, unique in its scene.
         camera: pose and intrinsics at the size of the pictures.
-        codes: linear intensities behind the analyser at 0, 45, 90 and 135 degrees, coded as
+        codes: linear intensities behind the analyzer at 0, 45, 90 and 135 degrees, coded as
             round(65535 * intensity), [4, H, W, 3] uint16, RGB. Kept coded because big captures do not fit
             into memory as floats.
         invalid: pixels the capture itself declares unusable (``invalid/<view>.png``), [H, W] bool; all False
@@ -62,7 +62,7 @@ class View:
     invalid: Tensor
     saturated: Tensor
     mask: Tensor | None = None
-    truth: GroundTruth | None = None
+    ground_truth: GroundTruth | None = None
 
     def to(self, device: torch.device) -> View:
         """The view with its pictures and masks on a device; itself where it is there already. Truth stays behind."""
@@ -91,7 +91,7 @@ class Scene:
         views: all views, sorted by name.
         test_names: names of the views held out for evaluation, sorted.
         points: sparse points in the world, [M, 3] float32.
-        point_colours: their colours as the COLMAP model gives them (display-encoded), [M, 3] uint8.
+        point_colors: their colors as the COLMAP model gives them (display-encoded), [M, 3] uint8.
         refractive_index: the one index that ``scene.json`` gives, or None if it gives none or several.
         downscale: side of the pixel boxes that were averaged; 1 is full size.
         transfer: "linear" or "srgb": how the files were taken to be encoded. The views are always linear.
@@ -104,7 +104,7 @@ class Scene:
     views: tuple[View, ...]
     test_names: tuple[str, ...]
     points: Tensor
-    point_colours: Tensor
+    point_colors: Tensor
     refractive_index: float | None
     downscale: int
     transfer: str

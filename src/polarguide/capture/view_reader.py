@@ -13,10 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera
-from polarguide.capture import boxes, checks
+from polarguide.capture import box_filter as boxes
+from polarguide.capture import checks
+from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes, read_file
+from polarguide.capture.ground_truth import read_ground_truth
 from polarguide.capture.layout import Layout
-from polarguide.capture.pictures import decode_mask, decode_picture, linear_codes, read_file
-from polarguide.capture.truth import read_truth
 from polarguide.capture.view import ANGLES, GroundTruth, View
 from polarguide.errors import PolarguideError
 
@@ -55,7 +56,7 @@ class ViewData:
     histogram: NDArray[np.int64]
     invalid: NDArray[np.bool_]
     mask: NDArray[np.bool_] | None
-    truth: GroundTruth | None
+    ground_truth: GroundTruth | None
     digests: dict[Path, str]
 
     def saturated(self, scale: int | None) -> NDArray[np.bool_]:
@@ -71,7 +72,7 @@ class ViewData:
             invalid=torch.from_numpy(self.invalid),
             saturated=torch.from_numpy(self.saturated(scale)),
             mask=None if self.mask is None else torch.from_numpy(self.mask),
-            truth=self.truth,
+            ground_truth=self.ground_truth,
         )
 
 
@@ -93,14 +94,14 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         )
     channels = [pixels[..., channel] for pixels in raw for channel in range(3)]
     peak = functools.reduce(np.maximum, channels)
-    invalid, mask, truth = np.zeros((height, width), bool), None, None
+    invalid, mask, ground_truth = np.zeros((height, width), bool), None, None
     if name in layout.invalid:
         invalid = _read_mask(files, layout.invalid[name], (height, width), any_value=True)
     if name in layout.masks:
         mask = _read_mask(files, layout.masks[name], (height, width), any_value=False)
-    if name in layout.truth:
-        path = layout.truth[name]
-        truth = read_truth(path, files.read(path), size=(height, width), factor=factor)
+    if name in layout.ground_truth:
+        path = layout.ground_truth[name]
+        ground_truth = read_ground_truth(path, files.read(path), size=(height, width), factor=factor)
     return ViewData(
         name=name,
         size=(width, height),
@@ -110,7 +111,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         histogram=np.sum([checks.top_histogram(pixels) for pixels in raw], axis=0),
         invalid=boxes.maximum(invalid, factor),
         mask=None if mask is None else boxes.every(mask, factor),
-        truth=truth,
+        ground_truth=ground_truth,
         digests=files.digests,
     )
 

@@ -43,7 +43,7 @@ def ablate(
         base: The recipe whose ablations to train.
         only: Names of the ablations to take, such as without-normals; all if none is given.
         reference: Recipes to add as first rows, such as 3dgs-dr.
-        steps: Optimiser steps of each run.
+        steps: Optimizer steps of each run.
         seeds: How many seeds: 3 trains with the seeds 0, 1 and 2, and shows mean and spread.
         downscale: Average the pictures over boxes of this many pixels first.
         transfer: How the files encode radiance; srgb undoes the display curve of JPEGs.

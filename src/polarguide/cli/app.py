@@ -42,7 +42,7 @@ VERBS: dict[str, Callable[..., Any]] = {
 }
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "
-    "normals and diffuse colour."
+    "normals and diffuse color."
 )
 
 

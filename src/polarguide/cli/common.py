@@ -15,9 +15,9 @@ from polarguide.camera import Camera
 from polarguide.capture import Scene, View, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import DeviceName
+from polarguide.runs.folder import recipe_data
+from polarguide.runs.opened import TrainedRun, open_trained
 from polarguide.shading.result import RenderResult
-from polarguide.trained import TrainedRun, open_trained
-from polarguide.training.run import recipe_data
 
 Transfer = Literal["linear", "srgb"]
 

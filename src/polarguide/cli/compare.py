@@ -12,15 +12,15 @@ from typing import Annotated, Any
 import tyro
 
 from polarguide.capture.view import listed
-from polarguide.cli.collect import BESIDE_OTHERS, collect, write_tables
 from polarguide.cli.common import Transfer, console, use_threads
-from polarguide.cli.comparison import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
 from polarguide.cli.job_progress import JobProgress
-from polarguide.cli.jobs import STDERR, Job, run_jobs
-from polarguide.cli.report import REPORT, write_report
 from polarguide.cli.train import check_count, checked_settings
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.study import read_study, study_svg
+from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
+from polarguide.experiments.jobs import STDERR, Job, run_jobs
+from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
+from polarguide.experiments.report_views import REPORT, write_report
+from polarguide.experiments.study import read_study, study_svg
 from polarguide.raster import DeviceName, choose_backend
 from polarguide.recipes import recipe_named
 
@@ -53,7 +53,7 @@ def compare(
         scenes: Scene folders, as for train.
         recipes: The recipes to compare, by name: 3dgs, 3dgs-dr, polarguide, polarguide:without-normals, ...
         out: Folder to write.
-        steps: Optimiser steps of each run.
+        steps: Optimizer steps of each run.
         seeds: How many seeds: 3 trains with the seeds 0, 1 and 2, and shows mean and spread.
         downscale: Average the pictures over boxes of this many pixels first.
         transfer: How the files encode radiance; srgb undoes the display curve of JPEGs.

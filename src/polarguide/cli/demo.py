@@ -10,8 +10,8 @@ from polarguide.cli.evaluate import evaluate_run
 from polarguide.cli.render import render_run
 from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
+from polarguide.runs.folder import CONFIGURATION
 from polarguide.shading.result import LAYERS
-from polarguide.training.run import CONFIGURATION
 
 STEPS = 2000
 
@@ -21,7 +21,7 @@ def demo(*, out: Path = Path("runs/demo"), steps: int = STEPS, seed: int = 0, th
 
     Args:
         out: Run folder to write; a finished or interrupted demo there is gone on with.
-        steps: Optimiser steps.
+        steps: Optimizer steps.
         seed: Seed of every random draw.
         threads: Threads to use; 0 takes all cores.
     """

@@ -22,7 +22,7 @@ from polarguide.evaluation.record import RUN_KEYS, validate_metrics
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.speed import frames_per_second
 from polarguide.raster import DeviceName
-from polarguide.training.run import RunLog
+from polarguide.runs.folder import RunLog
 
 METRICS = "metrics.json"
 SHOWN_KEYS = (
@@ -65,7 +65,7 @@ def evaluate_run(opened: OpenRun, *, speed: bool = True) -> dict[str, Any]:
     views = {}
     for view in opened.scene.test_views:
         # First what is known of it: copied later, it would have to wait until the rendering is done.
-        target = ViewTarget.of(view.photograph(), view.invalid, view.truth, opened.backend.device)
+        target = ViewTarget.of(view.photograph(), view.invalid, view.ground_truth, opened.backend.device)
         views[view.name] = score_view(target, opened.draw(view))
     seconds, alone = RunLog(opened.folder).elapsed()
     record = write_metrics(
@@ -75,7 +75,7 @@ def evaluate_run(opened: OpenRun, *, speed: bool = True) -> dict[str, Any]:
             "fps": _speed(opened, normals=False) if speed else None,
             "fps_layers": _speed(opened, depth=True) if speed else None,
             "train_seconds": seconds if alone and seconds > 0 else None,
-            "gaussians": len(opened.state.rows),
+            "gaussians": len(opened.state.gaussians),
             "steps": opened.state.step,
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         },

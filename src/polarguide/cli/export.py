@@ -11,15 +11,15 @@ import tyro
 
 from polarguide.cli.common import OpenRun, console, open_run, use_threads
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import figures
 from polarguide.export.cameras import write_colmap, write_transforms
 from polarguide.export.environment import needs_radiance, panorama, write_exr
 from polarguide.export.mesh import scene_mesh, write_mesh
 from polarguide.export.points import surface_points, write_points
 from polarguide.export.sog import write_sog
-from polarguide.export.splats import write_run_ply
 from polarguide.export.spz import write_spz
-from polarguide.surroundings import surroundings
+from polarguide.runs.point_cloud import write_run_ply
+from polarguide.scene_frame import scene_frame
+from polarguide.visualization import figures
 
 Format = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
 PANORAMA_HEIGHT = 512
@@ -37,7 +37,7 @@ def export(
     """Write a run as the files of other programs.
 
     ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB and PLY) is
-    fused from rendered depth, with diffuse colours and learned normals; points are opaque Gaussians with normals;
+    fused from rendered depth, with diffuse colors and learned normals; points are opaque Gaussians with normals;
     environment is the learned light as a panorama (EXR and PNG); cameras are a COLMAP model and transforms.json.
 
     Args:
@@ -88,14 +88,14 @@ def _mesh(opened: OpenRun, folder: Path, resolution: int) -> list[Path]:
     mesh = scene_mesh(cameras, lambda camera: opened.render_camera(camera, depth=True), resolution=resolution)
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
-        write_mesh(path, mesh, surroundings(list(cameras.values())))
+        write_mesh(path, mesh, scene_frame(list(cameras.values())))
     console.print(f"{len(mesh.surface.vertices):,} vertices, {len(mesh.surface.faces):,} triangles")
     return paths
 
 
 def _points(opened: OpenRun, folder: Path) -> list[Path]:
     path = folder / "points.ply"
-    write_points(path, *surface_points(opened.state.rows, opened.scene.views, opened.backend.rasterise))
+    write_points(path, *surface_points(opened.state.gaussians, opened.scene.views, opened.backend.rasterize))
     return [path]
 
 
@@ -103,7 +103,7 @@ def _environment(opened: OpenRun, folder: Path) -> list[Path]:
     environment = opened.environment
     shading = needs_radiance(opened.shading, lit=environment is not None, what="--format environment")
     assert environment is not None
-    around = surroundings(list(opened.cameras.values()))
+    around = scene_frame(list(opened.cameras.values()))
     picture = panorama(environment["texels"], shading, around, PANORAMA_HEIGHT)
     paths = [folder / "environment.exr", folder / "environment.png"]
     write_exr(paths[0], picture)
@@ -113,6 +113,6 @@ def _environment(opened: OpenRun, folder: Path) -> list[Path]:
 
 def _cameras(opened: OpenRun, folder: Path) -> list[Path]:
     scene = opened.scene
-    write_colmap(folder / "sparse" / "0", opened.cameras, scene.points, scene.point_colours)
+    write_colmap(folder / "sparse" / "0", opened.cameras, scene.points, scene.point_colors)
     write_transforms(folder / "transforms.json", opened.cameras)
     return [folder / "sparse" / "0", folder / "transforms.json"]

@@ -14,17 +14,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from polarguide.cli.common import Transfer, console, use_threads
 from polarguide.cli.train import check_count
 from polarguide.errors import PolarguideError
+from polarguide.files import atomic
 from polarguide.inspection.fix import correction, fix_scene
+from polarguide.inspection.inspect import Inspection, InspectSettings, Normals, inspect_scene
 from polarguide.inspection.orders import ORDERS, PAIRINGS
 from polarguide.inspection.page_html import FILE as PAGE
 from polarguide.inspection.page_html import inspection_html
 from polarguide.inspection.record import write_record
-from polarguide.inspection.run import Inspection, InspectSettings, Normals, inspect_scene
 from polarguide.inspection.verdict import Verdict
 from polarguide.raster import DeviceName, choose_backend
-from polarguide.training.run import atomic
 
-COLOURS: dict[Verdict, str] = {"ok": "green", "look": "yellow", "wrong": "bold red", "n/a": "dim"}
+COLORS: dict[Verdict, str] = {"ok": "green", "look": "yellow", "wrong": "bold red", "n/a": "dim"}
 
 
 def inspect(
@@ -52,7 +52,7 @@ def inspect(
         fix: New folder for a corrected copy of the scene, if order, sense or zero are wrong and decided.
         normals: points uses points seen in several views alone; train also trains for normals, without polarization;
             auto does so where the points do not decide.
-        steps: Optimiser steps of that training. It is kept in --out and goes on where it stopped.
+        steps: Optimizer steps of that training. It is kept in --out and goes on where it stopped.
         refractive_index: Of the surfaces; without it as scene.json says, else 1.5.
         downscale: Average the pictures over boxes of this many pixels first; 0 until they are at most 640 pixels wide.
         transfer: How the files encode radiance.
@@ -91,7 +91,7 @@ def inspect(
 def _say(found: Inspection) -> None:
     """The checks and the odds of the orders on the console."""
     for check in found.checks:
-        console.print(f"[{COLOURS[check.verdict]}]{check.verdict:>5}[/]  ", end="")
+        console.print(f"[{COLORS[check.verdict]}]{check.verdict:>5}[/]  ", end="")
         console.print(f"{check.title}: {check.finding}", markup=False)
         if check.remedy and check.verdict != "ok":
             console.print(f"       {check.remedy}", markup=False)

@@ -12,8 +12,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from polarguide.cli.common import console
-from polarguide.cli.jobs import Child, Job
-from polarguide.training.run import LOG
+from polarguide.experiments.jobs import Child, Job
+from polarguide.runs.folder import LOG
 
 TAIL_BYTES = 4096
 # Trainings log every tenth step and recipes differ in speed: a long memory keeps the time left from jumping.

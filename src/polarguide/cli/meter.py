@@ -9,8 +9,8 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from polarguide.cli.common import console
+from polarguide.runs.folder import RunLog
 from polarguide.training.losses import refuse_diverged
-from polarguide.training.run import RunLog
 from polarguide.training.settings import StepReport
 from polarguide.training.stopwatch import Stopwatch
 

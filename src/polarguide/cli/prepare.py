@@ -14,9 +14,9 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from polarguide.capture.calibration import Calibration, read_calibration
-from polarguide.capture.prepare import ORIGINS, PrepareSettings, Reporter, prepare_scene
 from polarguide.cli.common import console, use_threads
 from polarguide.errors import PolarguideError
+from polarguide.preparation import ORIGINS, PrepareSettings, Reporter, prepare_scene
 
 
 def prepare(
@@ -63,7 +63,7 @@ def prepare(
         source: Folder of raw mosaics (one file a view), of filter shots (four folders or suffixes), or of a dataset.
         out: Scene folder to write.
         format: What the source is; auto looks for datasets and the four shots of a filter, else takes mosaics.
-        sensor: Sensor of raw mosaics: MYR are colour, MZR is monochrome.
+        sensor: Sensor of raw mosaics: MYR are color, MZR is monochrome.
         packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
         width: Width of .raw files in pixels.
         height: Height of .raw files in pixels.
@@ -73,9 +73,9 @@ def prepare(
         black_level: Stored value without light.
         dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it full scale.
-        white_balance: none, grey (the mean colour becomes grey), or gains of R, G and B such as 1.9,1,1.6.
+        white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
         demosaic: half, quarter or full resolution of the sensor.
-        interpolation: How half and full fill in colours and angles.
+        interpolation: How half and full fill in colors and angles.
         register: Bring the four angles of half size, which lie half a pixel apart, to one place.
         transfer: Encoding of filter shots (auto: the one under which the pair sums agree best) and of GNeRP.
         align: Estimate and correct small shifts between the four shots of a filter.
@@ -85,7 +85,7 @@ def prepare(
         sense: How the angles count as the picture is displayed; without it ccw, or as the dataset says.
         zero: Where their zero lies, in degrees counter-clockwise from the image's horizontal.
         poses: sfm, dataset, none, or the path of a COLMAP model; auto takes those of a dataset, else sfm.
-        matching: Pairs that SfM compares: all, or neighbours in the order of their names.
+        matching: Pairs that SfM compares: all, or neighbors in the order of their names.
         sfm_pictures: What SfM finds features in: the photograph, or the minimum over the angles, which has less glare.
         intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all pictures as developed, for SfM; without it they are estimated.
         refine_intrinsics: Let SfM change the focal lengths and distortion given.

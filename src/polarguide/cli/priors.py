@@ -15,8 +15,8 @@ from polarguide import optics
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, Transfer, console, open_run, read_scene, select_views, use_threads
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import figures
 from polarguide.training.priors import facing_chromatic, guide_normals
+from polarguide.visualization import figures
 
 Picture = NDArray[np.uint8]
 SHEET_VIEWS = 8
@@ -37,7 +37,7 @@ def priors(
 ) -> None:
     """Pictures of what polarization says about a scene, before or after training.
 
-    S0, DoLP, AoLP, zenith, both separations, polarization normals, those that colour differences tell (grey where they
+    S0, DoLP, AoLP, zenith, both separations, polarization normals, those that color differences tell (gray where they
     decide nothing), and the mask of usable pixels. The exact separation
     needs normals: those of a trained run with --run, else the polarization normals themselves, with their ambiguity
     resolved only by the surface facing the camera (a rough guess, and named so in the file).
@@ -113,7 +113,7 @@ def prior_pictures(view: View, opened: OpenRun | None, index: float, threshold: 
         f"normal_{source}": figures.normal_to_rgb(
             view.camera.to_world(normal * mask[..., None]), view.camera
         ),
-        "normal_by_colour": figures.normal_to_rgb(
+        "normal_by_color": figures.normal_to_rgb(
             view.camera.to_world(chromatic * (certain[..., None] > 0)), view.camera
         ),
         "mask": figures.scalar_to_rgb(mask.float(), 0.0, 1.0),

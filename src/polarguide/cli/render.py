@@ -10,10 +10,7 @@ import tyro
 
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, console, open_run, select_views, use_threads
-from polarguide.cli.film import film
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import figures
-from polarguide.evaluation.pictures import Picture, layer_picture, true_depth_range, truth_pictures
 from polarguide.export.environment import (
     RELIT_RESOLUTION,
     needs_radiance,
@@ -22,8 +19,11 @@ from polarguide.export.environment import (
     turned_cubemap,
 )
 from polarguide.raster import DeviceName
+from polarguide.rendering.film import film
+from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import LAYERS
-from polarguide.surroundings import surroundings
+from polarguide.visualization import figures
+from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture, true_depth_range
 
 SHEET_VIEWS = 8
 
@@ -94,7 +94,7 @@ def relight(opened: OpenRun, panorama: Path | None, degrees: float) -> None:
     what = "--environment" if panorama else "--rotate-environment"
     shading = needs_radiance(opened.shading, lit=learned is not None, what=what)
     assert learned is not None
-    around = surroundings(list(opened.cameras.values()))
+    around = scene_frame(list(opened.cameras.values()))
     if panorama is not None:
         texels = texels_of(read_panorama(panorama), shading, around, RELIT_RESOLUTION)
         learned["texels"] = texels.to(learned["texels"].device)
@@ -120,10 +120,10 @@ def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out:
                 missing.add(name)
             else:
                 figures.write_png(out / f"{view.name}_{name}.png", picture)
-        truth = truth_pictures(view)
+        ground_truth = ground_truth_pictures(view)
         if len(rows) < 2 * SHEET_VIEWS:
             rows.append([pictures[name] for name in layers])
-            rows.append([truth.get(name) for name in layers])
+            rows.append([ground_truth.get(name) for name in layers])
             labels += [view.name, f"{view.name} true"]
     sheet = out / "contact_sheet.png"
     figures.write_png(sheet, figures.contact_sheet(rows, labels, layers))

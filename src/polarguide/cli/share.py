@@ -42,7 +42,7 @@ def share(
     path.parent.mkdir(parents=True, exist_ok=True)
     write_page(path, page)
     console.print(
-        f"page: {path} ({path.stat().st_size / 1e6:.1f} MB, {len(opened.state.rows):,} Gaussians)",
+        f"page: {path} ({path.stat().st_size / 1e6:.1f} MB, {len(opened.state.gaussians):,} Gaussians)",
         markup=False,
     )
 
@@ -52,12 +52,12 @@ def page_of(opened: OpenRun, *, title: str = "", caption: str = "") -> str:
     views = opened.scene.test_views + opened.scene.train_views
     configuration = opened.configuration
     return share_page(
-        opened.state.rows,
+        opened.state.gaussians,
         opened.environment,
         opened.shading,
         {view.name: view.camera for view in views},
         first=views[0].name,
         title=title or opened.scene.name,
         caption=caption or f"{configuration.recipe}, {opened.state.step:,} steps",
-        metrics=[*shown_metrics(opened.folder), ("Gaussians", f"{len(opened.state.rows):,}")],
+        metrics=[*shown_metrics(opened.folder), ("Gaussians", f"{len(opened.state.gaussians):,}")],
     )

@@ -11,7 +11,7 @@ from polarguide.cli.common import console, use_threads
 from polarguide.cli.prepare import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.synth.manifest import MANIFEST, scene_digest
-from polarguide.synth.run import synthesise
+from polarguide.synth.render import synthesise
 from polarguide.synth.settings import Overrides, SynthSettings, find_scene
 from polarguide.synth.sweep import parse_sweep, sweep_scenes
 
@@ -31,8 +31,8 @@ def synth(
     index: float | None = None,
     spacing: float | None = None,
     sweep: str | None = None,
-    colour: Literal["rgb", "spectral"] = "rgb",
-    truth: Literal["test", "all"] = "test",
+    color: Literal["rgb", "spectral"] = "rgb",
+    ground_truth: Literal["test", "all"] = "test",
     threads: int = 0,
 ) -> None:
     """Render a polarized scene with ground truth: figure, kit, car, cup, water, proof, or a scene file.
@@ -51,10 +51,10 @@ def synth(
         noise: Photon and read noise: 1 is a sensor exposed to full scale, 2 a quarter of that light, 0 none.
         roughness: Roughness of all plastic objects in the foreground.
         index: Refractive index of these.
-        spacing: Degrees between neighbouring views on a ring.
+        spacing: Degrees between neighboring views on a ring.
         sweep: A family of scenes, such as views=9,18,36,63 or noise=0,1,2,4; also roughness, index and spacing.
-        colour: Three channels with exact values, or a sampled spectrum.
-        truth: Views that get ground truth.
+        color: Three channels with exact values, or a sampled spectrum.
+        ground_truth: Views that get ground truth.
         threads: Threads to use; 0 takes all cores.
     """
     use_threads(threads)
@@ -67,8 +67,8 @@ def synth(
         seed=seed,
         sensor=sensor,
         noise=noise,
-        colour=colour,
-        truth=truth,
+        color=color,
+        ground_truth=ground_truth,
     )
     spec = find_scene(scene)
     if sweep is not None:

@@ -11,19 +11,13 @@ from typing import Annotated
 import tyro
 
 from polarguide.cli.common import Transfer, console, read_scene, use_threads
-from polarguide.cli.company import backend_of, company
-from polarguide.cli.train_loop import train_run, watched
 from polarguide.errors import PolarguideError
 from polarguide.raster import DeviceName
 from polarguide.recipes import recipe_named
-from polarguide.training.ranks import Ranks
-from polarguide.training.run import (
-    CHECKPOINT,
-    CONFIGURATION,
-    RunConfiguration,
-    load_checkpoint,
-    recipe_data,
-)
+from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, RunConfiguration, load_checkpoint, recipe_data
+from polarguide.runs.train import train_run, watched
+from polarguide.training.company import backend_of, company
+from polarguide.training.distributed import Ranks
 from polarguide.training.trainer import Trainer, TrainSettings
 from polarguide.viewer import LOOPBACK
 
@@ -60,7 +54,7 @@ def train(
         recipe: Which method: polarguide-stokes (renders the measured polarization, too), polarguide (the paper's stages
             with repaired physics), polarguide-paper, 3dgs, 3dgs-dr, ref-gs (these three ignore polarization), or an
             ablation of one, such as polarguide:without-normals.
-        steps: Optimiser steps in all. 3,000 show the scene, 5,000 and more settle it.
+        steps: Optimizer steps in all. 3,000 show the scene, 5,000 and more settle it.
         downscale: Average the pictures over boxes of this many pixels first.
         seed: Seed of every random draw.
         refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water.
@@ -101,7 +95,7 @@ def train(
             state = load_checkpoint(out, chosen, backend.device) if (out / CHECKPOINT).exists() else None
         trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
         with watched(trainer, viewer_host, viewer_port) if viewer else nullcontext() as look:
-            ranks.wait()
+            ranks.barrier()
             if leads:
                 out.mkdir(parents=True, exist_ok=True)
                 configuration.save(out)

@@ -1,7 +1,7 @@
 """Metrics, records and figures: what a trained scene is worth, in numbers and to the eye."""
 
-from .record import validate_metrics, write_metrics
-from .scores import ViewScores, score_view, summarise
-from .target import ViewTarget
+from polarguide.evaluation.record import validate_metrics, write_metrics
+from polarguide.evaluation.scores import ViewScores, score_view, summarize
+from polarguide.evaluation.target import ViewTarget
 
-__all__ = ["ViewScores", "ViewTarget", "score_view", "summarise", "validate_metrics", "write_metrics"]
+__all__ = ["ViewScores", "ViewTarget", "score_view", "summarize", "validate_metrics", "write_metrics"]

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import torch
 from torch import Tensor
 
-from .metrics import shown
+from polarguide.color import shown
 
 FETCH_COMMAND = "python -c \"import torchvision; torchvision.models.vgg16(weights='DEFAULT')\""
 # Five halvings: below this the last layer of the network has no pixel.

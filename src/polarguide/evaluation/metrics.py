@@ -9,12 +9,38 @@ results stay there, as tensors [] of float64: whoever wants several asks for the
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .selection import Selection
+from polarguide.color import shown
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Pixels that count, as a mask and by their numbers.
+
+    A device that picks by a mask has to count it first, and whoever asked waits for the answer. So masks are counted on
+    the CPU, where they come from, and pixels are picked by number: the same ones in the same order.
+
+    Attributes:
+        mask: [H, W] bool. places: [P] int64, the pixels in it, counted along the rows.
+    """
+
+    mask: Tensor
+    places: Tensor
+
+    @classmethod
+    def of(cls, mask: Tensor, device: torch.device) -> Selection:
+        """The pixels of a mask [H, W] bool, on a device; the mask itself should lie on the CPU."""
+        return cls(mask.to(device), mask.flatten().nonzero()[:, 0].to(device))
+
+    def pick(self, values: Tensor) -> Tensor:
+        """[P, ...] of values [H, W, ...] on the same device."""
+        return values.flatten(0, 1).index_select(0, self.places)
+
 
 Keep = Tensor | Selection | None
 SSIM_WINDOW = 11
@@ -25,21 +51,6 @@ REFLECTIVE_SHARE = 0.3
 CLOSE_NORMAL_DEG = 11.25
 SHORTEST = 1e-12
 """Vectors that are not longer have no direction."""
-
-
-def shown(linear: Tensor) -> Tensor:
-    """The picture as a display shows it: clipped to [0, 1], then the sRGB transfer (IEC 61966-2-1).
-
-    Args:
-        linear: [...] linear radiance.
-
-    Returns:
-        [...] in [0, 1], in the dtype given. NaN stays NaN.
-    """
-    clipped = linear.clamp(0.0, 1.0)
-    # The power's base is kept off zero: its slope there is infinite.
-    curve = 1.055 * clipped.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-    return torch.where(clipped <= 0.0031308, 12.92 * clipped, curve)
 
 
 def psnr(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -> float:
@@ -75,13 +86,13 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
     the picture, mean over windows and channels: what scikit-image computes with ``gaussian_weights=True, sigma=1.5,
     use_sample_covariance=False, data_range=1``.
 
-    A pixel outside ``keep`` has no weight in any window (the weights of the others are normalised to one) and the
+    A pixel outside ``keep`` has no weight in any window (the weights of the others are normalized to one) and the
     window around it does not count. Without such pixels this is the plain definition.
 
     Args:
         pred_linear, true_linear: [H, W, C] linear radiance, H and W at least 11.
         keep: [H, W] bool or a selection, the pixels that count; None counts all.
-        windows: ``window_centres`` of ``keep``, where they are known already.
+        windows: ``window_centers`` of ``keep``, where they are known already.
 
     Returns:
         [], at most 1; NaN where no window counts.
@@ -108,12 +119,12 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
     similarity = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
         (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
     )
-    counted = _selected(window_centres(kept) if windows is None else windows, similarity[0])
+    counted = _selected(window_centers(kept) if windows is None else windows, similarity[0])
     return similarity.flatten(1).index_select(1, counted.places).mean()
 
 
-def window_centres(keep: Tensor) -> Tensor:
-    """Of a mask [H, W] of pixels, the centres of SSIM's windows: [H - 10, W - 10]."""
+def window_centers(keep: Tensor) -> Tensor:
+    """Of a mask [H, W] of pixels, the centers of SSIM's windows: [H - 10, W - 10]."""
     margin = SSIM_WINDOW // 2
     return keep[margin:-margin, margin:-margin]
 

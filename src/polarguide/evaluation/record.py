@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from polarguide.errors import PolarguideError
-
-from .scores import MEAN_KEYS, PERFECT_PSNR, ViewScores, score_view, summarise
+from polarguide.evaluation.scores import MEAN_KEYS, PERFECT_PSNR, ViewScores, score_view, summarize
 
 __all__ = [
     "PROVENANCE_KEYS",
     "RUN_KEYS",
     "ViewScores",
     "score_view",
-    "summarise",
+    "summarize",
     "validate_metrics",
     "write_metrics",
 ]
@@ -39,7 +38,7 @@ def write_metrics(
 ) -> dict[str, Any]:
     """Write ``metrics.json`` in one step: a reader sees the old file or the whole new one.
 
-    Top level: the means of ``summarise``, the keys of ``run``, ``views`` and ``provenance``. Numbers are
+    Top level: the means of ``summarize``, the keys of ``run``, ``views`` and ``provenance``. Numbers are
         finite: NaN
     and infinity become null, an infinite PSNR ``PERFECT_PSNR``.
 
@@ -60,7 +59,7 @@ def write_metrics(
         name: {k: _clean(k, v) for k, v in scores.items()} for name, scores in views.items()
     }
     record: dict[str, Any] = {
-        **summarise(clean),
+        **summarize(clean),
         **dict.fromkeys(RUN_KEYS),
         **{key: _clean(key, value) for key, value in run.items()},
         "views": clean,

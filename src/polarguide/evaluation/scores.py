@@ -9,9 +9,16 @@ from typing import Any, TypedDict, cast
 import torch
 from torch import Tensor
 
-from .lpips import lpips
-from .metrics import decibels, layer_error, normal_mae_deg, normal_within_11, squared_error, ssim
-from .target import ViewTarget
+from polarguide.evaluation.lpips import lpips
+from polarguide.evaluation.metrics import (
+    decibels,
+    layer_error,
+    normal_mae_deg,
+    normal_within_11,
+    squared_error,
+    ssim,
+)
+from polarguide.evaluation.target import ViewTarget
 
 PERFECT_PSNR = 100.0
 """What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
@@ -102,7 +109,7 @@ def score_view(target: ViewTarget, rendered: Any) -> ViewScores:
     return cast(ViewScores, scores)
 
 
-def summarise(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | None]:
+def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | None]:
     """Plain means over views (a mean of PSNRs, not a PSNR of means).
 
     Args:

@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .metrics import has_direction, reflective_mask, window_centres
-from .selection import Selection
+from polarguide.evaluation.metrics import Selection, has_direction, reflective_mask, window_centers
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +17,7 @@ class ViewTarget:
 
     Attributes:
         photograph: [H, W, 3] linear, S0/2.
-        valid: the pixels that count at all. windows: those of them that are centres of SSIM's windows.
+        valid: the pixels that count at all. windows: those of them that are centers of SSIM's windows.
         foreground: valid pixels of the true mask; None without a mask, and then all that follows is None.
         reflective: those that are mostly seen by their reflection; None where the true specular lobe is not known.
         surface: foreground pixels with a true normal; None where normals are not known.
@@ -69,7 +68,7 @@ class ViewTarget:
         return cls(
             photograph=photograph.detach().to(device).to(torch.float64),
             valid=Selection.of(valid, device),
-            windows=Selection.of(window_centres(valid), device),
+            windows=Selection.of(window_centers(valid), device),
             foreground=chosen(foreground),
             reflective=chosen(reflective),
             surface=chosen(surface),

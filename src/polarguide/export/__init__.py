@@ -1,5 +1,5 @@
 """Trained scenes as the files of other tools."""
 
-from polarguide.export.splats import write_run_ply
+from polarguide.runs.point_cloud import write_run_ply
 
 __all__ = ["write_run_ply"]

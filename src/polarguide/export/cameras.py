@@ -13,19 +13,19 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.training.run import atomic
+from polarguide.files import atomic
 
 # nerfstudio's cameras look along -z with y up: OpenGL's axes, not OpenCV's.
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 
 def write_colmap(
-    folder: Path, cameras: Mapping[str, Camera], points: Tensor, colours: Tensor, suffix: str = ".png"
+    folder: Path, cameras: Mapping[str, Camera], points: Tensor, colors: Tensor, suffix: str = ".png"
 ) -> None:
     """Write a COLMAP model as text: one camera and one image a view, and points without tracks.
 
     Args:
-        folder: made if there is none. cameras: by view. points: [M, 3]. colours: [M, 3] uint8.
+        folder: made if there is none. cameras: by view. points: [M, 3]. colors: [M, 3] uint8.
         suffix: the images are called the view's name and this.
     """
     model = pycolmap.Reconstruction()
@@ -38,8 +38,8 @@ def write_colmap(
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(camera.rotation.numpy()), camera.translation.numpy())
         image = pycolmap.Image(name=name + suffix, camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pose)
-    for place, colour in zip(points.double().numpy(), colours.numpy().astype(np.uint8), strict=True):
-        model.add_point3D(place, pycolmap.Track(), colour)
+    for place, color in zip(points.double().numpy(), colors.numpy().astype(np.uint8), strict=True):
+        model.add_point3D(place, pycolmap.Track(), color)
     folder.mkdir(parents=True, exist_ok=True)
     model.write_text(str(folder))
 
@@ -49,7 +49,7 @@ def transforms(cameras: Mapping[str, Camera], suffix: str = ".png") -> dict[str,
     frames = []
     for name, camera in cameras.items():
         pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3], pose[:3, 3] = camera.rotation.T, camera.centre
+        pose[:3, :3], pose[:3, 3] = camera.rotation.T, camera.center
         frames.append(
             {
                 "file_path": f"images/{name}{suffix}",

@@ -16,12 +16,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from polarguide.errors import PolarguideError
-from polarguide.export.extras import needed
+from polarguide.errors import PolarguideError, optional_import
+from polarguide.scene_frame import SceneFrame
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
+from polarguide.shading.deferred import Shading
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, ShadingModel
-from polarguide.shading.render import Shading
-from polarguide.surroundings import Surroundings
 
 LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
@@ -46,7 +45,7 @@ def needs_radiance(shading: ShadingModel, *, lit: bool, what: str) -> Shading:
 
 
 @torch.no_grad()
-def panorama(texels: Tensor, shading: Shading, around: Surroundings, height: int) -> Tensor:
+def panorama(texels: Tensor, shading: Shading, around: SceneFrame, height: int) -> Tensor:
     """Radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
     steps = torch.arange(2 * height, dtype=torch.float64) + 0.5
     latitude, longitude = (
@@ -62,7 +61,7 @@ def panorama(texels: Tensor, shading: Shading, around: Surroundings, height: int
 
 
 @torch.no_grad()
-def texels_of(picture: Tensor, shading: Shading, around: Surroundings, resolution: int) -> Tensor:
+def texels_of(picture: Tensor, shading: Shading, around: SceneFrame, resolution: int) -> Tensor:
     """Raw texels [6, R, R, 3] that a panorama [H, W, 3] of radiance is the light of, as far as the blend can hold it.
 
     ``lerp`` holds radiance below 1, ``fresnel`` below e^5.
@@ -97,7 +96,7 @@ def write_exr(path: Path, picture: Tensor) -> None:
     Raises:
         PolarguideError: OpenEXR is not installed.
     """
-    exr = needed("OpenEXR", "an EXR file")
+    exr = optional_import("OpenEXR", "an EXR file")
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
     pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32))
     with exr.File(header, {"RGB": pixels}) as file:
@@ -129,7 +128,7 @@ def read_panorama(path: Path) -> Tensor:
 
 
 def _exr_pixels(path: Path) -> np.ndarray | None:
-    exr = needed("OpenEXR", str(path))
+    exr = optional_import("OpenEXR", str(path))
     try:
         with exr.File(str(path)) as file:
             channels = file.channels()

@@ -13,8 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
-from polarguide.export.extras import needed
+from polarguide.errors import PolarguideError, optional_import
 
 TRUNCATION = 4.0  # voxels
 _SLAB = 1 << 21  # voxels at a time
@@ -42,16 +41,16 @@ def seen_points(camera: Camera, depth: Tensor, mask: Tensor) -> Tensor:
     """World points [M, 3] float64 of the pixels in ``mask`` [H, W] at camera depths [H, W]."""
     rays = camera.rays()[mask].double()
     local = rays * (depth[mask].double() / rays[:, 2])[:, None]
-    return camera.to_world(local) + camera.centre
+    return camera.to_world(local) + camera.center
 
 
-def box_around(points: Sequence[Tensor], centre: Tensor, reach: float, resolution: int) -> Box:
-    """The box of what the cameras look at: points [M, 3] within ``reach`` of the centre, without their outermost 0.5 %.
+def box_around(points: Sequence[Tensor], center: Tensor, reach: float, resolution: int) -> Box:
+    """The box of what the cameras look at: points [M, 3] within ``reach`` of the center, without their outermost 0.5 %.
 
     Raises:
         PolarguideError: nothing is there.
     """
-    near = torch.cat([p[(p - centre).norm(dim=1) < reach] for p in points])
+    near = torch.cat([p[(p - center).norm(dim=1) < reach] for p in points])
     if len(near) < 100:
         raise PolarguideError(
             "mesh", expected="surfaces before the cameras", found="none", remedy="Train for more steps."
@@ -113,7 +112,7 @@ def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, small
     Raises:
         PolarguideError: scikit-image is not installed, or there is no surface.
     """
-    marching_cubes: Callable[..., tuple[NDArray, NDArray, NDArray, NDArray]] = needed(
+    marching_cubes: Callable[..., tuple[NDArray, NDArray, NDArray, NDArray]] = optional_import(
         "skimage.measure", "--format mesh"
     ).marching_cubes
     known = (weight >= least).numpy()

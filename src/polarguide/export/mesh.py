@@ -1,4 +1,4 @@
-"""A trained scene as a triangle mesh with the normals and the diffuse colours that were learned."""
+"""A trained scene as a triangle mesh with the normals and the diffuse colors that were learned."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.export.extras import needed
+from polarguide.color import srgb_encode
+from polarguide.errors import optional_import
 from polarguide.export.fusion import TRUNCATION, Box, Surface, box_around, fuse, seen_points, surface_of
-from polarguide.shading.display import srgb_encode
+from polarguide.files import atomic
+from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.result import RenderResult
-from polarguide.surroundings import Surroundings, surroundings
-from polarguide.training.run import atomic
 from polarguide.vectors import dot, unit
 
 OPAQUE = 0.8
@@ -26,17 +26,17 @@ _STEEPEST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class ColouredMesh:
-    """A mesh with linear diffuse colours [V, 3] in [0, 1]."""
+class ColoredMesh:
+    """A mesh with linear diffuse colors [V, 3] in [0, 1]."""
 
     surface: Surface
-    colours: NDArray[np.float64]
+    colors: NDArray[np.float64]
 
 
 @torch.no_grad()
 def scene_mesh(
     cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
-) -> ColouredMesh:
+) -> ColoredMesh:
     """Fuse the depth that a scene's cameras see.
 
     Args:
@@ -46,18 +46,18 @@ def scene_mesh(
     Raises:
         PolarguideError: there is no surface, or a library is missing.
     """
-    needed("skimage.measure", "--format mesh")
+    optional_import("skimage.measure", "--format mesh")
     views = [(camera, _kept(render(camera), camera)) for camera in cameras.values()]
-    around = surroundings(list(cameras.values()))
+    around = scene_frame(list(cameras.values()))
     points = [seen_points(camera, seen.depth, seen.mask) for camera, seen in views]
-    box = box_around(points, around.centre, around.distance, resolution)
+    box = box_around(points, around.center, around.distance, resolution)
     field, weight = fuse(box, ((camera, seen.depth, seen.mask) for camera, seen in views))
     return painted(surface_of(box, field, weight), views, box)
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Of one view: depth [H, W], where it counts [H, W], diffuse colour and world normal [H, W, 3]."""
+    """Of one view: depth [H, W], where it counts [H, W], diffuse color and world normal [H, W, 3]."""
 
     depth: Tensor
     mask: Tensor
@@ -74,43 +74,41 @@ def _kept(result: RenderResult, camera: Camera) -> Seen:
     return Seen(result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse, normal)
 
 
-def painted(surface: Surface, views: list[tuple[Camera, Seen]], box: Box) -> ColouredMesh:
-    """Colours and normals of the views that see each vertex, weighted by how squarely they do."""
+def painted(surface: Surface, views: list[tuple[Camera, Seen]], box: Box) -> ColoredMesh:
+    """Colors and normals of the views that see each vertex, weighted by how squarely they do."""
     vertices = torch.from_numpy(surface.vertices)
     own = torch.from_numpy(surface.normals)
-    colour, normal = torch.zeros_like(vertices), torch.zeros_like(vertices)
+    color, normal = torch.zeros_like(vertices), torch.zeros_like(vertices)
     total = torch.zeros(len(vertices), dtype=torch.float64)
     for camera, seen in views:
-        x, y, z = camera.to_camera(vertices - camera.centre).unbind(-1)
+        x, y, z = camera.to_camera(vertices - camera.center).unbind(-1)
         safe = z.clamp(min=1e-6)
         column, row = (camera.fx * x / safe + camera.cx).floor(), (camera.fy * y / safe + camera.cy).floor()
         inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         column, row = column.clamp(0, camera.width - 1).long(), row.clamp(0, camera.height - 1).long()
         near = (seen.depth[row, column] - z).abs() < TRUNCATION * box.size
-        squarely = dot(unit(camera.centre - vertices), own).clamp(min=0)
+        squarely = dot(unit(camera.center - vertices), own).clamp(min=0)
         weight = (inside & near & seen.mask[row, column]) * squarely
-        colour += weight[:, None] * seen.diffuse[row, column]
+        color += weight[:, None] * seen.diffuse[row, column]
         normal += weight[:, None] * seen.normal[row, column]
         total += weight
-    # What no view sees squarely keeps the normal of its surface, and the colour grey.
+    # What no view sees squarely keeps the normal of its surface, and the color gray.
     learned = unit(normal, 1e-9)
     agrees = (total > 0) & (dot(learned, own) > 0)
     normals = torch.where(agrees[:, None], learned, own)
-    colours = torch.where((total > 0)[:, None], colour / total.clamp(min=1e-9)[:, None], 0.2)
-    return ColouredMesh(
-        Surface(surface.vertices, surface.faces, normals.numpy()), colours.clamp(0, 1).numpy()
-    )
+    colors = torch.where((total > 0)[:, None], color / total.clamp(min=1e-9)[:, None], 0.2)
+    return ColoredMesh(Surface(surface.vertices, surface.faces, normals.numpy()), colors.clamp(0, 1).numpy())
 
 
-def write_mesh(path: Path, mesh: ColouredMesh, around: Surroundings) -> None:
-    """Write a mesh: PLY in world axes with display colours, or GLB, upright (+y), with linear colours as glTF has them.
+def write_mesh(path: Path, mesh: ColoredMesh, around: SceneFrame) -> None:
+    """Write a mesh: PLY in world axes with display colors, or GLB, upright (+y), with linear colors as glTF has them.
 
     Raises:
         PolarguideError: trimesh is not installed.
     """
-    trimesh = needed("trimesh", "--format mesh")
+    trimesh = optional_import("trimesh", "--format mesh")
     binary = path.suffix.lower() == ".glb"
-    shown = torch.from_numpy(mesh.colours)
+    shown = torch.from_numpy(mesh.colors)
     values = (shown if binary else srgb_encode(shown)).mul(255).round().to(torch.uint8).numpy()
     made = trimesh.Trimesh(
         vertices=mesh.surface.vertices,

@@ -42,6 +42,6 @@ def network_numbers(light: Mapping[str, Tensor]) -> NDArray[np.float32]:
 
 
 def viridis() -> NDArray[np.uint8]:
-    """The colour map of scalar layers, [256, 3] RGB."""
-    colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_VIRIDIS)
-    return np.ascontiguousarray(colours[0, :, ::-1], dtype=np.uint8)
+    """The color map of scalar layers, [256, 3] RGB."""
+    colors = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_VIRIDIS)
+    return np.ascontiguousarray(colors[0, :, ::-1], dtype=np.uint8)

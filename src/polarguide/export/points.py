@@ -11,15 +11,15 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from polarguide.capture import View
+from polarguide.color import srgb_encode
 from polarguide.errors import PolarguideError
+from polarguide.files import atomic
 from polarguide.gaussians.geometry import shortest_axis_normals
-from polarguide.raster import Rasterise
+from polarguide.raster import Rasterize
+from polarguide.shading.deferred import harmonic_colors
 from polarguide.shading.directional import albedo_of
-from polarguide.shading.display import srgb_encode
-from polarguide.shading.model import Rows
-from polarguide.shading.render import harmonic_colours
-from polarguide.training.orientation import outward_directions
-from polarguide.training.run import atomic
+from polarguide.shading.model import Parameters
+from polarguide.shading.visibility import outward_directions
 
 OPAQUE = 0.5
 FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
@@ -28,14 +28,16 @@ FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
 
 
 @torch.no_grad()
-def surface_points(rows: Rows, views: Iterable[View], rasterise: Rasterise) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions, outward unit normals and display colours, each [M, 3], of opaque Gaussians that a view sees.
+def surface_points(
+    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions, outward unit normals and display colors, each [M, 3], of opaque Gaussians that a view sees.
 
     Raises:
         PolarguideError: there are none.
     """
-    outward = outward_directions(rows, views, rasterise)
-    opaque = torch.sigmoid(rows["opacity_logits"]) >= OPAQUE
+    outward = outward_directions(gaussians, views, rasterize)
+    opaque = torch.sigmoid(gaussians["opacity_logits"]) >= OPAQUE
     kept = (opaque & (outward.norm(dim=1) > 0)).nonzero()[:, 0]
     if not len(kept):
         raise PolarguideError(
@@ -44,27 +46,27 @@ def surface_points(rows: Rows, views: Iterable[View], rasterise: Rasterise) -> t
             found="none",
             remedy="Train for more steps.",
         )
-    means, side = rows["means"][kept], outward[kept]
+    means, side = gaussians["means"][kept], outward[kept]
     normals = shortest_axis_normals(
-        means, rows["quaternions"][kept], rows["log_scales"][kept], torch.zeros(3)
+        means, gaussians["quaternions"][kept], gaussians["log_scales"][kept], torch.zeros(3)
     )
     normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
-    if "log_albedo" in rows:
-        linear = albedo_of(rows)[kept]
+    if "log_albedo" in gaussians:
+        linear = albedo_of(gaussians)[kept]
     else:
-        few = {name: rows[name][kept] for name in ("sh_dc", "sh_rest")}
-        linear = harmonic_colours(few, -normals.contiguous())
-    colours = srgb_encode(linear.clamp(0, 1))
-    return means, normals, colours
+        few = {name: gaussians[name][kept] for name in ("sh_dc", "sh_rest")}
+        linear = harmonic_colors(few, -normals.contiguous())
+    colors = srgb_encode(linear.clamp(0, 1))
+    return means, normals, colors
 
 
-def write_points(path: Path, points: Tensor, normals: Tensor, colours: Tensor) -> None:
+def write_points(path: Path, points: Tensor, normals: Tensor, colors: Tensor) -> None:
     """Write a PLY of points."""
     table = np.empty(len(points), dtype=FIELDS)
     values = np.concatenate((points.numpy(), normals.numpy()), axis=1)
     for index, (name, _) in enumerate(FIELDS[:6]):
         table[name] = values[:, index]
-    shades = np.rint(colours.numpy() * 255).astype(np.uint8)
+    shades = np.rint(colors.numpy() * 255).astype(np.uint8)
     for index, name in enumerate(("red", "green", "blue")):
         table[name] = shades[:, index]
     with atomic(path) as temporary:

@@ -8,7 +8,7 @@ texel content
 ===== ==================================================================================================
 0     mean 3 x float32; opacity u16; strength u16 (roughness for the directional shading)
 1     rotation (w, x, y, z) 4 x i16; logarithms of the scales 3 x f16; scale of the harmonics f16
-2     colour of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; side u16 (1: the axis points outward)
+2     color of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; side u16 (1: the axis points outward)
 3-5   harmonics of degrees 1 to 3, 45 signed bytes in steps of their scale; or 4 x i16 features in texel 3
 6-9   light of its own: degree 0 3 x f16, scale f16; then its harmonics as above
 ===== ==================================================================================================
@@ -29,9 +29,9 @@ from torch.nn.functional import normalize
 
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.raster.interface import MINIMUM_ALPHA
+from polarguide.shading.deferred import Shading
 from polarguide.shading.directional import DirectionalShading, albedo_of
-from polarguide.shading.model import Rows, ShadingModel
-from polarguide.shading.render import Shading
+from polarguide.shading.model import Parameters, ShadingModel
 
 TEXEL = 16
 Bytes = NDArray[np.uint8]
@@ -42,7 +42,7 @@ TEXELS: dict[Kind, int] = {"plain": 6, "reflection": 6, "local": 10, "directiona
 
 @dataclass(frozen=True, eq=False)
 class Records:
-    """Quantised Gaussians.
+    """Quantized Gaussians.
 
     Attributes:
         kind: how they are shaded. data: [N, 16 K] uint8, K texels each.
@@ -52,7 +52,7 @@ class Records:
     data: Bytes
 
     def planes(self) -> bytes:
-        """The records byte by byte, first all first bytes: neighbours are alike, so that they compress well."""
+        """The records byte by byte, first all first bytes: neighbors are alike, so that they compress well."""
         return np.ascontiguousarray(self.data.T).tobytes()
 
 
@@ -66,19 +66,19 @@ def shading_kind(shading: ShadingModel, *, lit: bool) -> Kind | None:
 
 
 @torch.no_grad()
-def records(rows: Rows, kind: Kind) -> Records:
-    """Quantise Gaussians; those too faint to be drawn at all are left out.
+def records(gaussians: Parameters, kind: Kind) -> Records:
+    """Quantize Gaussians; those too faint to be drawn at all are left out.
 
     Args:
-        rows: the Gaussians, with the side tensors that the kind needs.
+        gaussians: the Gaussians, with the side tensors that the kind needs.
         kind: see ``shading_kind``.
 
     Returns:
-        In the order of a curve that fills space, so that neighbours in it are alike.
+        In the order of a curve that fills space, so that neighbors in it are alike.
     """
-    opacity = torch.sigmoid(rows["opacity_logits"])
+    opacity = torch.sigmoid(gaussians["opacity_logits"])
     kept = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]
-    kept = kept[torch.from_numpy(curve_order(rows["means"][kept].numpy()))]
+    kept = kept[torch.from_numpy(curve_order(gaussians["means"][kept].numpy()))]
     data = np.zeros((len(kept), TEXEL * TEXELS[kind]), dtype=np.uint8)
 
     def put(at: int, values: NDArray[np.generic]) -> None:
@@ -86,9 +86,9 @@ def records(rows: Rows, kind: Kind) -> Records:
         data[:, at : at + raw.shape[1]] = raw
 
     def row(name: str) -> Tensor:
-        return rows[name][kept].detach()
+        return gaussians[name][kept].detach()
 
-    axis, side = _axes(rows, kept)
+    axis, side = _axes(gaussians, kept)
     put(0, row("means").numpy().astype("<f4"))
     put(12, _fraction(opacity[kept], 65535, "<u2"))
     put(16, _fraction(normalize(row("quaternions"), dim=-1), 32767, "<i2"))
@@ -97,7 +97,7 @@ def records(rows: Rows, kind: Kind) -> Records:
     put(44, side.numpy().astype("<u2"))
     if kind == "directional":
         put(14, _fraction(torch.sigmoid(row("roughness_logits")), 65535, "<u2"))
-        put(32, _half(albedo_of(rows)[kept]))
+        put(32, _half(albedo_of(gaussians)[kept]))
         put(48, _fraction(torch.tanh(row("features")), 32767, "<i2"))
         return Records(kind, data)
     if kind != "plain":
@@ -124,13 +124,13 @@ def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]
     return steps.astype(np.int8), step
 
 
-def _axes(rows: Rows, kept: Tensor) -> tuple[Tensor, Tensor]:
+def _axes(gaussians: Parameters, kept: Tensor) -> tuple[Tensor, Tensor]:
     """Normal axes [K, 3], and 1 [K] where they are turned outward, 0 where the camera alone decides."""
-    means, origin = rows["means"][kept], torch.zeros(3)
-    axes = shortest_axis_normals(means, rows["quaternions"][kept], rows["log_scales"][kept], origin)
-    if "outward" not in rows:
+    means, origin = gaussians["means"][kept], torch.zeros(3)
+    axes = shortest_axis_normals(means, gaussians["quaternions"][kept], gaussians["log_scales"][kept], origin)
+    if "outward" not in gaussians:
         return axes, torch.zeros(len(kept))
-    along = (axes * rows["outward"][kept]).sum(dim=1)
+    along = (axes * gaussians["outward"][kept]).sum(dim=1)
     return torch.where(along < 0, -1.0, 1.0)[:, None] * axes, (along != 0).float()
 
 

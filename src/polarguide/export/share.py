@@ -21,10 +21,10 @@ from polarguide import __version__
 from polarguide.camera import Camera
 from polarguide.export.page_light import directional_levels, light_numbers, network_numbers, viridis
 from polarguide.export.records import TEXELS, Kind, records, shading_kind
-from polarguide.shading.model import Rows, ShadingModel
-from polarguide.shading.render import Shading
-from polarguide.surroundings import surroundings
-from polarguide.training.run import atomic
+from polarguide.files import atomic
+from polarguide.scene_frame import scene_frame
+from polarguide.shading.deferred import Shading
+from polarguide.shading.model import Parameters, ShadingModel
 
 SCRIPTS = ("algebra.js", "sorter.js", "renderer.js", "navigation.js", "controls.js", "unpack.js", "main.js")
 SHADERS = {
@@ -42,7 +42,7 @@ LAYERS: dict[Kind, tuple[str, ...]] = {
     "local": ("final", "diffuse", "specular", "base", "strength", "normal"),
     "directional": ("final", "diffuse", "specular", "base", "normal"),
 }
-LEFT_OUT = "The reflections of this model are left out: the page does not know their shading. It shows the base colour."
+LEFT_OUT = "The reflections of this model are left out: the page does not know their shading. It shows the base color."
 TURNED_LOCALLY = (
     "Turning the environment turns what is reflected from afar. What stands near is reflected by the Gaussians "
     "themselves, which stay as they are."
@@ -50,7 +50,7 @@ TURNED_LOCALLY = (
 
 
 def share_page(
-    rows: Rows,
+    gaussians: Parameters,
     environment: Mapping[str, Tensor] | None,
     shading: ShadingModel,
     cameras: Mapping[str, Camera],
@@ -63,7 +63,8 @@ def share_page(
     """The page.
 
     Args:
-        rows: the Gaussians. environment: parameters of the learned light, None: no reflection. shading: of the recipe.
+        gaussians: the Gaussians.
+        environment: parameters of the learned light, None: no reflection. shading: of the recipe.
         cameras: poses to choose from by name, at least one. first: name of the one to begin with.
         title, caption: any text; it is escaped.
         metrics: labels and values, any text.
@@ -74,11 +75,11 @@ def share_page(
     kind = shading_kind(shading, lit=environment is not None)
     notes = [LEFT_OUT] if kind is None else [TURNED_LOCALLY] if kind == "local" else []
     kind = kind or "plain"
-    quantised = records(rows, kind)
+    quantized = records(gaussians, kind)
     scene: dict[str, Any] = {
         "kind": kind,
         "texels": TEXELS[kind],
-        "count": len(quantised.data),
+        "count": len(quantized.data),
         "layers": LAYERS[kind],
     }
     scene |= _frame(cameras, first) | {"index": 1.5, "resolution": 1, "levels": 1}
@@ -109,7 +110,7 @@ def share_page(
         script=script,
         scene=_data(scene),
         shaders=_data({name: _page(file) for name, file in SHADERS.items()}),
-        records=_packed(quantised.planes()),
+        records=_packed(quantized.planes()),
         **{name: "" if values is None else _packed(values.tobytes()) for name, values in arrays.items()},
     )
 
@@ -121,10 +122,10 @@ def write_page(path: Path, page: str) -> None:
 
 
 def _frame(cameras: Mapping[str, Camera], first: str) -> dict[str, Any]:
-    around = surroundings(list(cameras.values()))
+    around = scene_frame(list(cameras.values()))
     return {
         "up": around.up.tolist(),
-        "centre": around.centre.tolist(),
+        "center": around.center.tolist(),
         "distance": around.distance,
         "first": list(cameras).index(first),
         "cameras": [

@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from polarguide.files import atomic
 from polarguide.gaussians.ply import read_ply
-from polarguide.training.run import atomic
 
 CODES = 256
 PALETTE_ROW = 64
@@ -39,19 +39,19 @@ def write_sog(path: Path, ply: Path) -> None:
     Args:
         path: the file to write. ply: as ``write_run_ply`` writes it.
     """
-    rows = {name: values for name, values in read_ply(ply).items() if name != "extra"}
-    order = _morton_order(rows["means"])
-    rows = {name: values[order] for name, values in rows.items()}
+    gaussians = {name: values for name, values in read_ply(ply).items() if name != "extra"}
+    order = _morton_order(gaussians["means"])
+    gaussians = {name: values[order] for name, values in gaussians.items()}
     width = math.ceil(math.sqrt(len(order)))
     pictures: dict[str, Pixels] = {}
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "polarguide"}, "count": len(order)}
-    meta["means"] = _means(rows["means"], width, pictures)
-    meta["scales"] = _coded("scales.webp", rows["log_scales"], None, width, pictures)
-    pictures["quats.webp"] = _picture(_smallest_three(rows["quaternions"]), width)
+    meta["means"] = _means(gaussians["means"], width, pictures)
+    meta["scales"] = _coded("scales.webp", gaussians["log_scales"], None, width, pictures)
+    pictures["quats.webp"] = _picture(_smallest_three(gaussians["quaternions"]), width)
     meta["quats"] = {"files": ["quats.webp"]}
-    opacity = _bytes(torch.sigmoid(rows["opacity_logits"].reshape(-1, 1)))
-    meta["sh0"] = _coded("sh0.webp", rows["sh_dc"].reshape(-1, 3), opacity, width, pictures)
-    meta["shN"] = _harmonics(rows["sh_rest"], width, pictures)
+    opacity = _bytes(torch.sigmoid(gaussians["opacity_logits"].reshape(-1, 1)))
+    meta["sh0"] = _coded("sh0.webp", gaussians["sh_dc"].reshape(-1, 3), opacity, width, pictures)
+    meta["shN"] = _harmonics(gaussians["sh_rest"], width, pictures)
     with atomic(path) as temporary, zipfile.ZipFile(temporary, "w") as file:
         _store(file, "meta.json", json.dumps(meta).encode())
         for name, pixels in pictures.items():
@@ -133,11 +133,11 @@ def _harmonics(rest: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[st
     size = min(LARGEST_PALETTE, count, 1024 * 2 ** max(0, int(math.log2(max(count, 1024) / 1024))))
     labels, palette = _clusters(rest.flatten(1), size)
     codes, book = _codebook(palette)
-    rows = math.ceil(size / PALETTE_ROW)
-    pixels = np.zeros((rows * PALETTE_ROW, coefficients, 3), dtype=np.uint8)
+    gaussians = math.ceil(size / PALETTE_ROW)
+    pixels = np.zeros((gaussians * PALETTE_ROW, coefficients, 3), dtype=np.uint8)
     pixels[:size] = codes.reshape(size, coefficients, 3).numpy()
     files = ["shN_centroids.webp", "shN_labels.webp"]
-    pictures[files[0]] = pixels.reshape(rows, PALETTE_ROW * coefficients, 3)
+    pictures[files[0]] = pixels.reshape(gaussians, PALETTE_ROW * coefficients, 3)
     split = torch.stack((labels & 255, labels >> 8, torch.zeros_like(labels)), dim=1)
     pictures[files[1]] = _picture(split, width)
     return {
@@ -166,7 +166,7 @@ def _nearest(points: Tensor, means: Tensor) -> Tensor:
 
 
 def _morton_order(means: Tensor) -> Tensor:
-    """Indices that put neighbours in space side by side, so that the pictures compress."""
+    """Indices that put neighbors in space side by side, so that the pictures compress."""
     ranks = means.argsort(dim=0).argsort(
         dim=0
     )  # ranks, not places: far Gaussians would squeeze all others into one cell

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import torch
 
-from polarguide.errors import PolarguideError
-from polarguide.export.extras import needed
+from polarguide.errors import PolarguideError, optional_import
+from polarguide.files import atomic
 from polarguide.gaussians.ply import read_ply, write_ply
-from polarguide.training.run import atomic
 
 # Signs of the harmonics of degree 1 to 3, in the order of a PLY, after half a turn about x: y and z change theirs.
 _HALF_TURN_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
@@ -19,7 +18,7 @@ def write_spz(path: Path, ply: Path) -> None:
     """Convert a PLY of Gaussians; our own fields in it are left out, as the format has no place for them.
 
     SPZ is in its own axes (right, up, back), so half a turn about x from ours; readers turn it back. Positions in it
-    are multiples of 1/4096 of the world's unit; colours and scales keep 8 bits, harmonics 5 or 4.
+    are multiples of 1/4096 of the world's unit; colors and scales keep 8 bits, harmonics 5 or 4.
 
     Args:
         path: the file to write. ply: as ``write_run_ply`` writes it.
@@ -27,7 +26,7 @@ def write_spz(path: Path, ply: Path) -> None:
     Raises:
         PolarguideError: the converter is not installed, or refuses.
     """
-    converter = needed("gaussforge", "--format spz").GaussForge()
+    converter = optional_import("gaussforge", "--format spz").GaussForge()
     converted = converter.convert(_half_turned(ply).read_bytes(), "ply", "spz")
     if "error" in converted:
         raise PolarguideError(
@@ -42,12 +41,12 @@ def write_spz(path: Path, ply: Path) -> None:
 
 def _half_turned(ply: Path) -> Path:
     """The same Gaussians beside the file, half a turn about the world's x further."""
-    rows = read_ply(ply)
-    rows.pop("extra")
-    rows["means"] = rows["means"] * torch.tensor([1.0, -1.0, -1.0])
+    gaussians = read_ply(ply)
+    gaussians.pop("extra")
+    gaussians["means"] = gaussians["means"] * torch.tensor([1.0, -1.0, -1.0])
     # Half a turn of the world and of each Gaussian's own axes, which does not change its shape.
-    rows["quaternions"] = rows["quaternions"] * torch.tensor([1.0, 1.0, -1.0, -1.0])
-    rows["sh_rest"] = rows["sh_rest"] * torch.tensor(_HALF_TURN_HARMONICS)[None, :, None]
+    gaussians["quaternions"] = gaussians["quaternions"] * torch.tensor([1.0, 1.0, -1.0, -1.0])
+    gaussians["sh_rest"] = gaussians["sh_rest"] * torch.tensor(_HALF_TURN_HARMONICS)[None, :, None]
     turned = ply.with_name("turned.ply")
-    write_ply(turned, **rows)
+    write_ply(turned, **gaussians)
     return turned

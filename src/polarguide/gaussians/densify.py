@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from polarguide.gaussians.free_space import FreeSpace
+from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import quaternions_to_rotations
-from polarguide.gaussians.rows import GaussianRows
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def _in_order(sums: Tensor) -> Tensor:
 
 @torch.no_grad()
 def densify(
-    rows: GaussianRows,
+    gaussians: Gaussians,
     statistics: DensityStatistics,
     settings: Densification,
     *,
@@ -113,35 +113,38 @@ def densify(
         generator: draws the positions of the split ones' children.
     """
     pulled = statistics.mean() >= settings.gradient
-    wide = rows["log_scales"].exp().amax(dim=1) > settings.dense_share * extent
-    room = max(0, limit - len(rows))
+    wide = gaussians["log_scales"].exp().amax(dim=1) > settings.dense_share * extent
+    room = max(0, limit - len(gaussians))
     if int(pulled.sum()) > room:
         strongest = statistics.mean().argsort(descending=True, stable=True)[:room]
         pulled = torch.zeros_like(pulled)
         pulled[strongest] = True
     clone, split = pulled & ~wide, pulled & wide
-    children = _children(rows, split, generator)
-    clones = {name: rows[name].detach()[clone] for name in rows.names}
-    rows.append({name: torch.cat((clones[name], children[name])) for name in rows.names})
-    added = len(rows) - len(split)
-    rows.keep(torch.cat((~split, split.new_ones(added))))
-    opacity = torch.sigmoid(rows["opacity_logits"])
+    children = _children(gaussians, split, generator)
+    clones = {name: gaussians[name].detach()[clone] for name in gaussians.names}
+    gaussians.append({name: torch.cat((clones[name], children[name])) for name in gaussians.names})
+    added = len(gaussians) - len(split)
+    gaussians.keep(torch.cat((~split, split.new_ones(added))))
+    opacity = torch.sigmoid(gaussians["opacity_logits"])
     doomed = opacity < settings.minimum_opacity
     if empty is not None:
-        doomed |= empty.holds(rows["means"].detach())
+        doomed |= empty.holds(gaussians["means"].detach())
     if prune_large:
-        distance = (rows["means"] - middle).norm(dim=1)
+        distance = (gaussians["means"] - middle).norm(dim=1)
         allowed = settings.maximum_scale_share * distance.clamp(min=extent)
-        doomed |= rows["log_scales"].exp().amax(dim=1) > allowed
+        doomed |= gaussians["log_scales"].exp().amax(dim=1) > allowed
     if bool(doomed.all()):
         doomed[opacity.argmax()] = False
-    rows.keep(~doomed)
-    statistics.clear(len(rows))
+    gaussians.keep(~doomed)
+    statistics.clear(len(gaussians))
 
 
-def _children(rows: GaussianRows, split: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+def _children(gaussians: Gaussians, split: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
     """Two children for each split Gaussian: drawn from it, 1.6 times smaller."""
-    values = {name: rows[name].detach()[split].repeat(2, *[1] * (rows[name].ndim - 1)) for name in rows.names}
+    values = {
+        name: gaussians[name].detach()[split].repeat(2, *[1] * (gaussians[name].ndim - 1))
+        for name in gaussians.names
+    }
     # Drawn on the CPU, so that every device gets the same children.
     drawn = torch.randn(values["means"].shape, generator=generator).to(values["means"].device)
     offsets = drawn * values["log_scales"].exp()

@@ -24,29 +24,29 @@ class FreeSpace:
     """Balls about the cameras.
 
     Attributes:
-        centres: [V, 3]. radii: [V], 0 for a camera that sees no point.
+        centers: [V, 3]. radii: [V], 0 for a camera that sees no point.
     """
 
-    centres: Tensor
+    centers: Tensor
     radii: Tensor
 
     def to(self, device: torch.device) -> FreeSpace:
         """The same on a device."""
-        return FreeSpace(self.centres.to(device), self.radii.to(device))
+        return FreeSpace(self.centers.to(device), self.radii.to(device))
 
     def holds(self, means: Tensor) -> Tensor:
         """Which of the positions [N, 3] lie in it, [N] bool."""
-        return (torch.cdist(means, self.centres) < self.radii).any(dim=1)
+        return (torch.cdist(means, self.centers) < self.radii).any(dim=1)
 
 
 def free_space(points: Tensor, cameras: Sequence[Camera]) -> FreeSpace:
     """The space in front of the cameras that points [M, 3] leave free: see ``EMPTY_SHARE`` and ``NEAREST``."""
     radii = []
     for camera in cameras:
-        x, y, z = camera.to_camera(points.double() - camera.centre).unbind(-1)
+        x, y, z = camera.to_camera(points.double() - camera.center).unbind(-1)
         column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         depths = z[inside]
         radii.append(EMPTY_SHARE * float(torch.quantile(depths, NEAREST)) if len(depths) else 0.0)
-    centres = torch.stack([camera.centre for camera in cameras]).float()
-    return FreeSpace(centres, torch.tensor(radii))
+    centers = torch.stack([camera.center for camera in cameras]).float()
+    return FreeSpace(centers, torch.tensor(radii))

@@ -17,7 +17,7 @@ GRAZING = 0.35
 
 
 def quaternions_to_rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalised first."""
+    """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalized first."""
     w, x, y, z = normalize(quats, dim=-1, eps=1e-12).unbind(-1)
     entries = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -28,7 +28,7 @@ def quaternions_to_rotations(quats: Tensor) -> Tensor:
 
 
 def shortest_axis_normals_reference(
-    means: Tensor, quaternions: Tensor, log_scales: Tensor, centre: Tensor, outward: Tensor | None = None
+    means: Tensor, quaternions: Tensor, log_scales: Tensor, center: Tensor, outward: Tensor | None = None
 ) -> Tensor:
     """The slow twin of ``shortest_axis_normals``: plain torch, any dtype and device."""
     # Component by component: reductions over three or four, and one-hot rows, are several times slower.
@@ -51,7 +51,7 @@ def shortest_axis_normals_reference(
         dim=-1,
     )
     with torch.no_grad():
-        to_camera = centre.to(means) - means
+        to_camera = center.to(means) - means
         facing = dot(to_camera, normals)
         if outward is not None:
             side = dot(outward, normals)
@@ -69,64 +69,64 @@ class _Axes(torch.autograd.Function):
         means: Tensor,
         quaternions: Tensor,
         log_scales: Tensor,
-        centre: Tensor,
+        center: Tensor,
         outward: Tensor | None,
     ) -> Tensor:
         means, quaternions, log_scales = (t.detach().contiguous() for t in (means, quaternions, log_scales))
         outward = None if outward is None else outward.detach().contiguous()
         out = torch.empty_like(means)
-        _native.axes_forward(means, quaternions, log_scales, centre, outward, GRAZING, out)
-        ctx.save_for_backward(means, quaternions, log_scales, centre, outward)
+        _native.axes_forward(means, quaternions, log_scales, center, outward, GRAZING, out)
+        ctx.save_for_backward(means, quaternions, log_scales, center, outward)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        means, quaternions, log_scales, centre, outward = ctx.saved_tensors
+        means, quaternions, log_scales, center, outward = ctx.saved_tensors
         to_quaternions = torch.empty_like(quaternions)
         _native.axes_backward(
-            means, quaternions, log_scales, centre, outward, GRAZING, grad.contiguous(), to_quaternions
+            means, quaternions, log_scales, center, outward, GRAZING, grad.contiguous(), to_quaternions
         )
         return None, to_quaternions, None, None, None
 
 
 def shortest_axis_normals(
-    means: Tensor, quaternions: Tensor, log_scales: Tensor, centre: Tensor, outward: Tensor | None = None
+    means: Tensor, quaternions: Tensor, log_scales: Tensor, center: Tensor, outward: Tensor | None = None
 ) -> Tensor:
     """Unit normals of flat Gaussians: the axis of the smallest scale, turned outward.
 
-    Without ``outward``, outward is towards the camera. At a silhouette that turns the Gaussians just beyond it over, so
+    Without ``outward``, outward is toward the camera. At a silhouette that turns the Gaussians just beyond it over, so
     that they cancel those just before it and the blended normal leans to the camera; with it they stay as they are.
 
     Args:
-        means: [N, 3]. quaternions: [N, 4] (w, x, y, z), any length. log_scales: [N, 3]. centre: [3] camera centre.
+        means: [N, 3]. quaternions: [N, 4] (w, x, y, z), any length. log_scales: [N, 3]. center: [3] camera center.
         outward: [N, 3] direction from which each is seen, which decides at grazing angles; zero where not known.
 
     Returns:
         [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
     """
-    centre = centre.detach().to(means).contiguous()
+    center = center.detach().to(means).contiguous()
     given = (means, quaternions, log_scales) if outward is None else (means, quaternions, log_scales, outward)
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in given):
-        result: Tensor = _Axes.apply(means, quaternions, log_scales, centre, outward)
+        result: Tensor = _Axes.apply(means, quaternions, log_scales, center, outward)
         return result
-    return shortest_axis_normals_reference(means, quaternions, log_scales, centre, outward)
+    return shortest_axis_normals_reference(means, quaternions, log_scales, center, outward)
 
 
-def mirrored_directions(means: Tensor, centre: Tensor, normals: Tensor) -> Tensor:
+def mirrored_directions(means: Tensor, center: Tensor, normals: Tensor) -> Tensor:
     """Where a ray from the camera goes after reflection at each Gaussian; without gradients.
 
     Args:
-        means: [N, 3]. centre: [3] camera centre. normals: [N, 3] unit.
+        means: [N, 3]. center: [3] camera center. normals: [N, 3] unit.
 
     Returns:
-        [N, 3], unit; zero for a mean at the centre.
+        [N, 3], unit; zero for a mean at the center.
     """
     means, normals = means.detach(), normals.detach()
-    centre = centre.detach().to(means)
+    center = center.detach().to(means)
     if means.device.type == "cpu" and means.dtype == normals.dtype == torch.float32:
         out = torch.empty_like(means)
-        _native.mirrored_forward(means.contiguous(), centre.contiguous(), normals.contiguous(), out)
+        _native.mirrored_forward(means.contiguous(), center.contiguous(), normals.contiguous(), out)
         return out
-    rays = unit(means - centre, 1e-12)
+    rays = unit(means - center, 1e-12)
     return rays - 2 * dot(rays, normals)[..., None] * normals

@@ -1,7 +1,7 @@
 """PLY files of Gaussians as the 3DGS release writes them, so that ordinary viewers open them.
 
 One ``vertex`` per Gaussian, float32 binary little-endian: position, normal (zero, as in the release),
-spherical harmonics of the display colour, opacity (logit), scales (log), rotation (w, x, y, z). Our own
+spherical harmonics of the display color, opacity (logit), scales (log), rotation (w, x, y, z). Our own
 fields follow in the same vertex. Viewers that read fields by name ignore them; the SIBR viewer of the release
 reads records of a fixed size and opens only files without extra fields.
 """
@@ -23,8 +23,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from torch import Tensor
 
 from polarguide.errors import PolarguideError
-
-from .spherical_harmonics import sh_basis
+from polarguide.gaussians.harmonics import sh_basis
 
 REST_COUNT = 15
 DIRECTIONS = 64
@@ -60,7 +59,7 @@ def write_ply(
         log_scales: [N, 3] natural logarithms of the standard deviations.
         quaternions: [N, 4] rotations (w, x, y, z).
         opacity_logits: [N] or [N, 1].
-        sh_dc, sh_rest: [N, 1, 3] and [N, 15, 3] harmonics of the display (sRGB-encoded) colour minus 0.5.
+        sh_dc, sh_rest: [N, 1, 3] and [N, 15, 3] harmonics of the display (sRGB-encoded) color minus 0.5.
         extra: further floating-point tensors [N, ...] by name (letters, digits, underscores). A tensor [N]
             becomes the field ``name``; one [N, ..., C] the fields ``name_0`` and so on, last axis slowest
             (channel-major, as ``f_rest``). A header comment keeps its shape.
@@ -154,16 +153,16 @@ def read_ply(path: str | Path) -> dict[str, Any]:
 
 
 def refit_sh_to_display(
-    colour_fn: Callable[[Tensor], Tensor], count: int, degree: int = 3
+    color_fn: Callable[[Tensor], Tensor], count: int, degree: int = 3
 ) -> tuple[Tensor, Tensor]:
-    """Spherical harmonics of display colours, ``colour = 0.5 + sum``, by least squares for each Gaussian.
+    """Spherical harmonics of display colors, ``color = 0.5 + sum``, by least squares for each Gaussian.
 
-    The colours are sampled in directions spread evenly over the sphere, a few at a time, so that memory stays
+    The colors are sampled in directions spread evenly over the sphere, a few at a time, so that memory stays
     near that of the result.
 
     Args:
-        colour_fn: maps directions [K, 3] (unit, from the camera to the Gaussian, as harmonics take them) to
-            sRGB-encoded colours [count, K, 3].
+        color_fn: maps directions [K, 3] (unit, from the camera to the Gaussian, as harmonics take them) to
+            sRGB-encoded colors [count, K, 3].
         count: number of Gaussians.
         degree: 0 to 3.
 
@@ -171,7 +170,7 @@ def refit_sh_to_display(
         dc [count, 1, 3] and rest [count, 15, 3] float32, zero beyond ``degree``.
 
     Raises:
-        ValueError: ``colour_fn`` returns another shape.
+        ValueError: ``color_fn`` returns another shape.
     """
     directions = fibonacci_sphere(DIRECTIONS)
     basis = sh_basis(directions, degree)
@@ -181,11 +180,11 @@ def refit_sh_to_display(
     for begin in range(0, DIRECTIONS, step):
         chunk = slice(begin, min(begin + step, DIRECTIONS))
         some = directions[chunk].to(torch.float32)
-        colours = colour_fn(some).detach().to("cpu", torch.float32)
-        if colours.shape != (count, len(some), 3):
-            raise ValueError(f"colours: expected {[count, len(some), 3]}, found {list(colours.shape)}")
+        colors = color_fn(some).detach().to("cpu", torch.float32)
+        if colors.shape != (count, len(some), 3):
+            raise ValueError(f"colors: expected {[count, len(some), 3]}, found {list(colors.shape)}")
         fitted[:, : solve.shape[0]] += torch.einsum(
-            "dk,nkc->ndc", solve[:, chunk].to(torch.float32), colours - 0.5
+            "dk,nkc->ndc", solve[:, chunk].to(torch.float32), colors - 0.5
         )
     return fitted[:, :1].clone(), fitted[:, 1:].clone()
 

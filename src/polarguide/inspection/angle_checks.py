@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.inspection.odds import Evidence, Odds, combined, odds
+from polarguide.inspection.likelihood import Evidence, Odds, combined, odds
 from polarguide.inspection.orders import IDENTITY, ORDERS, PAIRINGS, FileOrder, Order, swaps
 from polarguide.inspection.verdict import Check, Verdict
 

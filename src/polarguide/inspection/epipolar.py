@@ -1,4 +1,4 @@
-"""Epipolar errors of feature matches between neighbouring views: what the pictures say of the poses."""
+"""Epipolar errors of feature matches between neighboring views: what the pictures say of the poses."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class PairError:
 
 
 def epipolar_errors(capture: Capture) -> list[PairError]:
-    """Match every posed view with its nearest neighbours by direction and place."""
+    """Match every posed view with its nearest neighbors by direction and place."""
     views = capture.posed
     features = [_features(view) for view in views]
-    pairs = _neighbour_pairs([view.camera for view in views if view.camera is not None])
+    pairs = _neighbor_pairs([view.camera for view in views if view.camera is not None])
     found = []
     for i, j in pairs:
         error = _pair_error(views[i], views[j], features[i], features[j], capture.factor)
@@ -44,7 +44,7 @@ def epipolar_errors(capture: Capture) -> list[PairError]:
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
-    """Each view's error: the lower quartile over its pairs, so that one bad view does not spoil its neighbours."""
+    """Each view's error: the lower quartile over its pairs, so that one bad view does not spoil its neighbors."""
     by_view: dict[str, list[float]] = {}
     for pair in errors:
         for name in (pair.first, pair.second):
@@ -53,23 +53,23 @@ def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
 
 
 def _features(view: Pictures) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
-    grey = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
-    top = max(float(np.percentile(grey, 99.5)), 1.0)
-    shown = (255 * np.clip(grey / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    gray = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
+    top = max(float(np.percentile(gray, 99.5)), 1.0)
+    shown = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
     keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(  # type: ignore[attr-defined]
         shown, None
     )
-    # OpenCV counts pixel centres from 0.
+    # OpenCV counts pixel centers from 0.
     places = np.array([point.pt for point in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     return places, None if descriptors is None else np.sqrt(
         descriptors / (descriptors.sum(1, keepdims=True) + 1e-9)
     )
 
 
-def _neighbour_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    centres = np.stack([camera.centre.numpy() for camera in cameras])
+def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    centers = np.stack([camera.center.numpy() for camera in cameras])
     axes = np.stack([camera.rotation[2].numpy() for camera in cameras])
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     apart = apart / max(float(np.median(apart)), 1e-12) + 2 * (1 - axes @ axes.T)
     np.fill_diagonal(apart, np.inf)
     near = np.argsort(apart, axis=1)[:, : min(NEIGHBOURS, len(cameras) - 1)]

@@ -13,16 +13,17 @@ import numpy as np
 
 from polarguide import __version__
 from polarguide.capture.calibration import Calibration, oriented
+from polarguide.capture.formats.pictures import read_file
 from polarguide.capture.layout import contents
-from polarguide.capture.pictures import read_file
-from polarguide.capture.prepare.folder import encoded, guarded, picture_codes, write_whole
-from polarguide.capture.sidecars import parse_json
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
+from polarguide.capture.write import encoded_png, picture_codes
 from polarguide.errors import PolarguideError
+from polarguide.files import guarded, write_whole
 from polarguide.inspection.angle_checks import Angles
 from polarguide.inspection.orders import FileOrder, swaps
 from polarguide.inspection.pictures import Capture
+from polarguide.records import parse_json
 
 SIDES = ("sparse", "masks", "invalid", "gt", "split.json")
 """What is copied as it is, beside the pictures."""
@@ -125,11 +126,11 @@ def _turn_view(capture: Capture, change: Calibration, folder: Path, view: str) -
     lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
     turned = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
     for angle, codes in zip(ANGLES, picture_codes(turned, lost), strict=True):
-        write_whole(folder / "polar" / f"{view}_{angle:03d}.png", encoded(codes[..., ::-1]))
+        write_whole(folder / "polar" / f"{view}_{angle:03d}.png", encoded_png(codes[..., ::-1]))
     (folder / "invalid").mkdir(exist_ok=True)
     for old in (folder / "invalid").glob(f"{view}.*"):
         old.unlink()
-    write_whole(folder / "invalid" / f"{view}.png", encoded(lost.astype(np.uint8) * 255))
+    write_whole(folder / "invalid" / f"{view}.png", encoded_png(lost.astype(np.uint8) * 255))
 
 
 def _sidecar(capture: Capture, change: Calibration) -> bytes:

@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.evaluation import figures
-from polarguide.evaluation.embedded import data_uri
-from polarguide.evaluation.figures import Picture
 from polarguide.inspection.pictures import Pictures
 from polarguide.inspection.readings import Readings
+from polarguide.visualization import figures
+from polarguide.visualization.embedded import data_uri
+from polarguide.visualization.figures import Picture
 
 SIDE = 240
 """Longest side of the pictures in pixels."""
 DOLP_HIGH, NOISE_HIGH, EXCESS_HIGH = 0.5, 0.05, 0.1
 AOLP_FULL_DOLP = 0.1
 """DoLP from which on the AoLP is shown at full brightness."""
-SATURATED_COLOUR, INVALID_COLOUR = (255, 40, 40), (60, 120, 255)
+SATURATED_COLOR, INVALID_COLOR = (255, 40, 40), (60, 120, 255)
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Layer:
     """One kind of picture.
 
     Attributes:
-        key, label: its name. legend: what its colours say. ramp: colour map of the legend's bar, or None.
+        key, label: its name. legend: what its colors say. ramp: color map of the legend's bar, or None.
         caption: the line beneath a view.
     """
 
@@ -44,7 +44,7 @@ LAYERS: tuple[Layer, ...] = (
     Layer("s0", "S0", "Photograph S0/2, brightened to the view's 99th percentile, sRGB.", None,
           lambda r: f"99 % under {r.bright:.2f}"),
     Layer("dolp", "DoLP", f"0 to {DOLP_HIGH:g}", "inferno", lambda r: f"median {r.dolp[0]:.3f}, 99 % {r.dolp[1]:.2f}"),
-    Layer("aolp", "AoLP", f"Direction of the field, by colour; dark where the DoLP is under {AOLP_FULL_DOLP:g}.", None,
+    Layer("aolp", "AoLP", f"Direction of the field, by color; dark where the DoLP is under {AOLP_FULL_DOLP:g}.", None,
           lambda r: f"{r.polarized:.0%} polarized"),
     Layer("saturation", "Saturation", "Red: an angle at full scale, or all black. Blue: declared invalid.", None,
           lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
@@ -58,30 +58,30 @@ LAYERS: tuple[Layer, ...] = (
 def layer_uris(view: Pictures) -> dict[str, str]:
     """All layers of a view by key."""
     intensities = view.intensities()
-    grey = intensities.mean(dim=-1)
-    stokes = optics.stokes(grey)
+    gray = intensities.mean(dim=-1)
+    stokes = optics.stokes(gray)
     s0, degree = stokes[0].clamp(min=1e-6), optics.dolp(stokes)
     photograph = intensities.mean(dim=0)
     step = max(1, photograph.numel() // 200_000)
     top = float(torch.quantile(photograph.flatten()[::step], 0.99))
     shown = figures.radiance_to_rgb(photograph / max(top, 1e-6))
-    excess = (grey[0] + grey[2] - grey[1] - grey[3]).abs() / s0
+    excess = (gray[0] + gray[2] - gray[1] - gray[3]).abs() / s0
     pictures: dict[str, Picture] = {
         "s0": shown,
         "dolp": figures.dolp_to_rgb(degree, DOLP_HIGH),
         "aolp": figures.aolp_to_rgb(optics.aolp(stokes), degree / AOLP_FULL_DOLP),
         "saturation": _marked(shown, view),
-        "noise": figures.scalar_to_rgb(optics.intensity_noise(grey) / (s0 / 2), 0.0, NOISE_HIGH),
+        "noise": figures.scalar_to_rgb(optics.intensity_noise(gray) / (s0 / 2), 0.0, NOISE_HIGH),
         "consistency": figures.scalar_to_rgb(excess, 0.0, EXCESS_HIGH, "magma"),
     }
     return {key: data_uri(picture, key, SIDE) for key, picture in pictures.items()}
 
 
 def _marked(shown: Picture, view: Pictures) -> Picture:
-    """The photograph in dim grey with its lost pixels in colour."""
+    """The photograph in dim gray with its lost pixels in color."""
     dim = (shown.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
-    for mask, colour in ((view.saturated, SATURATED_COLOUR), (view.invalid, INVALID_COLOUR)):
-        dim[_grown(mask).numpy()] = colour
+    for mask, color in ((view.saturated, SATURATED_COLOR), (view.invalid, INVALID_COLOR)):
+        dim[_grown(mask).numpy()] = color
     return dim
 
 

@@ -10,14 +10,13 @@ from string import Template
 
 import torch
 
-from polarguide.evaluation import figures
-from polarguide.evaluation.report import colour_gradient
 from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.layers import LAYERS, layer_uris
 from polarguide.inspection.orders import ORDERS, PAIRINGS
 from polarguide.inspection.readings import Readings
-from polarguide.inspection.run import Inspection
 from polarguide.inspection.verdict import Check, Verdict
+from polarguide.visualization import figures
 
 FILE = "inspection.html"
 _CLASSES: dict[Verdict, str] = {"ok": "ok", "look": "look", "wrong": "wrong", "n/a": "na"}
@@ -119,7 +118,8 @@ def _legends() -> str:
     for layer in LAYERS:
         bar = ""
         if layer.ramp is not None:
-            bar = f'<span class="ramp" style="background:linear-gradient(90deg,{colour_gradient(layer.ramp)})"></span>'
+            stops = figures.color_gradient(layer.ramp)
+            bar = f'<span class="ramp" style="background:linear-gradient(90deg,{stops})"></span>'
         elif layer.key == "aolp":
             bar = aolp_wheel()
         parts.append(f'<p class="legend {layer.key}">{bar}{html.escape(layer.legend)}</p>')
@@ -127,12 +127,12 @@ def _legends() -> str:
 
 
 def aolp_wheel() -> str:
-    """The colours of the AoLP as half a disc, 0 to the right, counter-clockwise, as an SVG drawing."""
+    """The colors of the AoLP as half a disc, 0 to the right, counter-clockwise, as an SVG drawing."""
     count, cx, cy, radius = 36, 66.0, 58.0, 40.0
     angles = (torch.arange(count, dtype=torch.float64) + 0.5) * math.pi / count
-    colours = figures.aolp_to_rgb(angles[None])[0].tolist()
+    colors = figures.aolp_to_rgb(angles[None])[0].tolist()
     wedges = []
-    for k, (r, g, b) in enumerate(colours):
+    for k, (r, g, b) in enumerate(colors):
         (x1, y1), (x2, y2) = (
             (cx + radius * math.cos(a), cy - radius * math.sin(a))
             for a in (k * math.pi / count, (k + 1.15 if k < count - 1 else k + 1) * math.pi / count)
@@ -144,7 +144,7 @@ def aolp_wheel() -> str:
         for a in (0, 45, 90, 135, 180)
     )
     drawing = "".join(wedges) + texts
-    return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by colour">{drawing}</svg>'
+    return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by color">{drawing}</svg>'
 
 
 def _tile(uris: dict[str, str], reading: Readings, marked: bool) -> str:

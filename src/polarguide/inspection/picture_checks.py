@@ -104,7 +104,7 @@ def _exposure(readings: Sequence[Readings], pairing: int | None) -> Check:
     ratio = float(np.median([r.pair_ratio for r in known]))
     off = tuple(r.view for r in known if abs((r.pair_ratio or ratio) - ratio) > UNSTEADY)
     figures = {"pair_ratio": ratio, "unsteady_views": len(off)}
-    said = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analysers have 1."
+    said = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analyzers have 1."
     verdict: Verdict = "ok"
     remedy = ""
     if abs(ratio - 1) > UNEQUAL:

@@ -16,13 +16,14 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import checks
-from polarguide.capture.colmap import ColmapModel, fit_camera, read_model
+from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model
+from polarguide.capture.formats.pictures import TRANSFERS, decode_picture, read_file
 from polarguide.capture.layout import Layout, find_layout, select_views
-from polarguide.capture.pictures import TRANSFERS, decode_picture, read_file
-from polarguide.capture.sidecars import parse_json, refractive_index_of
+from polarguide.capture.metadata import refractive_index_of
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.errors import PolarguideError
+from polarguide.records import parse_json
 
 LONGEST = 640
 """Pixels of the longer side that pictures are averaged down to (by whole factors)."""

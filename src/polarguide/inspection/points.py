@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from polarguide import optics
-from polarguide.capture.colmap import ColmapModel
+from polarguide.capture.colmap.model import ColmapModel
 from polarguide.inspection.clusters import cells, cluster_sums
-from polarguide.inspection.odds import DEGREES, Evidence
+from polarguide.inspection.likelihood import DEGREES, Evidence
 from polarguide.inspection.orders import PAIRINGS, SENSES
 from polarguide.inspection.pictures import Pictures
 from polarguide.inspection.surfaces import Pixels
@@ -106,7 +106,7 @@ def _sightings(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fields in the world and the axes across them, [2, P, V, 2, 3]; weights [P, V]; DoLP and its noise [P, V, 2]."""
     limit = float(optics.diffuse_dolp_limit(index))
-    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES_DEG]
+    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
     fields = torch.zeros(len(SENSES), len(points), len(views), 2, 3)
     weights = torch.zeros(len(points), len(views))
     degrees = torch.zeros(len(points), len(views), 2)
@@ -118,9 +118,9 @@ def _sightings(
         u = (camera.fx * local[:, 0] / depth + camera.cx) / camera.width
         v = (camera.fy * local[:, 1] / depth + camera.cy) / camera.height
         inside = (local[:, 2] > 1e-9) & (torch.minimum(u, v) > 0.01) & (torch.maximum(u, v) < 0.99)
-        grey = view.intensities().mean(dim=-1)[order]
-        noise = optics.intensity_noise(grey)
-        planes = torch.cat((optics.stokes(grey), noise[None], (~view.usable).float()[None]))
+        gray = view.intensities().mean(dim=-1)[order]
+        noise = optics.intensity_noise(gray)
+        planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
         grid = torch.stack((2 * u - 1, 2 * v - 1), dim=-1).float()[None, None]
         sampled = grid_sample(planes[None], grid, align_corners=False)[0, :, 0]
         stokes, degree = sampled[:3], optics.dolp(sampled[:3])

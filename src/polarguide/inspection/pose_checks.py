@@ -34,7 +34,7 @@ def pose_check(capture: Capture) -> Check:
     if len(errors) < 3:
         return Check(
             key, title, "n/a" if not missing else "look",
-            f"Too few features match between neighbouring views to judge the poses. {len(missing)} views have none.",
+            f"Too few features match between neighboring views to judge the poses. {len(missing)} views have none.",
             "Structure from motion needs texture that stays put." if missing else "", missing,
             {"views": {}, "without_pose": len(missing)},
         )  # fmt: skip
@@ -64,10 +64,10 @@ def coverage_check(capture: Capture) -> Check:
     cameras = [view.camera for view in capture.posed if view.camera is not None]
     if len(cameras) < 2:
         return Check(key, title, "n/a", "Fewer than two views have a pose.")
-    centres = np.stack([camera.centre.numpy() for camera in cameras])
+    centers = np.stack([camera.center.numpy() for camera in cameras])
     axes = np.stack([camera.rotation[2].numpy() for camera in cameras])
-    focus = _nearest_to_axes(centres, axes)
-    seen = centres - focus
+    focus = _nearest_to_axes(centers, axes)
+    seen = centers - focus
     seen = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     angles = np.degrees(np.arccos(np.clip(seen @ seen.T, -1, 1))) + 360 * np.eye(len(seen))
     nearest = angles.min(axis=1)
@@ -82,16 +82,16 @@ def coverage_check(capture: Capture) -> Check:
     if lonely or len(seen) < FEW_VIEWS:
         return Check(
             key, title, "look", said,
-            "Reconstruction is unsure across gaps: add views, neighbours 15 degrees or less apart.", lonely, figures,
+            "Reconstruction is unsure across gaps: add views, neighbors 15 degrees or less apart.", lonely, figures,
         )  # fmt: skip
     return Check(key, title, "ok", said, figures=figures)
 
 
-def _nearest_to_axes(centres: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nearest_to_axes(centers: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
     """The place nearest to all optical axes (least squares)."""
     across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
     return np.asarray(
-        np.linalg.lstsq(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0], rcond=None)[0]
+        np.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)[:, 0], rcond=None)[0]
     )
 
 

@@ -27,7 +27,7 @@ class Readings:
         bright: 99th percentile of the intensities, in [0, 1].
         saturated, invalid, dark: shares of pixels with an angle at full scale (or black in all), declared invalid by
             the capture, and darker than 1/256.
-        noise: median standard deviation of the noise of one intensity (mean over the colours), after averaging down.
+        noise: median standard deviation of the noise of one intensity (mean over the colors), after averaging down.
         noise_share: the same, as a share of S0 / 2.
         pair_ratio: median of (I0 + I90) / (I45 + I135); None where too little is bright enough.
         sum_error: median of |I0 + I90 - I45 - I135| / S0.
@@ -61,12 +61,12 @@ def read_view_figures(view: Pictures, index: float) -> Readings:
         view: its pictures.
         index: refractive index.
     """
-    grey = view.intensities().mean(dim=-1)
-    stokes = optics.stokes(grey)
-    dark = grey.mean(dim=0) < DARK
+    gray = view.intensities().mean(dim=-1)
+    stokes = optics.stokes(gray)
+    dark = gray.mean(dim=0) < DARK
     good = view.usable & ~dark
     share = float(good.float().mean())
-    noise = optics.intensity_noise(grey)
+    noise = optics.intensity_noise(gray)
     bright = _quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
     saturated, invalid = (float(mask.float().mean()) for mask in (view.saturated, view.invalid))
     nothing = Readings(
@@ -85,7 +85,7 @@ def read_view_figures(view: Pictures, index: float) -> Readings:
     )
     if share < 0.001:
         return nothing
-    i0, i45, i90, i135 = (angle[good] for angle in grey)
+    i0, i45, i90, i135 = (angle[good] for angle in gray)
     s0 = stokes[0][good]
     degree, spread = optics.dolp(stokes)[good], optics.dolp_noise(stokes, noise)[good]
     limit = float(optics.diffuse_dolp_limit(index))

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from polarguide import __version__
-from polarguide.inspection.run import Inspection
+from polarguide.files import atomic
+from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.verdict import plain
-from polarguide.training.run import atomic
 
 SCHEMA = 1
 """Raised whenever a key changes its meaning or goes away; new keys do not raise it."""

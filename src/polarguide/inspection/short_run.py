@@ -15,13 +15,14 @@ import torch
 
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
+from polarguide.files import atomic
 from polarguide.inspection.surfaces import Surface
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
-from polarguide.shading.render import render
-from polarguide.training.consistency import depth_normals
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
+from polarguide.shading.deferred import render
+from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
-from polarguide.training.run import CHECKPOINT, atomic, load_checkpoint, save_checkpoint
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import StepReport, Trainer, TrainSettings
 from polarguide.vectors import dot, unit
@@ -60,8 +61,8 @@ def short_run(
     Args:
         scene: at the size to train at.
         folder: where its state is kept; one of another scene or length is replaced.
-        steps: optimiser steps.
-        backend: device and rasteriser.
+        steps: optimizer steps.
+        backend: device and rasterizer.
         on_step: called after every step.
     """
     recipe = recipe_named(RECIPE)
@@ -95,7 +96,7 @@ def _same(folder: Path, wanted: dict[str, object]) -> bool:
 @torch.no_grad()
 def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
     """What the trained Gaussians say of the surface in one view, on the CPU, where pictures are compared with it."""
-    result = render(state.rows, view.camera, backend.rasterise, sh_degree=0, normals=True, depth=True)
+    result = render(state.gaussians, view.camera, backend.rasterize, sh_degree=0, normals=True, depth=True)
     result = result.to("cpu")
     if result.normal is None or result.depth is None:
         raise PolarguideError(

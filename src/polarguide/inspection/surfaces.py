@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.inspection.clusters import cells, cluster_sums
-from polarguide.inspection.odds import DEGREES, Evidence
+from polarguide.inspection.likelihood import DEGREES, Evidence
 from polarguide.inspection.orders import PAIRINGS, SENSES
 from polarguide.inspection.pictures import Pictures
 
@@ -82,14 +82,14 @@ def surface_pixels(pairs: Iterable[tuple[Pictures, Surface]], pairing: int = 0, 
         pairing: which pictures are perpendicular, a position in ``PAIRINGS``.
         seed: of the choice of pixels.
     """
-    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES_DEG]
+    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
     generator = torch.Generator().manual_seed(seed)
     found: list[Tensor] = []
     for view, surface in pairs:
         size = surface.known.shape
-        grey = view.intensities().mean(dim=-1)[order]
-        noise = optics.intensity_noise(grey)
-        planes = torch.cat((optics.stokes(grey), noise[None], (~view.usable).float()[None]))
+        gray = view.intensities().mean(dim=-1)[order]
+        noise = optics.intensity_noise(gray)
+        planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
         planes = interpolate(planes[None], size=size, mode="area")[0]
         stokes, degree = planes[:3], optics.dolp(planes[:3])
         spread = optics.dolp_noise(stokes, planes[3])
@@ -100,7 +100,7 @@ def surface_pixels(pairs: Iterable[tuple[Pictures, Surface]], pairing: int = 0, 
         chosen = good.flatten().nonzero()[:, 0]
         chosen = chosen[torch.randperm(len(chosen), generator=generator)[:SAMPLES]]
         place = surface.camera.to_world(rays / rays[..., 2:] * surface.depth[..., None])
-        place = place + surface.camera.centre.float()
+        place = place + surface.camera.center.float()
         rows = (optics.aolp(stokes), degree, spread, optics.azimuth(surface.normal, rays), zenith)
         flat = torch.stack([*(row.flatten() for row in rows), *place.reshape(-1, 3).unbind(-1)])
         found.append(flat[:, chosen])

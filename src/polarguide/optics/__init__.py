@@ -4,9 +4,9 @@ They are differentiable, and value and gradient stay finite at every degenerate 
 polarization, normal and grazing incidence).
 """
 
-from .chromatic import ChromaticNormals, chromatic_normals
-from .frames import azimuth, lens_frame, normal_from_angles, zenith
-from .fresnel import (
+from polarguide.optics.chromatic import ChromaticNormals, chromatic_normals
+from polarguide.optics.frames import azimuth, lens_frame, normal_from_angles, zenith
+from polarguide.optics.fresnel import (
     brewster,
     diffuse_dolp,
     diffuse_dolp_limit,
@@ -18,7 +18,7 @@ from .fresnel import (
     specular_zeniths,
     transmittances,
 )
-from .normals import (
+from polarguide.optics.normals import (
     Candidates,
     Disambiguated,
     PhysicalCandidates,
@@ -29,17 +29,17 @@ from .normals import (
     physical_candidates,
     polarization_mask,
 )
-from .separation import (
+from polarguide.optics.separation import (
     Separation,
     exact_separation,
     paper_intensities,
     paper_separation,
     predicted_stokes,
 )
-from .stokes import ANGLES_DEG, aolp, dolp, intensity, luminance, photograph, stokes
+from polarguide.optics.stokes import ANGLES, aolp, dolp, intensity, luminance, photograph, stokes
 
 __all__ = [
-    "ANGLES_DEG",
+    "ANGLES",
     "Candidates",
     "ChromaticNormals",
     "Disambiguated",

@@ -2,7 +2,7 @@
 
 Polarization is full of them: the angle of an unpolarized pixel, the azimuth of a normal that looks at the
 camera, the square root in a zenith at zero degree of polarization. At such a point the value is the limit (or
-zero where there is none) and the gradient is zero, so that one pixel cannot poison a whole optimisation step.
+zero where there is none) and the gradient is zero, so that one pixel cannot poison a whole optimization step.
 """
 
 from __future__ import annotations

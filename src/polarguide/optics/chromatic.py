@@ -1,9 +1,9 @@
-"""Normals from the polarization of colour differences.
+"""Normals from the polarization of color differences.
 
-Light reflected at a dielectric surface has nearly the colour of what it reflects; light from below has the
-colour of the body. Between the colour channels of a pixel it is therefore mostly diffuse light that differs,
+Light reflected at a dielectric surface has nearly the color of what it reflects; light from below has the
+color of the body. Between the color channels of a pixel it is therefore mostly diffuse light that differs,
 and how polarization differs with it shows the diffuse lobe alone, however much specular light lies over it
-(the two colours of Nayar, Fang and Boult 1997, "Separation of reflection components using color and
+(the two colors of Nayar, Fang and Boult 1997, "Separation of reflection components using color and
 polarization", with the diffuse light's own polarization). In a channel c of a pixel,
 
     (S1, S2)_c = (rho_s specular - rho_d diffuse_c) (cos, sin)(2 (azimuth + pi/2)),
@@ -19,20 +19,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ._guard import check_index, check_leading, safe_atan2
-from ._window import window_mean
-from .fresnel import diffuse_dolp_limit, diffuse_zenith
-from .stokes import dolp, luminance
+from polarguide.optics._guard import check_index, check_leading, safe_atan2
+from polarguide.optics._window import window_mean
+from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith
+from polarguide.optics.stokes import dolp, luminance
 
 
 class ChromaticNormals(NamedTuple):
-    """What the colour differences say.
+    """What the color differences say.
 
     Attributes:
         zenith: [H, W] radians, of the diffuse lobe whose degree of polarization is the slope's.
         azimuth: [H, W] radians in (-pi/2, pi/2], up to half a turn.
         certainty: [H, W] explained over unexplained polarization, a ratio of standard deviations; 0 where
-            there is no colour.
+            there is no color.
         decided: [H, W] bool, where diffuse light alone can explain the slope: see ``chromatic_normals``.
     """
 
@@ -51,24 +51,24 @@ def chromatic_normals(
     minimum_contrast: float = 0.05,
     pure_lobe_dolp: float = 0.05,
 ) -> ChromaticNormals:
-    """Zenith and azimuth from the slope of (S1, S2) over S0 among the colours of a small window.
+    """Zenith and azimuth from the slope of (S1, S2) over S0 among the colors of a small window.
 
-    A coloured reflection has a slope of its own, ``rho_s`` times the opposite direction. The two are told
+    A colored reflection has a slope of its own, ``rho_s`` times the opposite direction. The two are told
     apart by the mean polarization: where it points against the slope, both lobes are there, and the one that
-    differs between colours is the weaker in polarization, which body colour explains; where it points along
-    the slope, the pixel may be one coloured lobe of either kind, and is decided only if its degree of
+    differs between colors is the weaker in polarization, which body color explains; where it points along
+    the slope, the pixel may be one colored lobe of either kind, and is decided only if its degree of
     polarization is as small as diffuse light has it at most zeniths.
 
     Args:
-        stokes: [3, H, W, C] with the colours last.
+        stokes: [3, H, W, C] with the colors last.
         index: refractive index.
         window: odd side of the window in pixels; the surface should be flat over it.
         minimum_certainty: least certainty of a decided pixel.
-        minimum_contrast: least standard deviation of S0 among the colours, as a share of S0.
+        minimum_contrast: least standard deviation of S0 among the colors, as a share of S0.
         pure_lobe_dolp: largest degree of polarization where the mean points along the slope.
 
     Returns:
-        ChromaticNormals. Nothing is decided in a picture without colour.
+        ChromaticNormals. Nothing is decided in a picture without color.
 
     Raises:
         ValueError: ``stokes`` is not [3, H, W, C], ``window`` is even, or ``index`` is not above 1.
@@ -88,12 +88,12 @@ def chromatic_normals(
     degree = torch.hypot(slope1, slope2)
     explained = degree * variance.sqrt()
     unexplained = (spread - explained**2).clamp(min=0).sqrt()
-    # What rounding leaves of a picture without colour explains nothing.
-    coloured = variance.sqrt() > minimum_contrast * s0
-    certainty = torch.where(coloured, explained / unexplained.clamp(min=1e-6 * s0.abs() + least), 0.0)
+    # What rounding leaves of a picture without color explains nothing.
+    colored = variance.sqrt() > minimum_contrast * s0
+    certainty = torch.where(colored, explained / unexplained.clamp(min=1e-6 * s0.abs() + least), 0.0)
     limit = diffuse_dolp_limit(index)
     against = slope1 * s1 + slope2 * s2 < 0
-    decided = coloured & (certainty >= minimum_certainty) & (degree < 0.95 * limit)
+    decided = colored & (certainty >= minimum_certainty) & (degree < 0.95 * limit)
     decided = decided & (against | (dolp(mean) < pure_lobe_dolp))
     zenith = diffuse_zenith(degree.clamp(max=limit), index)
     return ChromaticNormals(zenith, safe_atan2(slope2, slope1) / 2, certainty, decided)

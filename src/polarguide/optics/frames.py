@@ -11,9 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from polarguide.optics._guard import safe_atan2
 from polarguide.vectors import dot
-
-from ._guard import safe_atan2
 
 
 def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from ._guard import check_index, safe_sqrt
+from polarguide.optics._guard import check_index, safe_sqrt
 
 
 def _cosine(zenith: Tensor) -> Tensor:

@@ -13,13 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide.optics._guard import check_leading, safe_normalize, safe_sqrt
+from polarguide.optics._window import window_mean
+from polarguide.optics.frames import normal_from_angles
+from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
+from polarguide.optics.stokes import aolp, dolp
 from polarguide.vectors import dot
-
-from ._guard import check_leading, safe_normalize, safe_sqrt
-from ._window import window_mean
-from .frames import normal_from_angles
-from .fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
-from .stokes import aolp, dolp
 
 
 class Candidates(NamedTuple):
@@ -178,7 +177,7 @@ def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
     Args:
         stokes: [3, ...].
         noise_sigma: of one of the four intensities in the units of ``stokes``, a number or [...]. For the
-            mean over three colours with independent noise, 1/sqrt(3) of one channel's.
+            mean over three colors with independent noise, 1/sqrt(3) of one channel's.
 
     Returns:
         [...]; infinite where S0 <= 0 and the noise is positive.
@@ -197,7 +196,7 @@ def intensity_noise(intensities: Tensor, window: int = 15) -> Tensor:
     that moved between the shots does, as it should.
 
     Args:
-        intensities: [4, H, W], of one channel or of the mean over the colours.
+        intensities: [4, H, W], of one channel or of the mean over the colors.
         window: odd side of the window in pixels.
 
     Returns:

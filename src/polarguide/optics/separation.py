@@ -11,11 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide.optics._guard import check_leading, safe_normalize
+from polarguide.optics.frames import lens_frame
+from polarguide.optics.fresnel import dolp_slopes, reflectances, transmittances
 from polarguide.vectors import dot
-
-from ._guard import check_leading, safe_normalize
-from .frames import lens_frame
-from .fresnel import dolp_slopes, reflectances, transmittances
 
 
 class Separation(NamedTuple):
@@ -24,7 +23,7 @@ class Separation(NamedTuple):
     Attributes:
         specular: [..., C] reflected at the surface, units of S0.
         diffuse: [..., C] from below the surface, units of S0.
-        conditioned: [...] bool, where the values can be trusted. One per pixel, without the colour axis.
+        conditioned: [...] bool, where the values can be trusted. One per pixel, without the color axis.
     """
 
     specular: Tensor
@@ -33,7 +32,7 @@ class Separation(NamedTuple):
 
 
 def _components(normals: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Components of the unit normal: towards the camera (cos(zenith)), image right, image up."""
+    """Components of the unit normal: toward the camera (cos(zenith)), image right, image up."""
     unit = safe_normalize(normals)
     x_ref, up_ref = lens_frame(rays)
     return -dot(unit, rays), dot(unit, x_ref), dot(unit, up_ref)
@@ -52,10 +51,10 @@ def exact_separation(
     Specular light is polarized perpendicular to the plane of incidence with degree rho_s, diffuse light in
     the plane with degree rho_d (Fresnel's equations). With P the part of (S1, S2) along the perpendicular,
     ``P = rho_s specular - rho_d diffuse`` and ``S0 = specular + diffuse``, so
-    ``specular = (P + rho_d S0) / (rho_s + rho_d)``, limited to [0, S0], each colour on its own.
+    ``specular = (P + rho_d S0) / (rho_s + rho_d)``, limited to [0, S0], each color on its own.
 
     Args:
-        stokes: [3, ..., C] with the colours last.
+        stokes: [3, ..., C] with the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
         index: refractive index, a number or [...].
@@ -95,7 +94,7 @@ def paper_separation(stokes: Tensor, zenith: Tensor, index: float | Tensor = 1.5
     specular layer depends on the zenith alone, and the layers do not add up to S0.
 
     Args:
-        stokes: [3, ..., C] with the colours last.
+        stokes: [3, ..., C] with the colors last.
         zenith: [...] radians.
         index: refractive index, a number or [...].
 
@@ -129,7 +128,7 @@ def paper_intensities(
     mean over the four polarizer angles is half of ``paper_separation``.
 
     Args:
-        stokes: [3, ..., C] with the colours last.
+        stokes: [3, ..., C] with the colors last.
         zenith: [...] radians.
         s_direction: [...] radians, the direction perpendicular to the plane of incidence: azimuth + pi/2.
         polarizer: radians, a number or [...].
@@ -164,7 +163,7 @@ def predicted_stokes(
     that faces away counts as grazing.
 
     Args:
-        specular, diffuse: [..., C] units of S0, the colours last.
+        specular, diffuse: [..., C] units of S0, the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
         index: refractive index, a number or [...].

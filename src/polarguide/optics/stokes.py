@@ -12,9 +12,9 @@ import math
 import torch
 from torch import Tensor
 
-from ._guard import check_leading, safe_atan2
+from polarguide.optics._guard import check_leading, safe_atan2
 
-ANGLES_DEG = (0, 45, 90, 135)
+ANGLES = (0, 45, 90, 135)
 """The polarizer angles of the four images, in degrees and in the order every function here expects."""
 
 
@@ -25,7 +25,7 @@ def stokes(intensities: Tensor) -> Tensor:
     of Malus's law).
 
     Args:
-        intensities: [4, ...] linear intensities in the order of ``ANGLES_DEG``.
+        intensities: [4, ...] linear intensities in the order of ``ANGLES``.
 
     Returns:
         [3, ...] Stokes vector, in the units of the intensities.
@@ -106,13 +106,13 @@ def photograph(stokes: Tensor) -> Tensor:
 
 
 def luminance(stokes: Tensor) -> Tensor:
-    """Stokes vector of the colour channels taken together: their plain mean.
+    """Stokes vector of the color channels taken together: their plain mean.
 
-    Angles and degrees of polarization of a colour picture are read from this mean; they are not averaged
+    Angles and degrees of polarization of a color picture are read from this mean; they are not averaged
     themselves.
 
     Args:
-        stokes: [3, ..., C] with the colours on the last axis.
+        stokes: [3, ..., C] with the colors on the last axis.
 
     Returns:
         [3, ...].

@@ -1,15 +1,15 @@
 """Splatting of Gaussians with any channels: one interface, a slow twin, and fast backends."""
 
 from polarguide.raster.backends import Backend, DeviceName, choose_backend
-from polarguide.raster.interface import Rasterise, Rasterised, ScreenStatistic
-from polarguide.raster.reference import rasterise_reference
+from polarguide.raster.interface import Rasterize, Rasterized, ScreenStatistic
+from polarguide.raster.reference import rasterize_reference
 
 __all__ = [
     "Backend",
     "DeviceName",
-    "Rasterise",
-    "Rasterised",
+    "Rasterize",
+    "Rasterized",
     "ScreenStatistic",
     "choose_backend",
-    "rasterise_reference",
+    "rasterize_reference",
 ]

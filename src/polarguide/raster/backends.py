@@ -8,18 +8,18 @@ from typing import Literal, NamedTuple
 import torch
 
 from polarguide.errors import PolarguideError
-from polarguide.raster.cpu import rasterise_cpu
-from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterise_cuda
-from polarguide.raster.interface import Rasterise
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
+from polarguide.raster.interface import Rasterize
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 class Backend(NamedTuple):
-    """A device and the rasteriser that runs on it."""
+    """A device and the rasterizer that runs on it."""
 
     device: torch.device
-    rasterise: Rasterise
+    rasterize: Rasterize
 
 
 def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = print) -> Backend:
@@ -34,10 +34,10 @@ def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str]
         PolarguideError: CUDA was asked for and there is no GPU, or gsplat or its kernels cannot be had.
     """
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
-        return Backend(torch.device("cpu"), rasterise_cpu)
+        return Backend(torch.device("cpu"), rasterize_cpu)
     if name == "auto" and not has_gsplat():
         say("there is a GPU, but the package gsplat is not installed: computing on the CPU")
-        return Backend(torch.device("cpu"), rasterise_cpu)
+        return Backend(torch.device("cpu"), rasterize_cpu)
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if local_rank >= count:
         built = torch.version.cuda or "none"
@@ -50,4 +50,4 @@ def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str]
     device = torch.device("cuda", local_rank)
     torch.cuda.set_device(device)
     load_gsplat(say)
-    return Backend(device, rasterise_cuda)
+    return Backend(device, rasterize_cuda)

@@ -13,18 +13,18 @@ from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.raster.interface import (
     NEAR_PLANE,
-    Rasterised,
+    Rasterized,
     ScreenStatistic,
     check_shapes,
     refuse_not_finite,
 )
 
 
-def native_rasteriser(camera: Camera, channels: int, statistic: ScreenStatistic | None) -> Any:
-    """A native rasteriser for one picture with ``channels`` channels, those of the statistic first."""
+def native_rasterizer(camera: Camera, channels: int, statistic: ScreenStatistic | None) -> Any:
+    """A native rasterizer for one picture with ``channels`` channels, those of the statistic first."""
     chosen = list(statistic.channels) if statistic else []
     permutation = chosen + [k for k in range(channels) if k not in chosen]
-    return _native.Rasteriser(
+    return _native.Rasterizer(
         camera.rotation.flatten().tolist(),
         camera.translation.tolist(),
         [camera.fx, camera.fy, camera.cx, camera.cy],
@@ -36,7 +36,7 @@ def native_rasteriser(camera: Camera, channels: int, statistic: ScreenStatistic 
     )
 
 
-class _Rasterise(torch.autograd.Function):
+class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
@@ -53,14 +53,14 @@ class _Rasterise(torch.autograd.Function):
             bad = _native.first_not_finite(tensor)
             if bad >= 0:
                 raise refuse_not_finite(name, bad // max(1, tensor[0].numel()))
-        rasteriser = native_rasteriser(camera, features.shape[1], statistic)
+        rasterizer = native_rasterizer(camera, features.shape[1], statistic)
         out = torch.empty(camera.height, camera.width, features.shape[1])
         alpha = torch.empty(camera.height, camera.width)
         radii = torch.empty(means.shape[0])
-        rasteriser.forward(*inputs, out, alpha, radii)
+        rasterizer.forward(*inputs, out, alpha, radii)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(*inputs, out)
-        ctx.rasteriser = rasteriser
+        ctx.rasterizer = rasterizer
         ctx.statistic = statistic
         return out, alpha, radii
 
@@ -70,7 +70,7 @@ class _Rasterise(torch.autograd.Function):
         *inputs, out = ctx.saved_tensors
         gradients = [torch.empty_like(t) for t in inputs]
         screen = torch.empty(inputs[0].shape[0], 2) if ctx.statistic else None
-        ctx.rasteriser.backward(
+        ctx.rasterizer.backward(
             *inputs, out, grad_out.contiguous(), grad_alpha.contiguous(), *gradients, screen
         )
         if ctx.statistic:
@@ -78,7 +78,7 @@ class _Rasterise(torch.autograd.Function):
         return (*gradients, None, None)
 
 
-def rasterise_cpu(
+def rasterize_cpu(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -87,16 +87,16 @@ def rasterise_cpu(
     camera: Camera,
     *,
     statistic: ScreenStatistic | None = None,
-) -> Rasterised:
+) -> Rasterized:
     """See ``polarguide.raster.interface``. CPU tensors, float32; deterministic for any number of threads."""
     check_shapes(means, quats, scales, opacities, features, statistic)
     named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
     for name, tensor in named.items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise PolarguideError(
-                f"rasterise({name})",
+                f"rasterize({name})",
                 expected="float32 on the CPU",
                 found=f"{tensor.dtype} on {tensor.device}",
                 remedy="Convert it, or use the plain-torch twin.",
             )
-    return Rasterised(*_Rasterise.apply(means, quats, scales, opacities, features, camera, statistic))
+    return Rasterized(*_Rasterize.apply(means, quats, scales, opacities, features, camera, statistic))

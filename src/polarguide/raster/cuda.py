@@ -26,7 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
-from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterised, ScreenStatistic, check_shapes
+from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterized, ScreenStatistic, check_shapes
 
 TILE = 16
 # A load that takes longer than this is compiling.
@@ -260,7 +260,7 @@ def _in_place(picture: Tensor, channels: list[int]) -> Tensor:
     return torch.stack([picture[..., channels.index(k)] for k in range(len(channels))], dim=-1)
 
 
-def rasterise_cuda(
+def rasterize_cuda(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -269,7 +269,7 @@ def rasterise_cuda(
     camera: Camera,
     *,
     statistic: ScreenStatistic | None = None,
-) -> Rasterised:
+) -> Rasterized:
     """See ``polarguide.raster.interface``, and the module for the differences. CUDA tensors, float32."""
     check_shapes(means, quats, scales, opacities, features, statistic)
     splats = _project(means, quats, scales, opacities, camera, _view(camera, means.device))
@@ -277,4 +277,4 @@ def rasterise_cuda(
         picture, alpha = _watched(splats, features, camera, statistic)
     else:
         picture, alpha = _blend(splats, features, camera)
-    return Rasterised(picture, alpha, splats.radii[0].amax(dim=-1).to(means.dtype))
+    return Rasterized(picture, alpha, splats.radii[0].amax(dim=-1).to(means.dtype))

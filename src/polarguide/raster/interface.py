@@ -1,7 +1,7 @@
-"""The narrow waist: what every rasteriser takes and gives.
+"""The narrow waist: what every rasterizer takes and gives.
 
-``rasterise(means, quats, scales, opacities, features, camera)`` splats N Gaussians with D feature channels each into
-one picture. It takes tensors, never a scene, and knows nothing of colours: base colour, normal, strength or depth
+``rasterize(means, quats, scales, opacities, features, camera)`` splats N Gaussians with D feature channels each into
+one picture. It takes tensors, never a scene, and knows nothing of colors: base color, normal, strength or depth
 are channels like any other.
 
 Definition, the same in every backend up to the differences that a backend's page names: EWA projection of the
@@ -30,7 +30,7 @@ MINIMUM_TRANSMITTANCE = 1e-4
 JACOBIAN_MARGIN = 0.15
 
 
-class Rasterised(NamedTuple):
+class Rasterized(NamedTuple):
     """A splatted picture.
 
     Attributes:
@@ -49,8 +49,8 @@ class Rasterised(NamedTuple):
 class ScreenStatistic:
     """Asks for the gradient of the loss with respect to the projected means, through some channels alone.
 
-    Densification wants to know how much the colours pull at a Gaussian's place in the picture, and normals or
-    strengths must not count (Ye et al. 2024). Passed to ``rasterise``, it is filled by the backward pass.
+    Densification wants to know how much the colors pull at a Gaussian's place in the picture, and normals or
+    strengths must not count (Ye et al. 2024). Passed to ``rasterize``, it is filled by the backward pass.
 
     Attributes:
         channels: which feature channels count.
@@ -61,7 +61,7 @@ class ScreenStatistic:
     gradient: Tensor | None = None
 
 
-class Rasterise(Protocol):
+class Rasterize(Protocol):
     """The signature of a backend.
 
     Args:
@@ -88,7 +88,7 @@ class Rasterise(Protocol):
         camera: Camera,
         *,
         statistic: ScreenStatistic | None = None,
-    ) -> Rasterised: ...
+    ) -> Rasterized: ...
 
 
 def check_shapes(
@@ -111,14 +111,14 @@ def check_shapes(
     ):
         if tuple(tensor.shape) != shape:
             raise PolarguideError(
-                f"rasterise({name})",
+                f"rasterize({name})",
                 expected=f"shape {list(shape)}",
                 found=str(list(tensor.shape)),
                 remedy="Give one row per Gaussian.",
             )
     if not 1 <= channels <= 32:
         raise PolarguideError(
-            "rasterise(features)",
+            "rasterize(features)",
             expected="1 to 32 channels",
             found=str(channels),
             remedy="Split the channels.",
@@ -126,7 +126,7 @@ def check_shapes(
     chosen = statistic.channels if statistic else ()
     if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):
         raise PolarguideError(
-            "rasterise(statistic)",
+            "rasterize(statistic)",
             expected=f"different channels below {channels}",
             found=str(chosen),
             remedy="Name channels that exist, each once.",
@@ -136,8 +136,8 @@ def check_shapes(
 def refuse_not_finite(name: str, row: int) -> PolarguideError:
     """The error for a NaN or an infinity in the inputs."""
     return PolarguideError(
-        f"rasterise({name})",
+        f"rasterize({name})",
         expected="finite numbers",
         found=f"NaN or infinity in row {row}",
-        remedy="A diverged optimisation: lower the learning rate or resume from an earlier checkpoint.",
+        remedy="A diverged optimization: lower the learning rate or resume from an earlier checkpoint.",
     )

@@ -1,4 +1,4 @@
-"""The slow twin: the definition of the rasteriser in plain torch, for any dtype and device.
+"""The slow twin: the definition of the rasterizer in plain torch, for any dtype and device.
 
 Every Gaussian is evaluated at every pixel, so memory grows as N x H x W: for tests and tiny pictures.
 """
@@ -17,7 +17,7 @@ from polarguide.raster.interface import (
     MINIMUM_ALPHA,
     MINIMUM_TRANSMITTANCE,
     NEAR_PLANE,
-    Rasterised,
+    Rasterized,
     ScreenStatistic,
     check_shapes,
     refuse_not_finite,
@@ -48,7 +48,7 @@ def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tu
     return means2d, half @ half.mT + BLUR * torch.eye(2).to(means), depth
 
 
-def rasterise_reference(
+def rasterize_reference(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -57,7 +57,7 @@ def rasterise_reference(
     camera: Camera,
     *,
     statistic: ScreenStatistic | None = None,
-) -> Rasterised:
+) -> Rasterized:
     """See ``polarguide.raster.interface``; differentiable by autograd, exact but slow."""
     check_shapes(means, quats, scales, opacities, features, statistic)
     named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
@@ -70,8 +70,8 @@ def rasterise_reference(
     visible = (depth > NEAR_PLANE) & (opacities >= MINIMUM_ALPHA) & (determinant > 0)
     order = torch.argsort(depth.detach(), stable=True)
     order = order[visible[order]]
-    centres = (torch.arange(max(camera.width, camera.height)).to(means)) + 0.5
-    pixels = torch.cartesian_prod(centres[: camera.height], centres[: camera.width]).flip(-1)
+    centers = (torch.arange(max(camera.width, camera.height)).to(means)) + 0.5
+    pixels = torch.cartesian_prod(centers[: camera.height], centers[: camera.width]).flip(-1)
     offset = pixels[None] - means2d[order][:, None]
     conics = torch.linalg.inv(covariances[order])
     quadratic = torch.einsum("npi,nij,npj->np", offset, conics, offset)
@@ -96,7 +96,7 @@ def rasterise_reference(
         size = torch.tensor([camera.width, camera.height]).to(means)
         seen = visible & ((means2d + half > 0) & (means2d - half < size)).all(dim=1)
         radii = torch.where(seen, radii, torch.zeros_like(radii))
-    return Rasterised(image, coverage.reshape(shape), radii)
+    return Rasterized(image, coverage.reshape(shape), radii)
 
 
 def _watched(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> Tensor:

@@ -7,7 +7,7 @@ from polarguide.recipes.ablations import ABLATIONS_3DGS_DR, ABLATIONS_POLARGUIDE
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
 from polarguide.recipes.ref_gs import RECIPE_REF_GS
-from polarguide.training.stages import Recipe
+from polarguide.training.recipe import Recipe
 
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe

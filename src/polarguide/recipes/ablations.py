@@ -8,7 +8,7 @@ from typing import Any
 
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_STOKES
-from polarguide.training.stages import Action, Recipe, Weights
+from polarguide.training.recipe import Action, Recipe, Weights
 
 
 def varied(
@@ -124,7 +124,7 @@ ABLATIONS_POLARGUIDE: tuple[Recipe, ...] = (
     varied(
         RECIPE_POLARGUIDE,
         "without-colour",
-        "Nothing is read from the polarization of colour differences.",
+        "Nothing is read from the polarization of color differences.",
         weights=off("chromatic"),
         priors={"chromatic": False},
     ),
@@ -185,7 +185,7 @@ ABLATIONS_STOKES: tuple[Recipe, ...] = (
     varied(
         RECIPE_POLARGUIDE_STOKES,
         "without-colour",
-        "Nothing is read from the polarization of colour differences.",
+        "Nothing is read from the polarization of color differences.",
         weights=off("chromatic"),
         priors={"chromatic": False},
     ),

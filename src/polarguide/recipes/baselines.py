@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from polarguide.training.stages import Recipe, Repeat, Stage
+from polarguide.training.recipe import Recipe, Repeat, Stage
 
 # Learning rates of the 3DGS release; that of the means is times the scene's extent.
 RATES_3DGS = {

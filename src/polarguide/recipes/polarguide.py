@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
-from polarguide.training.stages import Action, Priors, Recipe, Repeat, Stage, Weights
+from polarguide.training.recipe import Action, Priors, Recipe, Repeat, Stage, Weights
 
 REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)
 

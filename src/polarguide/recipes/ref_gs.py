@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from polarguide.recipes.baselines import RATES_3DGS, RESET
 from polarguide.shading.directional import DirectionalShading
-from polarguide.training.stages import Recipe, Stage, Weights
+from polarguide.training.recipe import Recipe, Stage, Weights
 
 WEIGHTS = Weights(consistency=0.05, flatness=0.1)
 

@@ -14,7 +14,7 @@ face major s     t
 ==== ===== ===== =====
 
 so that the direction of face 0 at (s, t) is (1, -t, -s). Seen from within the cube, pictures are upright with +y up.
-At a face's edge the taps beyond it are the texels of the neighbouring face; beyond a corner, where only three faces
+At a face's edge the taps beyond it are the texels of the neighboring face; beyond a corner, where only three faces
 meet, the missing tap is the mean of their three corner texels. So the look-up is continuous everywhere. On the CPU in
 float32 it is a native kernel; ``cubemap_lookup_reference`` is its twin in plain torch.
 """
@@ -43,7 +43,7 @@ _FACES = (
 
 
 def _face_points(coordinates: Tensor, distance: int) -> Tensor:
-    """Points [6, n, n, 3] on (extended) faces ``distance`` from the centre, at coordinates [n] along s and t."""
+    """Points [6, n, n, 3] on (extended) faces ``distance`` from the center, at coordinates [n] along s and t."""
     t, s = torch.meshgrid(coordinates, coordinates, indexing="ij")
     points = torch.empty(6, *s.shape, 3, dtype=coordinates.dtype)
     for face, (axis, sign, s_axis, s_sign, t_axis, t_sign) in enumerate(_FACES):
@@ -54,7 +54,7 @@ def _face_points(coordinates: Tensor, distance: int) -> Tensor:
 
 
 def texel_directions(resolution: int) -> Tensor:
-    """Unit directions of the texel centres, [6, R, R, 3] float32; R at least 1."""
+    """Unit directions of the texel centers, [6, R, R, 3] float32; R at least 1."""
     coordinates = (torch.arange(resolution) + 0.5) * 2 / resolution - 1
     return torch.nn.functional.normalize(_face_points(coordinates, 1), dim=-1)
 
@@ -68,7 +68,7 @@ class _Ring(NamedTuple):
 
 
 def _texel_index(face: Tensor, points: Tensor, resolution: int) -> Tensor:
-    """Flat texel of points [..., 3] in half texels from the cube's centre, on the given faces [...]."""
+    """Flat texel of points [..., 3] in half texels from the cube's center, on the given faces [...]."""
     table = torch.tensor(_FACES)[face]
     s = table[..., 3] * points.gather(-1, table[..., 2:3])[..., 0]
     t = table[..., 5] * points.gather(-1, table[..., 4:5])[..., 0]
@@ -108,7 +108,7 @@ def _face_table(device: torch.device) -> Tensor:
 
 
 def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Face [P], and s and t [P] in [-1, 1], of directions [P, 3]; ties go to the earlier axis, zero to +x's centre."""
+    """Face [P], and s and t [P] in [-1, 1], of directions [P, 3]; ties go to the earlier axis, zero to +x's center."""
     x, y, z = directions.abs().unbind(-1)
     axis = torch.where((x >= y) & (x >= z), 0, torch.where(y >= z, 1, 2))
     major = directions.gather(-1, axis[:, None])[:, 0]
@@ -121,7 +121,7 @@ def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def ringed_texels(texture: Tensor) -> Tensor:
-    """Texels [6, R, R, C] with a ring of their neighbours around each face, [6 (R + 2)^2, C]."""
+    """Texels [6, R, R, C] with a ring of their neighbors around each face, [6 (R + 2)^2, C]."""
     ring = _ring(texture.shape[1], texture.device)
     texels = texture.reshape(-1, texture.shape[-1])
     return texels[ring.source].index_put((ring.corners,), texels[ring.around].mean(dim=1))
@@ -142,7 +142,7 @@ def bilinear(
     """
     channels = ringed.shape[-1]
     face, s, t = place
-    # Texel centres are at half-integers; one is added for the ring. A NaN reads cell 0 and stays in the fraction.
+    # Texel centers are at half-integers; one is added for the ring. A NaN reads cell 0 and stays in the fraction.
     u, v = (s + 1) * (resolution / 2) + 0.5, (t + 1) * (resolution / 2) + 0.5
     column, row = (x.detach().nan_to_num(0).clamp(min=0).floor().long() for x in (u, v))
     if isinstance(resolution, Tensor):
@@ -186,7 +186,7 @@ def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
     """Seamless bilinear look-up, ``sum_k w_k(direction) texel_k`` over four taps; see the module for the faces.
 
     The gradient with respect to a direction is that of the weights: it is constant along the ray, so orthogonal to
-    the direction, and jumps where the direction passes between cells of four texel centres. A direction of length
+    the direction, and jumps where the direction passes between cells of four texel centers. A direction of length
     zero reads the middle of +x and gets no gradient; one with a NaN reads NaN.
 
     Args:

@@ -23,7 +23,7 @@ from torch.nn.functional import relu
 
 from polarguide.camera import Camera
 from polarguide.shading.mips import box_mips, mip_lookup
-from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, Rows, mirrored
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, Parameters, mirrored
 from polarguide.vectors import unit
 
 CHANNELS, FEATURES = 16, 4
@@ -35,9 +35,9 @@ MINIMUM_ALPHA = 0.05
 _DARKEST = 1e-3  # a black point's first albedo, so that its logarithm is finite
 
 
-def albedo_of(rows: Rows) -> Tensor:
+def albedo_of(gaussians: Parameters) -> Tensor:
     """Albedo [N, 3], ``exp(min(x, 5)) / 5`` of the rows ``log_albedo``."""
-    return ALBEDO_SCALE * rows["log_albedo"].clamp(max=MAXIMUM_LOG_LIGHT).exp()
+    return ALBEDO_SCALE * gaussians["log_albedo"].clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class DirectionalShading:
     Attributes:
         width: of the MLP's two hidden layers.
         mlp_rate: learning rate of the MLP.
-        first_albedo: share of the first points' colours that albedo begins with, in (0, 1].
+        first_albedo: share of the first points' colors that albedo begins with, in (0, 1].
         first_roughness: that Gaussians begin with, in (0, 1).
         first_light: specular radiance before the first step (the MLP's output bias is its logarithm).
     """
@@ -58,14 +58,14 @@ class DirectionalShading:
     first_roughness: float = 0.5
     first_light: float = 0.25
 
-    def first_rows(self, colours: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+    def first_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         """The side tensors ``log_albedo`` [N, 3], ``roughness_logits`` [N] and ``features`` [N, 4] to begin with.
 
         Args:
-            colours: [N, 3] linear, of the first Gaussians. generator: draws the features.
+            colors: [N, 3] linear, of the first Gaussians. generator: draws the features.
         """
-        count = colours.shape[0]
-        albedo = (self.first_albedo * colours).clamp(min=_DARKEST)
+        count = colors.shape[0]
+        albedo = (self.first_albedo * colors).clamp(min=_DARKEST)
         logit = math.log(self.first_roughness / (1 - self.first_roughness))
         return {
             "log_albedo": torch.log(albedo / ALBEDO_SCALE),
@@ -123,14 +123,16 @@ class DirectionalShading:
         out = torch.addmm(light["mlp_bias_2"], hidden, light["mlp_weight_2"])
         return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
-    def channels(self, rows: Rows, normals: Tensor, centre: Tensor, sh_degree: int) -> list[Tensor]:
+    def channels(
+        self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
+    ) -> list[Tensor]:
         """Albedo [N, 3]; then roughness and feature together, [N, 5]. No harmonics are read."""
-        roughness = torch.sigmoid(rows["roughness_logits"])[:, None]
-        return [albedo_of(rows), torch.cat((roughness, torch.tanh(rows["features"])), dim=1)]
+        roughness = torch.sigmoid(gaussians["roughness_logits"])[:, None]
+        return [albedo_of(gaussians), torch.cat((roughness, torch.tanh(gaussians["features"])), dim=1)]
 
     def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
-        """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the colour that was splatted is albedo."""
-        albedo, normal, further, alpha = splatted.colour, splatted.normal, splatted.further, splatted.alpha
+        """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the color that was splatted is albedo."""
+        albedo, normal, further, alpha = splatted.color, splatted.normal, splatted.further, splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
         directions = mirrored(rays, unit(normal, 1e-3))
         radiance = self.radiance(
@@ -142,19 +144,21 @@ class DirectionalShading:
         specular = radiance * (alpha > MINIMUM_ALPHA)[..., None]
         return {"final": albedo + specular, "specular": specular, "diffuse": albedo}
 
-    def colours(self, rows: Rows, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor) -> Tensor:
-        """Each Gaussian shaded alone, at its own normal, roughness and feature: linear colours [N, 3].
+    def colors(
+        self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
+    ) -> Tensor:
+        """Each Gaussian shaded alone, at its own normal, roughness and feature: linear colors [N, 3].
 
         Args:
             rays: [N, 3] unit. normals: [N, 3] unit, facing them.
         """
-        roughness, features = torch.sigmoid(rows["roughness_logits"]), torch.tanh(rows["features"])
-        return albedo_of(rows) + self.radiance(light, mirrored(rays, normals), roughness, features)
+        roughness, features = torch.sigmoid(gaussians["roughness_logits"]), torch.tanh(gaussians["features"])
+        return albedo_of(gaussians) + self.radiance(light, mirrored(rays, normals), roughness, features)
 
-    def fields(self, rows: Rows) -> dict[str, Tensor]:
-        """What a PLY of the Gaussians keeps besides display colours: ``albedo``, ``roughness``, ``feature``."""
+    def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
+        """What a PLY of the Gaussians keeps besides display colors: ``albedo``, ``roughness``, ``feature``."""
         return {
-            "albedo": albedo_of(rows),
-            "roughness": torch.sigmoid(rows["roughness_logits"]),
-            "feature": torch.tanh(rows["features"]),
+            "albedo": albedo_of(gaussians),
+            "roughness": torch.sigmoid(gaussians["roughness_logits"]),
+            "feature": torch.tanh(gaussians["features"]),
         }

@@ -14,7 +14,7 @@ from polarguide.vectors import dot
 MAXIMUM_LOG_LIGHT = 5.0
 
 
-class Rows(Protocol):
+class Parameters(Protocol):
     """Named per-Gaussian tensors: the trainable rows, or a frozen copy of them."""
 
     def __getitem__(self, name: str, /) -> Tensor: ...
@@ -25,7 +25,7 @@ class GBuffer(NamedTuple):
     """What was splatted for a picture that is shaded afterwards.
 
     Attributes:
-        features: [H, W, 6 + K] blended colour, normal (world axes) and channels of the shading model; others may
+        features: [H, W, 6 + K] blended color, normal (world axes) and channels of the shading model; others may
             follow.
         alpha: [H, W].
     """
@@ -34,13 +34,13 @@ class GBuffer(NamedTuple):
     alpha: Tensor
 
     @property
-    def colour(self) -> Tensor:
+    def color(self) -> Tensor:
         """[H, W, 3]."""
         return self.features[..., :3]
 
     @property
     def normal(self) -> Tensor:
-        """[H, W, 3] blended, world axes, not normalised."""
+        """[H, W, 3] blended, world axes, not normalized."""
         return self.features[..., 3:6]
 
     @property
@@ -55,17 +55,21 @@ class ShadingModel(Protocol):
     ``light`` is the learned environment: its parameters by name.
     """
 
-    def channels(self, rows: Rows, normals: Tensor, centre: Tensor, sh_degree: int) -> list[Tensor]:
-        """Per Gaussian: colours [N, 3], then what is blended behind colour and normal, each [N, C]."""
+    def channels(
+        self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
+    ) -> list[Tensor]:
+        """Per Gaussian: colors [N, 3], then what is blended behind color and normal, each [N, C]."""
 
     def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
         """Layers of a picture by their names in ``RenderResult``; ``final`` at least."""
 
-    def colours(self, rows: Rows, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor) -> Tensor:
-        """Linear colours [N, 3] of Gaussians shaded one by one, along unit rays [N, 3] at facing normals [N, 3]."""
+    def colors(
+        self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
+    ) -> Tensor:
+        """Linear colors [N, 3] of Gaussians shaded one by one, along unit rays [N, 3] at facing normals [N, 3]."""
 
-    def fields(self, rows: Rows) -> dict[str, Tensor]:
-        """What a PLY of the Gaussians keeps besides display colours, [N, ...] by name."""
+    def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
+        """What a PLY of the Gaussians keeps besides display colors, [N, ...] by name."""
 
 
 def mirrored(rays: Tensor, normals: Tensor) -> Tensor:

@@ -19,11 +19,11 @@ class RenderResult:
     Attributes:
         final: the picture; ``specular + diffuse``.
         specular: what reflection adds to it; None for a recipe without reflection.
-        diffuse: what the base colour adds to it; None for a recipe without reflection.
-        base: blended base colour.
+        diffuse: what the base color adds to it; None for a recipe without reflection.
+        base: blended base color.
         reflection: the environment seen along the mirrored ray; None where the shading has no such layer.
         strength: [H, W] reflection strength in [0, 1]; None where the shading has none.
-        normal: blended normal in world axes, not normalised; None where the stage does not splat it.
+        normal: blended normal in world axes, not normalized; None where the stage does not splat it.
         depth: [H, W] expected camera depth over alpha; None where not asked for.
         alpha: [H, W] in [0, 1].
         radii: [N] pixels, of the projected Gaussians; 0 where culled.

@@ -101,16 +101,16 @@ def _own_mesh(path: Path) -> Mesh:
 
 
 def _picture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
-    """The texture of a thing, [H, W, 3], or None where it has one colour."""
-    colour = thing.material.colour
-    if colour != "own":
-        return make_texture(colour, thing.name, folder) if isinstance(colour, dict) else None
+    """The texture of a thing, [H, W, 3], or None where it has one color."""
+    color = thing.material.color
+    if color != "own":
+        return make_texture(color, thing.name, folder) if isinstance(color, dict) else None
     if mesh.palette is None:
         raise PolarguideError(
-            f"{thing.name} material.colour",
-            expected='a shape that brings colours, where the colour is "own"',
+            f"{thing.name} material.color",
+            expected='a shape that brings colors, where the color is "own"',
             found=f"a {thing.shape.get('type')} without",
-            remedy="Give the parts of a solid a colour each, or the material one.",
+            remedy="Give the parts of a solid a color each, or the material one.",
         )
     return mesh.palette[None]
 

@@ -13,7 +13,7 @@ TEST_EVERY = 8
 
 
 def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[Camera]:
-    """The cameras of a path, ring after ring, turning about z; neighbours are neighbours on a ring.
+    """The cameras of a path, ring after ring, turning about z; neighbors are neighbors on a ring.
 
     A few percent of jitter in radius, height and angle keep the views from standing on exact circles.
     """

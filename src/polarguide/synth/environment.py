@@ -19,25 +19,25 @@ from polarguide.synth.noise import fractal
 from polarguide.synth.textures import image
 
 HEIGHT = 256
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 
 def directions(height: int) -> Array:
-    """Unit directions of the pixels' centres of a panorama, [height, 2 height, 3]."""
+    """Unit directions of the pixels' centers of a panorama, [height, 2 height, 3]."""
     polar = np.pi * (np.arange(height) + 0.5) / height
     turn = -2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height)
     theta, phi = np.meshgrid(polar, turn, indexing="ij")
     return np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1)
 
 
-def uniform(radiance: Colour = (1.0, 1.0, 1.0), height: int = 16) -> Array:
+def uniform(radiance: Color = (1.0, 1.0, 1.0), height: int = 16) -> Array:
     """The same from everywhere."""
     return np.tile(np.array(radiance, float), (height, 2 * height, 1))
 
 
 def sky(
     sun: tuple[float, float] = (40.0, 60.0), brightness: float = 1.0, sunlight: float = 40.0, clouds: float = 0.5,
-    ground: Colour = (0.12, 0.11, 0.10), skyline: float = 8.0, seed: int = 0, height: int = HEIGHT,
+    ground: Color = (0.12, 0.11, 0.10), skyline: float = 8.0, seed: int = 0, height: int = HEIGHT,
 ) -> Array:  # fmt: skip
     """A sky with clouds, a veiled sun (height and azimuth in degrees), and a skyline of houses and trees."""
     d = directions(height)
@@ -49,8 +49,8 @@ def sky(
     tone = fractal(across * 1.6 + 50, seed + 1, 5)[..., None]
     picture = blue * (1 - cover) + np.array([1.0, 0.98, 0.95]) * (0.75 + 0.5 * tone) * cover
     high, azimuth = np.radians(sun)
-    towards = np.array([np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)])
-    cosine = d @ towards
+    toward = np.array([np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)])
+    cosine = d @ toward
     glow = np.exp((cosine - 1) * 400) * sunlight + np.exp((cosine - 1) * 25) * sunlight * 0.02
     picture = brightness * (picture + glow[..., None] * np.array([1.0, 0.9, 0.72]))
     _skyline(picture, d, skyline, brightness, seed)
@@ -87,8 +87,8 @@ def _skyline(picture: Array, d: Array, highest: float, brightness: float, seed: 
 
 
 def room(
-    size: tuple[float, float, float] = (6.0, 5.0, 3.0), eye: float = 1.2, walls: Colour = (0.42, 0.38, 0.32),
-    ceiling: Colour = (0.5, 0.49, 0.47), floor: Colour = (0.16, 0.1, 0.06), window: float = 9.0, lamp: float = 5.0,
+    size: tuple[float, float, float] = (6.0, 5.0, 3.0), eye: float = 1.2, walls: Color = (0.42, 0.38, 0.32),
+    ceiling: Color = (0.5, 0.49, 0.47), floor: Color = (0.16, 0.1, 0.06), window: float = 9.0, lamp: float = 5.0,
     warm: float = 0.25, seed: int = 0, height: int = HEIGHT,
 ) -> Array:  # fmt: skip
     """A furnished room as seen from its middle: two windows, ceiling lamps, pictures, shelves, a door."""
@@ -164,13 +164,13 @@ def studio(
     picture *= 0.8 + 0.4 * fractal(d * 3 + 5, seed, 4)[..., None]
     for item in boxes:
         high, azimuth = np.radians(item["at"])
-        towards = np.array([np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)])
-        right = unit(np.cross([0.0, 0, 1], towards))
-        up = np.cross(towards, right)
-        ahead = np.maximum(d @ towards, 1e-3)
+        toward = np.array([np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)])
+        right = unit(np.cross([0.0, 0, 1], toward))
+        up = np.cross(toward, right)
+        ahead = np.maximum(d @ toward, 1e-3)
         wide, tall = (np.tan(np.radians(s / 2)) for s in item["size"])
         x, y = d @ right / ahead / wide, d @ up / ahead / tall
-        shade = np.clip((1 - np.maximum(np.abs(x), np.abs(y))) * 12, 0, 1) * (d @ towards > 0)
+        shade = np.clip((1 - np.maximum(np.abs(x), np.abs(y))) * 12, 0, 1) * (d @ toward > 0)
         picture = picture * (1 - shade[..., None]) + shade[..., None] * np.array(item["radiance"], float)
     return picture
 

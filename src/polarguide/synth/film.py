@@ -49,18 +49,18 @@ def expose(
     *,
     seed: int,
     walk: Walk,
-    centre: bool = False,
+    center: bool = False,
 ) -> Light:
     """Render a view.
 
     Args:
         scenes: one Mitsuba scene of a spectral variant, or three of a mono one: red, green and blue. The channels
-            share their random numbers, so that noise has no colour of its own.
+            share their random numbers, so that noise has no color of its own.
         camera: pose and intrinsics; the film is filtered with the box of a pixel.
         samples: paths per pixel and lobe.
         seed: of the view.
         walk: limits of the paths.
-        centre: send all rays through the centres of pixels.
+        center: send all rays through the centers of pixels.
     """
     pixels = camera.width * camera.height
     passes = min(samples, -(-samples * pixels // PATHS_AT_ONCE))
@@ -70,7 +70,7 @@ def expose(
     total = np.zeros((pixels, 7, 3))
     for done in range(0, samples, batch):
         for channel, scene in enumerate(scenes):
-            found = _expose_once(scene, camera, (done, batch), seed, walk, centre)
+            found = _expose_once(scene, camera, (done, batch), seed, walk, center)
             if len(scenes) == 1:
                 total += found
             else:
@@ -80,7 +80,7 @@ def expose(
 
 
 def _expose_once(
-    scene: Any, camera: Camera, part: tuple[int, int], seed: int, walk: Walk, centre: bool
+    scene: Any, camera: Camera, part: tuple[int, int], seed: int, walk: Walk, center: bool
 ) -> NDArray[np.float64]:
     """Sums over some samples of each pixel: [pixels, 7, 3 or 1]."""
     import mitsuba as mi
@@ -92,11 +92,11 @@ def _expose_once(
         sums = np.zeros((pixels, 7, 3))
         for pixel in range(pixels):
             for sample in range(first, first + count):
-                parts = _path(scene, lens, pixel, sample, start, walk, centre)
-                sums[pixel] += np.array([[float(v) for v in colour] for colour in parts])
+                parts = _path(scene, lens, pixel, sample, start, walk, center)
+                sums[pixel] += np.array([[float(v) for v in color] for color in parts])
         return sums
     opaque = [number(mi.UInt32, value) for value in (first, count)]
-    found = _compiled()(scene, lens, opaque, pixels, count, start, walk, centre)
+    found = _compiled()(scene, lens, opaque, pixels, count, start, walk, center)
     return np.stack([column.numpy() for column in found], -1).reshape(pixels, 7, -1).astype(np.float64)
 
 
@@ -110,7 +110,7 @@ def _compiled() -> Callable[..., list[Any]]:
 
 
 def _sums(
-    scene: Any, lens: list[Any], part: list[Any], pixels: int, count: int, seed: Any, walk: Walk, centre: bool
+    scene: Any, lens: list[Any], part: list[Any], pixels: int, count: int, seed: Any, walk: Walk, center: bool
 ) -> list[Any]:
     """Sums over ``count`` samples of each pixel, all at once."""
     import drjit as dr
@@ -120,21 +120,21 @@ def _sums(
     index = dr.arange(mi.UInt32, pixels * count)
     pixel = index // per_pixel
     sample = index - pixel * per_pixel + first
-    parts = _path(scene, lens, pixel, sample, seed, walk, centre)
-    flat = [value for colour in parts for value in colour]
+    parts = _path(scene, lens, pixel, sample, seed, walk, center)
+    flat = [value for color in parts for value in color]
     dr.eval(flat)
     return [dr.block_reduce(dr.ReduceOp.Add, value, count) for value in flat]
 
 
 def _path(
-    scene: Any, lens: list[Any], pixel: Any, sample: Any, seed: Any, walk: Walk, centre: bool
+    scene: Any, lens: list[Any], pixel: Any, sample: Any, seed: Any, walk: Walk, center: bool
 ) -> list[list[Any]]:
-    """The colours of one sample: S0, S1, S2 of the specular and of the diffuse lobe, and what is seen directly."""
+    """The colors of one sample: S0, S1, S2 of the specular and of the diffuse lobe, and what is seen directly."""
     import mitsuba as mi
 
     draws = Draws(mi.UInt32(pixel), mi.UInt32(sample), seed)
     spread, place = draws.next(), draws.pair()
-    if centre:
+    if center:
         place = mi.Point2f(0.5, 0.5)
     ray, x_ref = primary_rays(lens, mi.UInt32(pixel), place)
     weight: Any = 1.0
@@ -144,8 +144,8 @@ def _path(
     parts = [*lens_stokes(specular, ray, x_ref), *lens_stokes(diffuse, ray, x_ref), seen]
     if not mi.is_spectral:
         return [[part.x] for part in parts]
-    colours = [mi.spectrum_to_srgb(part * weight, ray.wavelengths, True) for part in parts]
-    return [[colour.x, colour.y, colour.z] for colour in colours]
+    colors = [mi.spectrum_to_srgb(part * weight, ray.wavelengths, True) for part in parts]
+    return [[color.x, color.y, color.z] for color in colors]
 
 
 def _shifted(sample: Any) -> Any:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.view import ANGLES
+from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
 from polarguide.synth.mesh import Array
 
@@ -60,9 +61,9 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def write_picture(path: Path, values: NDArray[Any]) -> None:
-    """Write a PNG, grey or RGB."""
-    colour = values[..., ::-1] if values.ndim == 3 else values
-    done, data = cv2.imencode(".png", np.ascontiguousarray(colour))
+    """Write a PNG, gray or RGB."""
+    color = values[..., ::-1] if values.ndim == 3 else values
+    done, data = cv2.imencode(".png", np.ascontiguousarray(color))
     if not done:
         raise OSError(f"{path}: PNG encoding failed")
     write_file(path, data.tobytes())
@@ -82,27 +83,25 @@ def picture_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np
 
 def clipped_share(out: Path, names: Sequence[str]) -> float:
     """Share of the samples of these views' pictures that stand at full scale."""
-    files = [file for name in names for file in view_files(out, name, truth=False, raw=False)]
+    files = [file for name in names for file in view_files(out, name, ground_truth=False, raw=False)]
     pictures = (np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files)
     return float(np.mean([(picture == TOP * STEP).mean() for picture in pictures]))
 
 
-def view_files(out: Path, name: str, *, truth: bool, raw: bool) -> list[Path]:
+def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[Path]:
     """All files of a view; it is finished when they exist."""
     files = [out / "polar" / f"{name}_{angle:03d}.png" for angle in ANGLES]
-    files += [out / "gt" / f"{name}.npz"] if truth else []
+    files += [out / "gt" / f"{name}.npz"] if ground_truth else []
     return files + ([out / "raw" / f"{name}.png"] if raw else [])
 
 
 def photograph(out: Path, name: str) -> NDArray[np.uint8]:
     """The mean of a view's four pictures as shown on a screen (sRGB), [H, W, 3]."""
-    files = view_files(out, name, truth=False, raw=False)
+    files = view_files(out, name, ground_truth=False, raw=False)
     parts = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files]
     return shown(np.mean(parts, axis=0)[..., ::-1] / 65535)
 
 
 def shown(linear: Array) -> NDArray[np.uint8]:
     """Linear values in [0, 1] as 8-bit sRGB."""
-    linear = np.clip(linear, 0, 1)
-    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.asarray(np.round(255 * curve), np.uint8)
+    return np.asarray(np.round(255 * srgb_encode_array(np.clip(linear, 0, 1))), np.uint8)

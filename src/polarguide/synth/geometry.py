@@ -28,21 +28,21 @@ class Hits:
     thing: NDArray[np.uint8]
 
 
-def cast(built: Built, origins: Array, towards: Array) -> Hits:
+def cast(built: Built, origins: Array, toward: Array) -> Hits:
     """Follow rays [N, 3] to the first surface."""
     import mitsuba as mi
 
     if mi.variant().startswith("scalar"):
-        pairs = zip(origins.tolist(), towards.tolist(), strict=True)
+        pairs = zip(origins.tolist(), toward.tolist(), strict=True)
         rows = [_cast(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in pairs]
         distance, normal, thing = (np.array(column, float) for column in zip(*rows, strict=True))
     else:
         origin = mi.Point3f(np.ascontiguousarray(origins.T, np.float32))
-        direction = mi.Vector3f(np.ascontiguousarray(towards.T, np.float32))
+        direction = mi.Vector3f(np.ascontiguousarray(toward.T, np.float32))
         distance, normal, thing = (np.array(value, float) for value in _cast(built, origin, direction))
         normal = normal.T
     known = thing > 0
-    normal = np.where((normal * towards).sum(-1, keepdims=True) > 0, -normal, normal) * known[:, None]
+    normal = np.where((normal * toward).sum(-1, keepdims=True) > 0, -normal, normal) * known[:, None]
     return Hits(distance * known, normal, thing.astype(np.uint8))
 
 
@@ -61,9 +61,9 @@ def _cast(built: Built, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
 
 
 def pixel_truth(built: Built, camera: Camera) -> dict[str, NDArray[Any]]:
-    """Normals, depth, mask and object numbers at the centres of pixels, under the names of a ground-truth file."""
+    """Normals, depth, mask and object numbers at the centers of pixels, under the names of a ground-truth file."""
     rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
-    origins = np.broadcast_to(camera.centre.numpy(), rays.shape)
+    origins = np.broadcast_to(camera.center.numpy(), rays.shape)
     hits = cast(built, origins, rays)
     shape = (camera.height, camera.width)
     front = np.array([False] + [thing.foreground for thing in built.spec.things])

@@ -20,7 +20,7 @@ class Mesh:
         faces: [F, 3] indices, counter-clockwise seen from outside.
         uv: [V, 2] texture coordinates.
         normals: [V, 3] unit normals to shade with, or None for flat triangles.
-        palette: [N, 3] linear colours, side by side along u, where the shape brings its own; else None.
+        palette: [N, 3] linear colors, side by side along u, where the shape brings its own; else None.
     """
 
     points: Array

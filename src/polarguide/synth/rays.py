@@ -16,13 +16,13 @@ def number(kind: Any, value: float) -> Any:
 
 
 def pinhole(camera: Camera) -> list[Any]:
-    """A camera as Mitsuba's numbers: width, (fx, fy, cx, cy), the axes of the camera in the world, and its centre."""
+    """A camera as Mitsuba's numbers: width, (fx, fy, cx, cy), the axes of the camera in the world, and its center."""
     import mitsuba as mi
 
     inner = [number(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
     # The rows of the world-to-camera rotation are the camera's axes in the world.
     axes = [mi.Vector3f(*(number(mi.Float, float(v)) for v in row)) for row in camera.rotation]
-    origin = mi.Point3f(*(number(mi.Float, float(v)) for v in camera.centre))
+    origin = mi.Point3f(*(number(mi.Float, float(v)) for v in camera.center))
     return [number(mi.UInt32, camera.width), inner, axes, origin]
 
 

@@ -14,9 +14,9 @@ CONVENTION = {
     "intensity": "I_a = (S0 + S1 cos 2a + S2 sin 2a) / 2 is PNG value / 65535, linear",
     "aolp": "atan2(S2, S1) / 2 from the image's horizontal, counter-clockwise as displayed, in the lens frame of "
     "each ray (docs/conventions.md)",
-    "camera": "OpenCV axes, world to camera x_cam = R x_world + t, pixel centres at 0.5",
+    "camera": "OpenCV axes, world to camera x_cam = R x_world + t, pixel centers at 0.5",
     "truth": "gt/<view>.npz: stokes, specular and diffuse as S0 of the lobes of the first surface, exposed like "
-    "the pictures, whose sum is S0 on surfaces; normal (world), depth (camera z), mask, objid at pixel centres",
+    "the pictures, whose sum is S0 on surfaces; normal (world), depth (camera z), mask, objid at pixel centers",
     "environment": "environment.hdr: rows from +z down, columns clockwise seen from above, from +x; scene units",
 }
 
@@ -35,7 +35,7 @@ def scene_record(
     objects = []
     for number, thing in enumerate(spec.things, 1):
         source = thing.material
-        material: dict[str, Any] = {"type": source.type, "diffuse": source.colour}
+        material: dict[str, Any] = {"type": source.type, "diffuse": source.color}
         if source.type == "plastic":
             material |= {"alpha": source.roughness, "ior": source.index}
         elif source.type == "metal":

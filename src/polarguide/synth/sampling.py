@@ -9,18 +9,18 @@ LEAST_DENSITY = 1e-5
 Sampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
 
 
-def by_surface(bsdf: Any, context: Any, si: Any, numbers: Any, towards: Any, active: Any) -> tuple[Any, Any]:
-    """Directions as the surface draws them: (value, density) towards a light, and (direction, density, weight, delta)
+def by_surface(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
+    """Directions as the surface draws them: (value, density) toward a light, and (direction, density, weight, delta)
     of a drawn one."""
     import mitsuba as mi
 
-    given = bsdf.eval_pdf(context, si, towards, active)
+    given = bsdf.eval_pdf(context, si, toward, active)
     sample, weight = bsdf.sample(context, si, *numbers, active)
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     return given, (sample.wo, sample.pdf, weight, delta)
 
 
-def by_cosine(bsdf: Any, context: Any, si: Any, numbers: Any, towards: Any, active: Any) -> tuple[Any, Any]:
+def by_cosine(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
     """Directions by Lambert's law; result as of ``by_surface``.
 
     Mitsuba 3.9 gives values of a coated surface's diffuse lobe rightly, but when that lobe alone is asked for, its
@@ -29,9 +29,9 @@ def by_cosine(bsdf: Any, context: Any, si: Any, numbers: Any, towards: Any, acti
     import drjit as dr
     import mitsuba as mi
 
-    value = bsdf.eval(context, si, towards, active)
+    value = bsdf.eval(context, si, toward, active)
     side = dr.sign(si.wi.z)  # surfaces have two sides
-    there = dr.maximum(towards.z * side, 0.0) * dr.inv_pi
+    there = dr.maximum(toward.z * side, 0.0) * dr.inv_pi
     wo = mi.warp.square_to_cosine_hemisphere(numbers[1])
     wo = mi.Vector3f(wo.x, wo.y, wo.z * side)
     density = dr.abs(wo.z) * dr.inv_pi

@@ -1,6 +1,6 @@
 """A scene as data: what a scene file may say, read from JSON with every mistake named.
 
-The fields are described in docs/dataset.md. Lengths are in one unit of the author's choice, z is up, colours are linear
+The fields are described in docs/dataset.md. Lengths are in one unit of the author's choice, z is up, colors are linear
 sRGB in [0, 1], radiance is linear and unbounded, angles are degrees.
 """
 
@@ -25,14 +25,14 @@ class Material:
     Attributes:
         type: "plastic" (a dielectric coat over a diffuse base: glaze, paint, polished wood, dark glass, water),
             "metal", or "matte" (depolarizing).
-        colour: diffuse colour, or a texture (see ``textures``), or "own" for a shape that brings colours.
+        color: diffuse color, or a texture (see ``textures``), or "own" for a shape that brings colors.
         roughness: GGX roughness of the coat or metal.
         index: refractive index of the coat.
         eta, k: complex index of a metal for red, green and blue.
     """
 
     type: str = "plastic"
-    colour: Any = (0.5, 0.5, 0.5)
+    color: Any = (0.5, 0.5, 0.5)
     roughness: float = 0.05
     index: float = 1.5
     eta: Vector = (1.35, 0.97, 0.62)
@@ -69,7 +69,7 @@ class CameraPath:
         target: what all look at; ``wander`` is by how much single cameras look past it.
         fov: horizontal field of view.
         views: number of views.
-        spacing: degrees between neighbours on a ring, about the middle of its arc; None fills the arc evenly.
+        spacing: degrees between neighbors on a ring, about the middle of its arc; None fills the arc evenly.
     """
 
     rings: tuple[Data, ...]
@@ -89,7 +89,7 @@ class SceneSpec:
         camera: the views.
         things: objects.
         environment: light from afar (see ``environment``).
-        lights: rectangles that shine, each with ``position``, ``towards``, ``size`` and ``radiance``.
+        lights: rectangles that shine, each with ``position``, ``toward``, ``size`` and ``radiance``.
         depth: largest number of surfaces that a path of light touches.
         clamp: see ``transport.Walk``.
         exposure: display value of radiance 1; None takes one by which 1 % of S0 lies above 1.5.

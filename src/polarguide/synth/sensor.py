@@ -66,17 +66,17 @@ def mosaic(
     """The raw picture that a sensor stores, [H, W], of light [3, H, W, 3] whose radiance 1 is full scale.
 
     A polarizer of finite extinction E weakens S1 and S2 by (E - 1) / (E + 1). A monochrome sensor sees the mean of the
-    colours.
+    colors.
     """
     height, width = stokes.shape[1:3]
     pattern = sensor_pattern(name)
     repeat = (-(-height // pattern.period), -(-width // pattern.period))
     angles = np.tile(pattern.angles, repeat)[:height, :width]
-    if pattern.colours is None:
+    if pattern.colors is None:
         light = stokes.mean(-1)
     else:
-        colours = np.tile(pattern.colours, repeat)[:height, :width]
-        light = np.take_along_axis(stokes, colours[None, ..., None], -1)[..., 0]
+        colors = np.tile(pattern.colors, repeat)[:height, :width]
+        light = np.take_along_axis(stokes, colors[None, ..., None], -1)[..., 0]
     contrast = (sensor.extinction - 1) / (sensor.extinction + 1)
     twice = 2 * np.radians(angles)
     value = (light[0] + contrast * (light[1] * np.cos(twice) + light[2] * np.sin(twice))) / 2

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from polarguide.errors import PolarguideError
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file
-from polarguide.synth.variant import Colour
+from polarguide.synth.variant import Color
 
 PRESETS = ("figure", "kit", "car", "cup", "water", "proof")
 SensorName = Literal["ideal", "imx250myr", "imx250mzr"]
@@ -26,7 +26,7 @@ class SynthSettings:
         seed: of every random draw.
         sensor: "ideal", or a sensor whose raw mosaics are written, too.
         noise: photon and read noise, see ``sensor.noisy``.
-        colour: see ``variant.Variant``.
+        color: see ``variant.Variant``.
         truth: views that get ground truth, "test" or "all".
         points: sparse points to look for.
     """
@@ -37,8 +37,8 @@ class SynthSettings:
     seed: int = 0
     sensor: SensorName = "ideal"
     noise: float = 0.0
-    colour: Colour = "rgb"
-    truth: Literal["test", "all"] = "test"
+    color: Color = "rgb"
+    ground_truth: Literal["test", "all"] = "test"
     points: int = 5000
 
     def data(self) -> dict[str, Any]:
@@ -63,7 +63,7 @@ class Overrides:
 
     Attributes:
         views: number of views.
-        spacing: degrees between neighbours on a ring.
+        spacing: degrees between neighbors on a ring.
         roughness, index: of all plastic objects in the foreground.
     """
 

@@ -1,6 +1,6 @@
 """Procedural geometry by name: what the ``shape`` of an object may be.
 
-Every shape is centred at the origin or stands on it, z up; see docs/dataset.md for the fields.
+Every shape is centered at the origin or stands on it, z up; see docs/dataset.md for the fields.
 """
 
 from __future__ import annotations

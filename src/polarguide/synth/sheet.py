@@ -28,8 +28,8 @@ def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> P
     width = sheet.shape[1] // len(COLUMNS)
     for number, label in enumerate(COLUMNS):
         place, size = (number * width + 6, 15), width / 420
-        for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(sheet, label, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)
+        for color, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(sheet, label, place, cv2.FONT_HERSHEY_SIMPLEX, size, color, thick, cv2.LINE_AA)
     _, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     write_file(out / "sheet.jpg", data.tobytes())
     return out / "sheet.jpg"
@@ -37,14 +37,14 @@ def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> P
 
 def _layers(path: Path, camera: Camera) -> list[NDArray[np.uint8]]:
     """The pictures of one view, [H, W, 3] each, in the order of ``COLUMNS``."""
-    with np.load(path) as truth:
+    with np.load(path) as ground_truth:
         stokes, specular, diffuse = (
-            truth[name].astype(np.float64) for name in ("stokes", "specular", "diffuse")
+            ground_truth[name].astype(np.float64) for name in ("stokes", "specular", "diffuse")
         )
         normal, depth, known = (
-            truth["normal"].astype(np.float64),
-            truth["depth"].astype(np.float64),
-            truth["objid"] > 0,
+            ground_truth["normal"].astype(np.float64),
+            ground_truth["depth"].astype(np.float64),
+            ground_truth["objid"] > 0,
         )
     mean = optics.luminance(torch.from_numpy(stokes))
     degree, angle = optics.dolp(mean).numpy(), optics.aolp(mean).numpy()
@@ -52,20 +52,20 @@ def _layers(path: Path, camera: Camera) -> list[NDArray[np.uint8]]:
     near, far = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
     return [
         shown(stokes[0] / 2),
-        _grey(np.sqrt(degree)),
+        _gray(np.sqrt(degree)),
         _hue(angle / np.pi, np.clip(degree * 4, 0, 1)),
         shown(specular / 2),
         shown(diffuse / 2),
         np.where(known[..., None], np.round(127.5 * (facing + 1)), 0).astype(np.uint8),
-        _grey(np.where(known, 1 - 0.9 * np.clip((depth - near) / max(far - near, 1e-9), 0, 1), 0)),
+        _gray(np.where(known, 1 - 0.9 * np.clip((depth - near) / max(far - near, 1e-9), 0, 1), 0)),
     ]
 
 
-def _grey(values: Array) -> NDArray[np.uint8]:
+def _gray(values: Array) -> NDArray[np.uint8]:
     return np.repeat(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)[..., None], 3, axis=-1)
 
 
 def _hue(turn: Array, strength: Array) -> NDArray[np.uint8]:
-    """Angles in turns as colours of full brightness, dark where ``strength`` is small."""
+    """Angles in turns as colors of full brightness, dark where ``strength`` is small."""
     codes = np.stack((turn * 180 % 180, np.full_like(turn, 255), 255 * strength), -1).astype(np.uint8)
     return np.asarray(cv2.cvtColor(codes, cv2.COLOR_HSV2RGB), np.uint8)

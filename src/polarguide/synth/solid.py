@@ -30,8 +30,8 @@ def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) ->
             ``round``), "capsule" (``from``, ``to``, ``radius``, and ``end``, that at ``to``), "cylinder" (``from``,
             ``to``, ``radius``, ``round``) or "ring" (``at``, ``radius``, ``thick``; about z); any with ``rotation``
             about its ``at``, ``cut`` to take it away, ``blend`` of its own, ``mirror`` ("x" or "y": a second one) and
-            ``colour``.
-        blend: width over which neighbours flow into each other.
+            ``color``.
+        blend: width over which neighbors flow into each other.
         detail: cells along the longest side.
     """
     whole = []
@@ -84,12 +84,12 @@ def _bounds(parts: list[dict[str, Any]]) -> tuple[Array, Array]:
             continue
         if "from" in part:
             reach = max(part["radius"], part.get("end", 0.0))
-            centres = [part["from"], part["to"]]
+            centers = [part["from"], part["to"]]
         else:
-            centres = [part["at"]]
+            centers = [part["at"]]
             size = part.get("size") or [part["radius"] + part["thick"]] * 3
             reach = np.linalg.norm(size) if "rotation" in part else np.array(size)
-        corners += [np.array(c) + s * np.ones(3) * reach for c in centres for s in (-1, 1)]
+        corners += [np.array(c) + s * np.ones(3) * reach for c in centers for s in (-1, 1)]
     return np.min(corners, axis=0), np.max(corners, axis=0)
 
 
@@ -101,8 +101,8 @@ def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: f
     cubes, which = np.unique(np.floor(points / block).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(which.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(cubes)))
-    centres: Array = ((cubes + 0.5) * block).astype(np.float64)
-    apart = np.stack([part_distance(centres, part) for part in parts])
+    centers: Array = ((cubes + 0.5) * block).astype(np.float64)
+    apart = np.stack([part_distance(centers, part) for part in parts])
     cut = np.array([bool(part.get("cut")) for part in parts])
     width = np.array([part.get("blend", blend) for part in parts])
     nearest = np.where(cut[:, None], np.inf, apart).min(0)
@@ -150,18 +150,18 @@ def _gradient(points: Array, parts: list[dict[str, Any]], blend: float, step: fl
 
 
 def _painted(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
-    """The mesh with a palette: every triangle has the colour of the coloured part nearest to its middle.
+    """The mesh with a palette: every triangle has the color of the colored part nearest to its middle.
 
-    Vertices between two colours become two, and texture coordinates choose a colour of the palette.
+    Vertices between two colors become two, and texture coordinates choose a color of the palette.
     """
-    coloured = [part for part in parts if "colour" in part and not part.get("cut")]
-    if not coloured:
+    colored = [part for part in parts if "color" in part and not part.get("cut")]
+    if not colored:
         return mesh
     middles: Array = mesh.points[mesh.faces].mean(1)
-    which = np.stack([part_distance(middles, part) for part in coloured], -1).argmin(-1)
-    palette, number = np.unique([part["colour"] for part in coloured], axis=0, return_inverse=True)
-    colour = number.reshape(-1)[which]
-    pairs, corners = np.unique(mesh.faces * len(palette) + colour[:, None], return_inverse=True)
+    which = np.stack([part_distance(middles, part) for part in colored], -1).argmin(-1)
+    palette, number = np.unique([part["color"] for part in colored], axis=0, return_inverse=True)
+    color = number.reshape(-1)[which]
+    pairs, corners = np.unique(mesh.faces * len(palette) + color[:, None], return_inverse=True)
     old, shade = np.divmod(pairs, len(palette))
     uv = np.stack(((shade + 0.5) / len(palette), np.full(len(pairs), 0.5)), -1)
     normals = None if mesh.normals is None else mesh.normals[old]

@@ -33,13 +33,13 @@ class Sparse:
     """Points and where they were found.
 
     Attributes:
-        points: [M, 3]. colours: [M, 3] display-encoded.
+        points: [M, 3]. colors: [M, 3] display-encoded.
         tracks: of each point, (view, x, y) of each observation.
         virtual, outliers: how many points lie behind mirrors, and are grossly wrong.
     """
 
     points: Array
-    colours: NDArray[np.uint8]
+    colors: NDArray[np.uint8]
     tracks: list[list[tuple[int, float, float]]]
     virtual: int
     outliers: int
@@ -58,24 +58,24 @@ def find_points(
         seed: of every random draw.
     """
     random = np.random.default_rng((seed, 23))
-    origins, rays, colours, home = [], [], [], []
+    origins, rays, colors, home = [], [], [], []
     for number, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
-        grey = picture.mean(-1)
-        contrast = np.hypot(*np.gradient(grey)) + 2
+        gray = picture.mean(-1)
+        contrast = np.hypot(*np.gradient(gray)) + 2
         amount = -(-count * 13 // 10 // len(cameras))
-        chosen = random.choice(grey.size, amount, p=(contrast / contrast.sum()).ravel())
+        chosen = random.choice(gray.size, amount, p=(contrast / contrast.sum()).ravel())
         world = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
         rays.append(world[chosen])
-        origins.append(np.broadcast_to(camera.centre.numpy(), (amount, 3)))
-        colours.append(picture.reshape(-1, 3)[chosen])
+        origins.append(np.broadcast_to(camera.center.numpy(), (amount, 3)))
+        colors.append(picture.reshape(-1, 3)[chosen])
         home.append(np.full(amount, number))
     origin, ray = np.concatenate(origins), np.concatenate(rays)
-    colour, view = np.concatenate(colours), np.concatenate(home)
+    color, view = np.concatenate(colors), np.concatenate(home)
     hits = cast(built, origin, ray)
     places = origin + hits.distance[:, None] * ray
     seen = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < FOUND)
     ghost, places = _mirrored(built, origin, ray, places, hits.normal, hits.thing, random)
-    near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1  # a reflection holds only between neighbours
+    near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1  # a reflection holds only between neighbors
     seen = np.where(ghost[:, None], near, seen)
     seen[np.arange(len(view)), view] = True
     keep = np.flatnonzero((hits.thing > 0) & (seen.sum(1) >= 2))
@@ -89,7 +89,7 @@ def find_points(
     wrong = random.random(len(keep)) < OUTLIERS
     stretch = random.uniform(0.5, 1.8, len(keep))[:, None]
     moved = np.where(wrong[:, None], origin[keep] + stretch * (moved - origin[keep]), moved)
-    return Sparse(moved, colour[keep], tracks, int(ghost[keep].sum()), int(wrong.sum()))
+    return Sparse(moved, color[keep], tracks, int(ghost[keep].sum()), int(wrong.sum()))
 
 
 def _visible(built: Built, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:
@@ -102,9 +102,9 @@ def _visible(built: Built, cameras: Sequence[Camera], places: Array) -> NDArray[
         )
         if len(inside) == 0:
             continue
-        way = places[inside] - camera.centre.numpy()
+        way = places[inside] - camera.center.numpy()
         length = np.linalg.norm(way, axis=1)
-        hits = cast(built, np.broadcast_to(camera.centre.numpy(), way.shape), way / length[:, None])
+        hits = cast(built, np.broadcast_to(camera.center.numpy(), way.shape), way / length[:, None])
         seen[inside, number] = np.abs(hits.distance - length) < 2e-3 * length
     return seen
 
@@ -165,8 +165,8 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
     (folder / "cameras.txt").write_text(f"# one camera\n1 PINHOLE {first.width} {first.height} {inner}\n")
     seen: list[list[str]] = [[] for _ in names]
     rows = []
-    for number, (place, colour, track) in enumerate(
-        zip(sparse.points, sparse.colours, sparse.tracks, strict=True), 1
+    for number, (place, color, track) in enumerate(
+        zip(sparse.points, sparse.colors, sparse.tracks, strict=True), 1
     ):
         errors = []
         parts = []
@@ -176,7 +176,7 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
             px, py, _ = _project(cameras[view], place[None])[0]
             errors.append(np.hypot(px - x, py - y))
         xyz = " ".join(f"{v:.6f}" for v in place)
-        rgb = " ".join(str(int(c)) for c in colour)
+        rgb = " ".join(str(int(c)) for c in color)
         rows.append(f"{number} {xyz} {rgb} {np.mean(errors):.4f} {' '.join(parts)}")
     (folder / "points3D.txt").write_text("# points\n" + "\n".join(rows) + "\n")
     lines = []

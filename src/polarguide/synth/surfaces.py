@@ -15,7 +15,7 @@ AIR = 1.0
 
 def surface(material: Material, picture: Array | None, channel: int | None) -> dict[str, Any]:
     """Mitsuba's description of a surface, of one channel or of all."""
-    base = _value(material.colour, channel) if picture is None else _bitmap(picture, channel)
+    base = _value(material.color, channel) if picture is None else _bitmap(picture, channel)
     if material.type == "metal":
         index = {name: _metal(getattr(material, name), channel) for name in ("eta", "k")}
         inner = {"type": "roughconductor", "distribution": "ggx", "alpha": material.roughness, **index}
@@ -27,11 +27,11 @@ def surface(material: Material, picture: Array | None, channel: int | None) -> d
     return {"type": "twosided", "inner": inner}
 
 
-def _value(colour: Any, channel: int | None) -> dict[str, Any]:
+def _value(color: Any, channel: int | None) -> dict[str, Any]:
     """A reflectance or radiance."""
     if channel is None:
-        return {"type": "rgb", "value": [float(c) for c in colour]}
-    return {"type": "uniform", "value": float(colour[channel])}
+        return {"type": "rgb", "value": [float(c) for c in color]}
+    return {"type": "uniform", "value": float(color[channel])}
 
 
 def _metal(index: tuple[float, float, float], channel: int | None) -> dict[str, Any]:
@@ -67,21 +67,21 @@ def lamp(light: dict[str, Any], channel: int | None, where: str) -> dict[str, An
     import mitsuba as mi
 
     try:
-        position, towards = list(light["position"]), list(light["towards"])
+        position, toward = list(light["position"]), list(light["toward"])
         half = [float(s) / 2 for s in light["size"]]
         radiance = [float(v) for v in light["radiance"]]
     except (KeyError, TypeError, ValueError) as error:
         raise PolarguideError(
             f"{where} (lights)",
-            expected="position, towards, size and radiance of each light",
+            expected="position, toward, size and radiance of each light",
             found=repr(error),
             remedy="docs/dataset.md describes them.",
         ) from error
     up = (
         [0, 0, 1]
-        if abs(towards[2] - position[2]) < 0.99 * np.linalg.norm(np.subtract(towards, position))
+        if abs(toward[2] - position[2]) < 0.99 * np.linalg.norm(np.subtract(toward, position))
         else [0, 1, 0]
     )
-    place = mi.ScalarTransform4f().look_at(position, towards, up) @ mi.ScalarTransform4f().scale([*half, 1.0])
+    place = mi.ScalarTransform4f().look_at(position, toward, up) @ mi.ScalarTransform4f().scale([*half, 1.0])
     return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": _value(radiance, channel)},
             "bsdf": {"type": "diffuse", "reflectance": _value((0.0, 0.0, 0.0), channel)}}  # fmt: skip

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from polarguide.capture.prepare.reporter import Reporter
 from polarguide.errors import PolarguideError
+from polarguide.progress import Reporter
 from polarguide.synth import folder
 from polarguide.synth.build import build_scene
 from polarguide.synth.cameras import held_out_names, place_cameras, view_names
 from polarguide.synth.manifest import verify_scene, write_manifest
-from polarguide.synth.run import synthesise
+from polarguide.synth.render import synthesise
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, SynthSettings
 from polarguide.synth.sparse import find_points, write_model
@@ -122,7 +122,7 @@ def _fewer_views(
         chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, int(value)).round().astype(int))]
         names = sorted([*chosen, *tests])
         _link(whole, member, names)
-        variant = choose_variant(settings.colour, threads=threads)
+        variant = choose_variant(settings.color, threads=threads)
         built = build_scene(spec, member, variant)
         some = [by_name[name] for name in names]
         pictures = [folder.photograph(member, name) for name in names]
@@ -143,9 +143,9 @@ def _fewer_views(
 def _link(whole: Path, member: Path, names: list[str]) -> None:
     """Share the files of views between two scenes: one file under two names where the disk allows it."""
     for name in names:
-        truth = (whole / "gt" / f"{name}.npz").exists()
+        ground_truth = (whole / "gt" / f"{name}.npz").exists()
         raw = (whole / "raw" / f"{name}.png").exists()
-        for source in folder.view_files(whole, name, truth=truth, raw=raw):
+        for source in folder.view_files(whole, name, ground_truth=ground_truth, raw=raw):
             target = member / source.relative_to(whole)
             if target.exists():
                 continue

@@ -1,6 +1,6 @@
 """Procedural textures by name: linear RGB pictures that tile or fill a surface.
 
-A texture is data, ``{"type": "wood", ...}``; each function below is a type and its parameters are the fields. Colours
+A texture is data, ``{"type": "wood", ...}``; each function below is a type and its parameters are the fields. Colors
 are linear sRGB. ``image`` takes a picture of the user's instead.
 """
 
@@ -13,15 +13,16 @@ from typing import Any
 import cv2
 import numpy as np
 
+from polarguide.color import srgb_decode_array
 from polarguide.errors import PolarguideError
 from polarguide.synth.mesh import Array
 from polarguide.synth.noise import fractal
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 
 def wood(
-    light: Colour = (0.34, 0.19, 0.085), dark: Colour = (0.13, 0.06, 0.025), planks: int = 5, seed: int = 0,
+    light: Color = (0.34, 0.19, 0.085), dark: Color = (0.13, 0.06, 0.025), planks: int = 5, seed: int = 0,
     pixels: int = 768,
 ) -> Array:  # fmt: skip
     """Boards along u with grain and dark joints."""
@@ -39,8 +40,8 @@ def wood(
 
 
 def checker(
-    a: Colour = (0.6, 0.58, 0.52),
-    b: Colour = (0.12, 0.13, 0.15),
+    a: Color = (0.6, 0.58, 0.52),
+    b: Color = (0.12, 0.13, 0.15),
     cells: int = 8,
     pixels: int = 512,
     seed: int = 0,
@@ -53,7 +54,7 @@ def checker(
 
 
 def bricks(
-    brick: Colour = (0.30, 0.10, 0.06), mortar: Colour = (0.38, 0.36, 0.33), rows: int = 16, columns: int = 8,
+    brick: Color = (0.30, 0.10, 0.06), mortar: Color = (0.38, 0.36, 0.33), rows: int = 16, columns: int = 8,
     joint: float = 0.07, seed: int = 0, pixels: int = 768,
 ) -> Array:  # fmt: skip
     """A running bond whose stones differ in tone."""
@@ -71,10 +72,10 @@ def bricks(
 
 
 def mottled(
-    a: Colour = (0.5, 0.48, 0.44), b: Colour = (0.3, 0.29, 0.27), scale: float = 6.0, sharp: float = 1.0, seed: int = 0,
+    a: Color = (0.5, 0.48, 0.44), b: Color = (0.3, 0.29, 0.27), scale: float = 6.0, sharp: float = 1.0, seed: int = 0,
     pixels: int = 512,
 ) -> Array:  # fmt: skip
-    """Two colours mixed at random: plaster, stone, asphalt, cloth, rust."""
+    """Two colors mixed at random: plaster, stone, asphalt, cloth, rust."""
     u, v = _grid(pixels)
     mix = fractal(np.stack((u, v), -1) * scale, seed, 6)
     mix = np.clip((mix - 0.5) * 2.5 * sharp + 0.5, 0, 1)[..., None]
@@ -82,37 +83,37 @@ def mottled(
 
 
 def stripes(
-    colours: tuple[Colour, ...] = ((0.6, 0.1, 0.08), (0.7, 0.68, 0.62)), count: int = 6, across: bool = False,
+    colors: tuple[Color, ...] = ((0.6, 0.1, 0.08), (0.7, 0.68, 0.62)), count: int = 6, across: bool = False,
     seed: int = 0, pixels: int = 512,
 ) -> Array:  # fmt: skip
     """Even stripes along u, or along v where ``across``; a little worn."""
     u, v = _grid(pixels)
-    which = np.floor((u if across else v) * count).astype(int) % len(colours)
+    which = np.floor((u if across else v) * count).astype(int) % len(colors)
     worn = 0.85 + 0.3 * fractal(np.stack((u, v), -1) * 12, seed, 4)
-    return np.asarray(np.array(colours)[which] * worn[..., None])
+    return np.asarray(np.array(colors)[which] * worn[..., None])
 
 
 def tiles(
-    colours: tuple[Colour, ...] = ((0.55, 0.5, 0.4), (0.5, 0.46, 0.38)), joint: Colour = (0.16, 0.15, 0.14),
+    colors: tuple[Color, ...] = ((0.55, 0.5, 0.4), (0.5, 0.46, 0.38)), joint: Color = (0.16, 0.15, 0.14),
     cells: int = 6, seed: int = 0, pixels: int = 640,
 ) -> Array:  # fmt: skip
-    """Square tiles in random colours of a palette, with joints."""
+    """Square tiles in random colors of a palette, with joints."""
     u, v = _grid(pixels)
     row, column = np.floor(v * cells), np.floor(u * cells)
-    which = (_random(row * 31 + column, seed) * len(colours)).astype(int)
+    which = (_random(row * 31 + column, seed) * len(colors)).astype(int)
     edge = np.minimum.reduce(
         [u * cells - column, column + 1 - u * cells, v * cells - row, row + 1 - v * cells]
     )
     face = np.clip((edge - 0.02) * 60, 0, 1)[..., None]
     tone = 0.8 + 0.4 * fractal(np.stack((u, v), -1) * cells * 2, seed, 4)
-    return np.asarray((np.array(colours)[which] * face + np.array(joint) * (1 - face)) * tone[..., None])
+    return np.asarray((np.array(colors)[which] * face + np.array(joint) * (1 - face)) * tone[..., None])
 
 
 def printed(
-    paper: Colour = (0.72, 0.69, 0.6), ink: Colour = (0.05, 0.06, 0.1), accent: Colour = (0.55, 0.08, 0.05),
+    paper: Color = (0.72, 0.69, 0.6), ink: Color = (0.05, 0.06, 0.1), accent: Color = (0.55, 0.08, 0.05),
     seed: int = 0, pixels: int = 512,
 ) -> Array:  # fmt: skip
-    """A cover or poster: a frame, a picture of coloured shapes, lines of words."""
+    """A cover or poster: a frame, a picture of colored shapes, lines of words."""
     random = np.random.default_rng(seed)
     picture = np.tile(np.array(paper), (pixels, pixels, 1))
     u, v = _grid(pixels)
@@ -121,8 +122,8 @@ def printed(
     sky = np.array(accent) * (1 - v[..., None]) + np.array([0.1, 0.2, 0.4]) * v[..., None]
     picture[block] = (sky * (0.5 + tone))[block]
     for _ in range(9):
-        centre, radius = random.uniform((0.15, 0.15), (0.85, 0.53)), random.uniform(0.03, 0.13)
-        disc = (np.hypot(u - centre[0], v - centre[1]) < radius) & block
+        center, radius = random.uniform((0.15, 0.15), (0.85, 0.53)), random.uniform(0.03, 0.13)
+        disc = (np.hypot(u - center[0], v - center[1]) < radius) & block
         picture[disc] = random.uniform(0.03, 0.75, 3)
     for line in range(7):
         top = 0.63 + 0.045 * line
@@ -143,14 +144,14 @@ def image(file: str, folder: Path = Path(".")) -> Array:
     if stored is None or stored.ndim != 3 or stored.shape[2] < 3:
         raise PolarguideError(
             path,
-            expected="a colour picture (PNG, JPEG or Radiance .hdr)",
+            expected="a color picture (PNG, JPEG or Radiance .hdr)",
             found="one of another kind" if path.is_file() else "nothing",
             remedy="File names of textures and environments start at the folder of the scene file.",
         )
     picture = stored[..., 2::-1].astype(np.float64)
     if stored.dtype == np.uint8:
         picture /= 255
-        return np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
+        return srgb_decode_array(picture)
     return picture / 65535 if stored.dtype == np.uint16 else picture
 
 
@@ -171,8 +172,8 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
     maker = TEXTURES.get(kind) if isinstance(kind, str) else None
     if maker is None:
         raise PolarguideError(
-            f"{where} material.colour",
-            expected=f'a colour, "own", or a texture with type {", ".join(TEXTURES)}',
+            f"{where} material.color",
+            expected=f'a color, "own", or a texture with type {", ".join(TEXTURES)}',
             found=repr(data),
             remedy="docs/dataset.md describes them.",
         )

@@ -131,9 +131,9 @@ def _scatter(
     bsdf = si.bsdf(ray)
     ds, brought = scene.sample_emitter_direction(si, light, True, active)
     lit = active & (ds.pdf > 0)
-    towards = si.to_local(ds.d)
-    (value, pdf), (wo, density, weight, delta) = sampler(bsdf, context, si, (choose, turn), towards, active)
-    back = gain @ si.to_world_mueller(value, -towards, si.wi)
+    toward = si.to_local(ds.d)
+    (value, pdf), (wo, density, weight, delta) = sampler(bsdf, context, si, (choose, turn), toward, active)
+    back = gain @ si.to_world_mueller(value, -toward, si.wi)
     share = dr.select(ds.delta, 1.0, ds.pdf / dr.maximum(ds.pdf + pdf, TINY))
     arriving = brought[0, 0] * dr.select(lit, share, 0.0)
     direct = [back[i, 0] * arriving for i in range(3)]

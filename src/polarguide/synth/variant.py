@@ -12,7 +12,7 @@ from typing import Literal
 
 from polarguide.errors import PolarguideError
 
-Colour = Literal["rgb", "spectral"]
+Color = Literal["rgb", "spectral"]
 OLDEST_LLVM = 16
 """Older ones crash on processors that are newer than they are."""
 SLOW_PATHS_PER_SECOND = 800.0
@@ -25,28 +25,28 @@ class Variant:
 
     Attributes:
         name: Mitsuba's name.
-        colour: "rgb" renders three channels one after the other, each with exact values; "spectral" follows four
+        color: "rgb" renders three channels one after the other, each with exact values; "spectral" follows four
             wavelengths a path and converts.
         fast: compiled for all paths at once, not one by one.
         note: why the slow one had to be taken; empty otherwise.
     """
 
     name: str
-    colour: Colour
+    color: Color
     fast: bool
     note: str = ""
 
     @property
     def channels(self) -> int:
         """Renderings per picture."""
-        return 3 if self.colour == "rgb" else 1
+        return 3 if self.color == "rgb" else 1
 
 
-def choose_variant(colour: Colour = "rgb", *, threads: int = 0) -> Variant:
+def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
     """Make a polarized variant current: a fast one where LLVM's library can be loaded, else the scalar one.
 
     Args:
-        colour: how colours are rendered; the scalar variant knows only "spectral".
+        color: how colors are rendered; the scalar variant knows only "spectral".
         threads: threads to use; 0 takes all cores.
 
     Raises:
@@ -64,12 +64,12 @@ def choose_variant(colour: Colour = "rgb", *, threads: int = 0) -> Variant:
 
         lack = _llvm_lack()
     if not lack:
-        mi.set_variant("llvm_ad_mono_polarized" if colour == "rgb" else "llvm_ad_spectral_polarized")
+        mi.set_variant("llvm_ad_mono_polarized" if color == "rgb" else "llvm_ad_spectral_polarized")
         if threads:
             import drjit as dr
 
             dr.set_thread_count(threads)
-        return Variant(mi.variant(), colour, True)
+        return Variant(mi.variant(), color, True)
     with _hushed():
         mi.set_variant("scalar_spectral_polarized")
     note = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from polarguide.training.stages import Propagation
+from polarguide.training.recipe import Propagation
 from polarguide.training.state import TrainingState
 
 RESET_OPACITY = 0.01
@@ -20,10 +20,10 @@ def _logit(value: float) -> float:
 @torch.no_grad()
 def reset_opacity(state: TrainingState) -> None:
     """Opacities down to at most 0.01, so that what is not needed stays transparent (Kerbl et al. 2023)."""
-    rows = state.rows
-    rows.overwrite("opacity_logits", rows["opacity_logits"].clamp(max=_logit(RESET_OPACITY)))
-    if "strength_logits" in rows:
-        rows.overwrite("strength_logits", rows["strength_logits"].clamp(min=_logit(RESET_STRENGTH)))
+    gaussians = state.gaussians
+    gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(max=_logit(RESET_OPACITY)))
+    if "strength_logits" in gaussians:
+        gaussians.overwrite("strength_logits", gaussians["strength_logits"].clamp(min=_logit(RESET_STRENGTH)))
     state.opacity_was_reset = True
 
 
@@ -31,24 +31,24 @@ def reset_opacity(state: TrainingState) -> None:
 def propagate_normals(
     state: TrainingState, settings: Propagation, generator: torch.Generator, rest: int
 ) -> None:
-    """Let Gaussians with a right normal take over their neighbourhood (Ye et al. 2024, Sec. 3.3).
+    """Let Gaussians with a right normal take over their neighborhood (Ye et al. 2024, Sec. 3.3).
 
-    Opacities rise, matt Gaussians get noise on their colour (which hides what they explain by colour alone), and
+    Opacities rise, matte Gaussians get noise on their color (which hides what they explain by color alone), and
     glossy ones grow along their surface.
     """
-    rows = state.rows
-    strength = torch.sigmoid(rows["strength_logits"])
-    rows.overwrite("opacity_logits", rows["opacity_logits"].clamp(min=_logit(settings.opacity)))
+    gaussians = state.gaussians
+    strength = torch.sigmoid(gaussians["strength_logits"])
+    gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(min=_logit(settings.opacity)))
     # Drawn on the CPU, so that every device gets the same noise.
-    noise = (torch.rand(rows["sh_dc"].shape, generator=generator) * 2 - 1) * settings.colour_noise
-    noise = noise.to(rows["sh_dc"].device)
-    matt = (strength <= settings.matt)[:, None]
+    noise = (torch.rand(gaussians["sh_dc"].shape, generator=generator) * 2 - 1) * settings.color_noise
+    noise = noise.to(gaussians["sh_dc"].device)
+    matte = (strength <= settings.matte)[:, None]
     # The release adds the noise to the SH coefficient itself; so do we.
-    rows.overwrite("sh_dc", rows["sh_dc"] + torch.where(matt, noise, torch.zeros_like(noise)))
-    scales = rows["log_scales"]
+    gaussians.overwrite("sh_dc", gaussians["sh_dc"] + torch.where(matte, noise, torch.zeros_like(noise)))
+    scales = gaussians["log_scales"]
     longer = torch.ones_like(scales).scatter(1, scales.argmin(dim=1, keepdim=True), 0.0)
     grow = (strength >= settings.glossy)[:, None] * longer * torch.log(torch.tensor(settings.widen))
-    rows.overwrite("log_scales", scales + grow)
+    gaussians.overwrite("log_scales", scales + grow)
     state.opacity_frozen_until = state.step + rest
 
 

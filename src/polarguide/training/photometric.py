@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from polarguide import _native
-from polarguide.shading.display import srgb_encode
+from polarguide.color import srgb_encode
 
 _WINDOW = 11
 _SIGMA = 1.5
@@ -154,12 +154,12 @@ def _check(prediction: Tensor, target: Tensor, weight: Tensor | None) -> None:
 def photometric_loss(
     prediction: Tensor, target_shown: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Tensor:
-    """Mean over valid pixels and colours of ``(1 - l) |x - y| + l (1 - SSIM(x, y))``.
+    """Mean over valid pixels and colors of ``(1 - l) |x - y| + l (1 - SSIM(x, y))``.
 
     Here ``x`` is sRGB of the clipped prediction and ``y`` the target (Kerbl et al. 2023, Eq. 7, on shown
     pictures). SSIM has an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and zeros beyond the
     border, so within five pixels of it the values differ from those of metrics that mirror the picture.
-    Pixels that are left out still lie in their neighbours' windows.
+    Pixels that are left out still lie in their neighbors' windows.
 
     A value outside [0, 1] gets the gradient that the boundary would have, where a step against it leads back
     in, else zero: saturated pixels are not stuck. Not a number anywhere makes the loss not a number.

@@ -14,13 +14,13 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture import View
-from polarguide.shading.display import srgb_encode
-from polarguide.training.stages import Priors
+from polarguide.color import srgb_encode
+from polarguide.training.recipe import Priors
 from polarguide.vectors import dot, unit
 
 # Rendered normals shorter than this are too mixed to say anything.
 MINIMUM_NORMAL = 0.3
-# Colour differences that explain their polarization this much better than not count fully.
+# Color differences that explain their polarization this much better than not count fully.
 FULL_CERTAINTY = 3.0
 # Below this degree of polarization their plane takes the place of the AoLP's.
 CHROMATIC_PLANE_DOLP = 0.03
@@ -36,7 +36,7 @@ class ViewPriors:
         normal: [H, W, 3] disambiguated polarization normal, world axes.
         plane: [H, W, 3] world normal of the plane of incidence that the AoLP names.
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
-        chromatic: [H, W, 3] normal that the polarization of colour differences tells, world axes.
+        chromatic: [H, W, 3] normal that the polarization of color differences tells, world axes.
         chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
         camera: of the view.
         stokes: [3, H, W, 3] as measured.
@@ -113,7 +113,7 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
     degree = optics.dolp(luminance)
     weight = (degree / settings.full_dolp).clamp(max=1) * (usable & known)
     if settings.chromatic:
-        # Nearly unpolarized light has no AoLP to speak of; the slope among its colours may still have one.
+        # Nearly unpolarized light has no AoLP to speak of; the slope among its colors may still have one.
         better = (chromatic_weight > 0) & (degree < CHROMATIC_PLANE_DOLP)
         plane = torch.where(better[..., None], unit(torch.linalg.cross(rays, chromatic)), plane)
         weight = torch.maximum(weight, chromatic_weight)
@@ -137,14 +137,14 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
 def facing_chromatic(
     stokes: Tensor, guide: Tensor, rays: Tensor, index: float, good: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Normals of the colour differences on the guide's side of each ray, and their weights.
+    """Normals of the color differences on the guide's side of each ray, and their weights.
 
     Args:
         stokes: [3, H, W, 3]. guide: [H, W, 3] camera axes. rays: [H, W, 3]. index: refractive index.
         good: [H, W] bool, pixels whose measurement counts.
 
     Returns:
-        [H, W, 3] unit, camera axes; [H, W] in [0, 1], 0 where colour decides nothing.
+        [H, W, 3] unit, camera axes; [H, W] in [0, 1], 0 where color decides nothing.
     """
     told = optics.chromatic_normals(stokes, index)
     normal = optics.normal_from_angles(told.zenith, told.azimuth, rays)

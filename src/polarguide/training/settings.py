@@ -12,7 +12,7 @@ class TrainSettings:
     """What the user chooses about a training.
 
     Attributes:
-        steps: total number of optimiser steps.
+        steps: total number of optimizer steps.
         seed: of every random draw.
         refractive_index: of all surfaces.
         views_per_step: B. A step's gradient is the mean over B views; learning rates are those of the recipe times the

@@ -8,8 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from polarguide.capture import Scene
+from polarguide.color import srgb_decode
 from polarguide.gaussians.densify import DensityStatistics
-from polarguide.gaussians.rows import GaussianRows
+from polarguide.gaussians.gaussians import Gaussians
+from polarguide.gaussians.harmonics import SH_C0
+from polarguide.gaussians.initialize import initial_parameters
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 
 
 class Environment:
@@ -28,24 +34,24 @@ class Environment:
             name: t.detach().clone().contiguous().requires_grad_() for name, t in parameters.items()
         }
         groups = [{"params": [t], "lr": rates[name]} for name, t in self.parameters.items()]
-        self._optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def retune(self, rates: Mapping[str, float], betas: tuple[float, float]) -> None:
         """Set the learning rate of each parameter, and the decay of all moments."""
-        for name, group in zip(self.parameters, self._optimiser.param_groups, strict=True):
+        for name, group in zip(self.parameters, self._optimizer.param_groups, strict=True):
             group["lr"], group["betas"] = rates[name], betas
 
     def step(self) -> None:
         """One Adam step on what has a gradient."""
         if any(t.grad is not None for t in self.parameters.values()):
-            self._optimiser.step()
-            self._optimiser.zero_grad(set_to_none=True)
+            self._optimizer.step()
+            self._optimizer.zero_grad(set_to_none=True)
 
     def state(self) -> dict[str, Tensor]:
         """``environment.NAME`` and their moments."""
         out = {f"environment.{name}": t.detach() for name, t in self.parameters.items()}
         for name, t in self.parameters.items():
-            for key, value in self._optimiser.state.get(t, {}).items():
+            for key, value in self._optimizer.state.get(t, {}).items():
                 out[_moments(name) + key] = value.detach()
         return out
 
@@ -57,7 +63,7 @@ class Environment:
             keys = {key: _moments(name) + key for key in ("step", "exp_avg", "exp_avg_sq")}
             moments = {key: state[full].clone() for key, full in keys.items() if full in state}
             if moments:
-                environment._optimiser.state[t] = moments
+                environment._optimizer.state[t] = moments
         return environment
 
 
@@ -72,7 +78,7 @@ class TrainingState:
 
     Attributes:
         step: the next step, 0-based.
-        rows: the Gaussians.
+        gaussians: the Gaussians.
         environment: learned reflection, None for a recipe without.
         statistics: of the density control.
         frozen: copy of the rows from which the present priors were computed; None before the first refresh.
@@ -81,7 +87,7 @@ class TrainingState:
     """
 
     step: int
-    rows: GaussianRows
+    gaussians: Gaussians
     environment: Environment | None
     statistics: DensityStatistics
     frozen: dict[str, Tensor] | None = None
@@ -90,7 +96,7 @@ class TrainingState:
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for a checkpoint."""
-        out = self.rows.state()
+        out = self.gaussians.state()
         if self.environment is not None:
             out.update(self.environment.state())
         out["statistics.gradient"] = self.statistics.gradient
@@ -107,11 +113,53 @@ class TrainingState:
         cls, tensors: Mapping[str, Tensor], rates: Mapping[str, float], environment_rates: Mapping[str, float]
     ) -> TrainingState:
         """The inverse of ``tensors``."""
-        rows = GaussianRows.from_state(tensors, rates)
+        gaussians = Gaussians.from_state(tensors, rates)
         environment = None
         if "environment.texels" in tensors:
             environment = Environment.from_state(tensors, environment_rates)
         statistics = DensityStatistics.of(tensors["statistics.gradient"], tensors["statistics.seen"])
         frozen = {key[7:]: value for key, value in tensors.items() if key.startswith("frozen.")}
         step, frozen_until, was_reset = (int(x) for x in tensors["scalars"])
-        return cls(step, rows, environment, statistics, frozen or None, frozen_until, bool(was_reset))
+        return cls(step, gaussians, environment, statistics, frozen or None, frozen_until, bool(was_reset))
+
+
+def seeded(*numbers: int) -> torch.Generator:
+    """A generator that depends on all the numbers: draws do not depend on what was drawn before."""
+    value = 0
+    for number in numbers:
+        value = (value * 1_000_003 + number + 1) % (2**63 - 1)
+    return torch.Generator().manual_seed(value)
+
+
+def first_state(
+    scene: Scene, recipe: Recipe, settings: TrainSettings, device: torch.device | str = "cpu"
+) -> TrainingState:
+    """The state before the first step; drawn on the CPU, so that every device begins with the same."""
+    colors = srgb_decode(scene.point_colors.float() / 255)
+    centers = torch.stack([view.camera.center for view in scene.train_views])
+    tensors = initial_parameters(scene.points, colors, centers, recipe.initialization, seed=settings.seed)
+    count = tensors["means"].shape[0]
+    environment = None
+    if recipe.oriented:
+        tensors["outward"] = torch.zeros(count, 3)
+    if recipe.directional is not None:
+        generator = seeded(settings.seed, 5)
+        tensors.update(recipe.directional.first_parameters(tensors["sh_dc"] * SH_C0 + 0.5, generator))
+        light = recipe.directional.first_light_values(
+            recipe.environment_resolution, recipe.environment_spread, generator
+        )
+        light = {name: t.to(device) for name, t in light.items()}
+        environment = Environment(light, recipe.environment_rates)
+    elif recipe.reflects:
+        logit = torch.logit(torch.tensor(recipe.first_strength))
+        tensors["strength_logits"] = logit.expand(count).clone()
+        if recipe.local:
+            tensors["local_dc"] = torch.zeros(count, 3)
+            tensors["local_rest"] = torch.zeros(count, 15, 3)
+        size = (6, recipe.environment_resolution, recipe.environment_resolution, 3)
+        uniform = torch.rand(size, generator=seeded(settings.seed, 1)) * 2 - 1
+        texels = (uniform * recipe.environment_spread).to(device)
+        environment = Environment({"texels": texels}, recipe.environment_rates)
+    gaussians = Gaussians({name: t.to(device) for name, t in tensors.items()}, recipe.rates)
+    statistics = DensityStatistics(count, settings.views_per_step, gaussians["means"].device)
+    return TrainingState(0, gaussians, environment, statistics)

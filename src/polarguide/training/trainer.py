@@ -14,21 +14,21 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
+from polarguide.color import srgb_encode
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
-from polarguide.gaussians.initialise import scene_extent
+from polarguide.gaussians.initialize import scene_extent
 from polarguide.raster import Backend, ScreenStatistic
-from polarguide.shading.display import srgb_encode
-from polarguide.shading.render import COLOUR_CHANNELS, render
+from polarguide.shading.deferred import COLOR_CHANNELS, render
+from polarguide.shading.visibility import outward_directions
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
+from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
-from polarguide.training.orientation import outward_directions
 from polarguide.training.priors import ViewPriors, view_priors
-from polarguide.training.ranks import ALONE, Ranks
+from polarguide.training.recipe import Action, Recipe, Stage
+from polarguide.training.schedule import Schedule
 from polarguide.training.settings import StepReport, TrainSettings
-from polarguide.training.stages import Action, Recipe, Schedule, Stage
-from polarguide.training.start import first_state, seeded
-from polarguide.training.state import TrainingState
+from polarguide.training.state import TrainingState, first_state, seeded
 
 __all__ = ["StepReport", "TrainSettings", "Trainer", "first_state"]
 
@@ -47,7 +47,7 @@ class Trainer:
         scene: the capture.
         recipe: the method.
         settings: the user's choices.
-        backend: device and rasteriser.
+        backend: device and rasterizer.
         state: where to go on from, on the backend's device; None: from the beginning.
         ranks: the processes that share the views of each step.
     """
@@ -67,9 +67,9 @@ class Trainer:
         self.state = state or first_state(scene, recipe, settings, backend.device)
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
-        centres = torch.stack([view.camera.centre for view in scene.train_views])
-        self._extent = scene_extent(centres)
-        self._middle = centres.mean(dim=0).float().to(self._device)
+        centers = torch.stack([view.camera.center for view in scene.train_views])
+        self._extent = scene_extent(centers)
+        self._middle = centers.mean(dim=0).float().to(self._device)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
         self._limit = int(pixels / recipe.densification.pixels_each)
         empty = free_space(scene.points, [view.camera for view in scene.train_views])
@@ -83,7 +83,7 @@ class Trainer:
             on_step(self.step())
 
     def step(self) -> StepReport:
-        """One optimiser step."""
+        """One optimizer step."""
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
         for action in position.actions:
@@ -92,14 +92,14 @@ class Trainer:
         # A rank without a view looks at the first one, so that it knows what has gradients, and adds nothing.
         measured = [self._look(slot, position.stage, bool(mine)) for slot in mine or range(1)]
         self._join_gradients(idle=not mine)
-        self._optimise()
+        self._optimize()
         told = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
-        report = StepReport(state.step, position.stage.name, len(state.rows), told)
+        report = StepReport(state.step, position.stage.name, len(state.gaussians), told)
         state.step += 1
         if position.stage.densify and state.step % recipe.densification.every == 0:
             self.exchange_statistics()
             densify(
-                state.rows,
+                state.gaussians,
                 state.statistics,
                 recipe.densification,
                 extent=self._extent,
@@ -120,11 +120,11 @@ class Trainer:
         """Render the view of a slot and add its gradients; [3] as of ``StepReport.measured``."""
         state, recipe = self.state, self.recipe
         view = self._view_of(state.step * self.settings.views_per_step + slot)
-        statistic = ScreenStatistic(COLOUR_CHANNELS) if stage.densify else None
+        statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
         result = render(
-            state.rows,
+            state.gaussians,
             view.camera,
-            self.backend.rasterise,
+            self.backend.rasterize,
             sh_degree=self.schedule.sh_degree(state.step),
             environment=state.environment.parameters if state.environment and stage.reflection else None,
             shading=recipe.shading(self.settings.refractive_index),
@@ -141,7 +141,7 @@ class Trainer:
             self._priors_of(view, stage),
             ssim_weight=recipe.ssim_weight,
             index=self.settings.refractive_index,
-            log_scales=state.rows["log_scales"],
+            log_scales=state.gaussians["log_scales"],
             extent=self._extent,
             camera=view.camera,
         )
@@ -157,33 +157,33 @@ class Trainer:
         if views == 1 and self.ranks.world == 1:
             return
         light = self.state.environment.parameters.values() if self.state.environment else ()
-        gradients = [t.grad for t in (*self.state.rows.trained(), *light) if t.grad is not None]
+        gradients = [t.grad for t in (*self.state.gaussians.trained(), *light) if t.grad is not None]
         if idle:
             torch._foreach_zero_(gradients)
-        self.ranks.add_up(gradients)
+        self.ranks.all_reduce(gradients)
         if views > 1:
             torch._foreach_div_(gradients, float(views))
 
     def _use_batch_rates(self) -> None:
-        """What the optimisers need for more than one view a step; see ``TrainSettings``."""
+        """What the optimizers need for more than one view a step; see ``TrainSettings``."""
         views = self.settings.views_per_step
         if views == 1:
             return
         betas = (0.9**views, 0.999**views)
-        self.state.rows.set_betas(betas)
+        self.state.gaussians.set_betas(betas)
         if self.state.environment is not None:
             rates = {name: rate * self._rate for name, rate in self.recipe.environment_rates.items()}
             self.state.environment.retune(rates, betas)
 
-    def _optimise(self) -> None:
+    def _optimize(self) -> None:
         state = self.state
         rates = self.schedule.rates(state.step)
         rates["means"] *= self._extent
         if state.step < state.opacity_frozen_until:
             rates["opacity_logits"] = 0.0
         for name, rate in rates.items():
-            state.rows.set_rate(name, rate * self._rate)
-        state.rows.step()
+            state.gaussians.set_rate(name, rate * self._rate)
+        state.gaussians.step()
         if state.environment is not None:
             state.environment.step()
 
@@ -195,12 +195,12 @@ class Trainer:
             rest = min(OPACITY_REST, self.settings.steps // 50)
             propagate_normals(self.state, self.recipe.propagation, generator, rest)
         elif action == "orient_normals":
-            rows, rasterise = self.state.rows, self.backend.rasterise
-            outward = outward_directions(rows, self.scene.train_views, rasterise)
-            self.ranks.agree(outward)
-            rows.overwrite("outward", outward)
+            gaussians, rasterize = self.state.gaussians, self.backend.rasterize
+            outward = outward_directions(gaussians, self.scene.train_views, rasterize)
+            self.ranks.broadcast(outward)
+            gaussians.overwrite("outward", outward)
         else:
-            self.state.frozen = self.state.rows.snapshot()
+            self.state.frozen = self.state.gaussians.snapshot()
             self._priors.clear()
 
     def _view_of(self, place: int) -> View:
@@ -228,7 +228,7 @@ class Trainer:
                 self._act("refresh_priors")
             assert self.state.frozen is not None
             with torch.no_grad():
-                guide = render(self.state.frozen, view.camera, self.backend.rasterise, sh_degree=0).normal
+                guide = render(self.state.frozen, view.camera, self.backend.rasterize, sh_degree=0).normal
             assert guide is not None
             self._priors[view.name] = view_priors(
                 view, guide, self.recipe.priors, self.settings.refractive_index

@@ -10,18 +10,18 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import View
-from polarguide.evaluation import figures
-from polarguide.evaluation.figures import Picture
-from polarguide.evaluation.pictures import depth_range, layer_picture
 from polarguide.export.environment import RELIT_RESOLUTION, turned_cubemap
 from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
 from polarguide.optics import aolp, dolp, luminance, stokes
-from polarguide.shading.model import Rows
-from polarguide.shading.render import Shading
+from polarguide.scene_frame import SceneFrame
+from polarguide.shading.deferred import Shading
+from polarguide.shading.model import Parameters
 from polarguide.shading.result import RenderResult
-from polarguide.surroundings import Surroundings
 from polarguide.viewer.lens import fit
 from polarguide.viewer.shown import Shown
+from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture
+from polarguide.visualization.layers import depth_range, layer_picture
 
 MEASURED = ("photograph", "DoLP", "AoLP", "error")
 """Layers that only a photograph's pose has."""
@@ -31,7 +31,7 @@ RADIANCE = {"final", "diffuse", "specular", "base", "reflection"}
 
 @dataclass(frozen=True)
 class Crop:
-    """A box about the scene's centre along the cameras' common right, up and back.
+    """A box about the scene's center along the cameras' common right, up and back.
 
     Attributes:
         low, high: corners in shares of the cameras' distance.
@@ -40,16 +40,16 @@ class Crop:
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
-    def corners(self, around: Surroundings) -> Tensor:
+    def corners(self, around: SceneFrame) -> Tensor:
         """Its eight corners in the world, [8, 3] float64, the last axis fastest."""
         sides = torch.tensor([self.low, self.high], dtype=torch.float64)
         local = torch.cartesian_prod(*sides.T) * around.distance
-        return around.centre + local @ around.panorama_axes().T
+        return around.center + local @ around.panorama_axes().T
 
-    def inside(self, means: Tensor, around: Surroundings) -> Tensor:
+    def inside(self, means: Tensor, around: SceneFrame) -> Tensor:
         """Which means [N, 3] lie in it, [N] bool."""
-        axes, centre = (t.to(means) for t in (around.panorama_axes(), around.centre))
-        local = (means - centre) @ axes / around.distance
+        axes, center = (t.to(means) for t in (around.panorama_axes(), around.center))
+        local = (means - center) @ axes / around.distance
         low, high = (
             torch.tensor(side, dtype=local.dtype, device=local.device) for side in (self.low, self.high)
         )
@@ -82,7 +82,7 @@ class Painter:
         around: the scene's surroundings.
     """
 
-    def __init__(self, around: Surroundings) -> None:
+    def __init__(self, around: SceneFrame) -> None:
         self.around = around
         self._depths: tuple[float, float] | None = None
 
@@ -101,7 +101,7 @@ class Painter:
             shown: the scene. camera: with the window's size; of the pose alone, where there is a view.
             appearance: what to draw.
             view: the photograph at whose pose it is drawn.
-            settled: whether the camera rests; the colours of depths follow the picture only then.
+            settled: whether the camera rests; the colors of depths follow the picture only then.
 
         Returns:
             uint8 [H, W, 3] of the camera's size; None where there is no such layer.
@@ -120,12 +120,12 @@ class Painter:
         return self._layer(self._result(shown, camera, appearance), camera, appearance, settled=settled)
 
     def _result(self, shown: Shown, camera: Camera, appearance: Appearance) -> RenderResult:
-        rows: Rows = shown.rows
+        gaussians: Parameters = shown.gaussians
         if appearance.crop is not None:
-            kept = appearance.crop.inside(shown.rows["means"].detach(), self.around)
-            rows = {name: shown.rows[name].detach()[kept] for name in shown.rows.names}
+            kept = appearance.crop.inside(shown.gaussians["means"].detach(), self.around)
+            gaussians = {name: shown.gaussians[name].detach()[kept] for name in shown.gaussians.names}
         light = self._light(shown, appearance.turn)
-        result = shown.render(camera, rows, light, depth=appearance.layer == "depth")
+        result = shown.render(camera, gaussians, light, depth=appearance.layer == "depth")
         if result.specular is None or result.diffuse is None or appearance.strength == 1.0:
             return result
         specular = appearance.strength * result.specular
@@ -159,7 +159,7 @@ class Painter:
         if appearance.layer == "error":
             final = self._result(shown, view.camera, appearance).final
             return figures.error_to_rgb(final * brighter, view.photograph() * brighter)
-        grey = luminance(stokes(view.intensities()))
+        gray = luminance(stokes(view.intensities()))
         if appearance.layer == "DoLP":
-            return figures.dolp_to_rgb(dolp(grey), DOLP_HIGH)
-        return figures.aolp_to_rgb(aolp(grey), dolp(grey) / AOLP_FULL_DOLP)
+            return figures.dolp_to_rgb(dolp(gray), DOLP_HIGH)
+        return figures.aolp_to_rgb(aolp(gray), dolp(gray) / AOLP_FULL_DOLP)

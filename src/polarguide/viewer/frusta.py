@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.surroundings import Surroundings
+from polarguide.scene_frame import SceneFrame
 from polarguide.viewer.appearance import Crop
 from polarguide.viewer.lens import quaternion
 from polarguide.viewer.photographs import Photograph
 
 SIZE, NEAR = 0.05, 0.4  # of the cameras' distance: of a frustum, and within which it is left out
-COLOUR, HELD_OUT_COLOUR, BOX_COLOUR = (60, 90, 160), (200, 120, 30), (240, 200, 40)
+COLOR, HELD_OUT_COLOR, BOX_COLOR = (60, 90, 160), (200, 120, 30), (240, 200, 40)
 # The twelve edges of a box whose eight corners are counted with the last axis fastest.
 EDGES = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
 
@@ -30,12 +30,12 @@ class Frusta:
         self,
         scene: Any,
         photographs: Sequence[Photograph],
-        around: Surroundings,
+        around: SceneFrame,
         go: Callable[[str], None],
     ) -> None:
         self._scene, self._around = scene, around
         self._visible, self._far = True, np.ones(len(photographs), dtype=bool)
-        self._centres = np.array([p.view.camera.centre.numpy() for p in photographs]).reshape(-1, 3)
+        self._centers = np.array([p.view.camera.center.numpy() for p in photographs]).reshape(-1, 3)
         self._reach = NEAR * around.distance
         self._handles: list[Any] = []
         for number, photograph in enumerate(photographs):
@@ -46,11 +46,11 @@ class Frusta:
                 aspect=camera.width / camera.height,
                 scale=SIZE * around.distance,
                 thickness=0.02 * SIZE * around.distance,
-                color=HELD_OUT_COLOUR if photograph.held_out else COLOUR,
+                color=HELD_OUT_COLOR if photograph.held_out else COLOR,
                 image=photograph.thumbnail,
                 jpeg_quality=80,
                 wxyz=quaternion(camera),
-                position=camera.centre.numpy(),
+                position=camera.center.numpy(),
                 cast_shadow=False,
                 receive_shadow=False,
             )
@@ -68,7 +68,7 @@ class Frusta:
 
         They would cover the picture.
         """
-        near = True if position is None else np.linalg.norm(self._centres - position, axis=1) < self._reach
+        near = True if position is None else np.linalg.norm(self._centers - position, axis=1) < self._reach
         self._far = ~np.broadcast_to(near, len(self._handles))
         self._update()
 
@@ -87,4 +87,4 @@ class Frusta:
             corners = crop.corners(self._around).numpy()
             points = np.array([[corners[a], corners[b]] for a, b in EDGES], dtype=np.float32)
             width = 0.0015 * self._around.distance
-            self._box = self._scene.add_line_segments("/crop", points, BOX_COLOUR, thickness=width)
+            self._box = self._scene.add_line_segments("/crop", points, BOX_COLOR, thickness=width)

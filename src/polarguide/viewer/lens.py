@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from polarguide.camera import Camera
-from polarguide.evaluation.figures import Picture
+from polarguide.visualization.figures import Picture
 
 
 def free_camera(
@@ -27,9 +27,9 @@ def free_camera(
     width, height = size
     w, x, y, z = (float(v) for v in wxyz)
     rotation = torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix().T.copy())
-    centre = torch.tensor([float(v) for v in position], dtype=torch.float64)
+    center = torch.tensor([float(v) for v in position], dtype=torch.float64)
     focal = 0.5 * height / math.tan(0.5 * fov)
-    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, -rotation @ centre)
+    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, -rotation @ center)
 
 
 def quaternion(camera: Camera) -> tuple[float, float, float, float]:
@@ -66,7 +66,7 @@ class Fit:
         )
 
     def placed(self, picture: Picture) -> Picture:
-        """A picture of the photograph's size in a window that is grey around it."""
+        """A picture of the photograph's size in a window that is gray around it."""
         matrix = np.array([[self.scale, 0, self.left], [0, self.scale, self.top]])
         # warpAffine counts from the middle of the corner pixel, our cameras from its corner.
         matrix[:, 2] += 0.5 * self.scale - 0.5

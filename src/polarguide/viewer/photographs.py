@@ -8,8 +8,8 @@ import cv2
 import torch
 
 from polarguide.capture import Scene, View
-from polarguide.evaluation import figures
-from polarguide.evaluation.figures import Picture
+from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture
 
 THUMBNAIL = 96  # pixels of the longer side
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from polarguide.capture import View
-from polarguide.surroundings import Surroundings
+from polarguide.scene_frame import SceneFrame
 from polarguide.viewer.lens import window_fov
 
 ARRIVAL = 5.0  # seconds that a browser has to reach a pose
@@ -42,15 +42,15 @@ class Place:
         return there or (not self.reached and now - self.since < ARRIVAL)
 
 
-def stand(client: Any, view: View, around: Surroundings, now: float) -> Place:
+def stand(client: Any, view: View, around: SceneFrame, now: float) -> Place:
     """Put a browser's camera where a photograph was taken, with a field of view that holds it."""
-    camera, lens, centre = client.camera, view.camera, view.camera.centre
-    # Turning goes round a point that the photograph sees, at the distance of the scene's centre.
+    camera, lens, center = client.camera, view.camera, view.camera.center
+    # Turning goes round a point that the photograph sees, at the distance of the scene's center.
     ahead = lens.rotation[2]
-    distance = max(float((around.centre - centre) @ ahead), 0.1 * around.distance)
+    distance = max(float((around.center - center) @ ahead), 0.1 * around.distance)
     with client.atomic():
         camera.fov = window_fov(lens, camera.aspect)
         camera.up_direction = (-lens.rotation[1]).numpy()
-        camera.position = centre.numpy()
-        camera.look_at = (centre + distance * ahead).numpy()
+        camera.position = center.numpy()
+        camera.look_at = (center + distance * ahead).numpy()
     return Place(view, np.array(camera.wxyz), np.array(camera.position), now)

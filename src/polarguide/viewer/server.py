@@ -11,10 +11,9 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from polarguide.errors import PolarguideError
-from polarguide.export.extras import needed
-from polarguide.shading.render import Shading
-from polarguide.surroundings import surroundings
+from polarguide.errors import PolarguideError, optional_import
+from polarguide.scene_frame import scene_frame
+from polarguide.shading.deferred import Shading
 from polarguide.viewer.panel import Offer
 from polarguide.viewer.photographs import Photograph
 from polarguide.viewer.shown import Shown
@@ -59,11 +58,11 @@ class Viewer:
         port: int = 8080,
         title: str = "polarguide",
     ) -> None:
-        viser = needed("viser", "the viewer", install="'viser>=1.1'")
+        viser = optional_import("viser", "the viewer", install="'viser>=1.1'")
         # Of pictures for a browser that has just left.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self._look, self._photographs = look, photographs
-        self._around = surroundings([photograph.view.camera for photograph in photographs.values()])
+        self._around = scene_frame([photograph.view.camera for photograph in photographs.values()])
         turns = lit and isinstance(look().shading, Shading)
         self._offer = Offer(lit, turns, tuple(photographs), trains)
         self._visitors: dict[int, Visitor] = {}

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.gaussians.rows import GaussianRows
-from polarguide.raster.interface import Rasterise
-from polarguide.shading.model import Rows, ShadingModel
-from polarguide.shading.render import render
+from polarguide.gaussians.gaussians import Gaussians
+from polarguide.raster.interface import Rasterize
+from polarguide.runs.opened import TrainedRun
+from polarguide.shading.deferred import render
+from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
-from polarguide.trained import TrainedRun
 from polarguide.training.trainer import Trainer
 
 
@@ -23,27 +23,27 @@ class Shown:
     """A scene to be rendered.
 
     Attributes:
-        rows: the Gaussians. environment: parameters of the learned light; None: no reflection (yet).
-        shading: of the recipe. rasterise: of the backend. sh_degree: of the base colour.
+        gaussians: the Gaussians. environment: parameters of the learned light; None: no reflection (yet).
+        shading: of the recipe. rasterize: of the backend. sh_degree: of the base color.
         status: a line about it.
     """
 
-    rows: GaussianRows
+    gaussians: Gaussians
     environment: Mapping[str, Tensor] | None
     shading: ShadingModel
-    rasterise: Rasterise
+    rasterize: Rasterize
     sh_degree: int
     status: str
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, rows: Rows, environment: Mapping[str, Tensor] | None, *, depth: bool
+        self, camera: Camera, gaussians: Parameters, environment: Mapping[str, Tensor] | None, *, depth: bool
     ) -> RenderResult:
         """All layers, on the CPU, of some of its rows in some light."""
         return render(
-            rows,
+            gaussians,
             camera,
-            self.rasterise,
+            self.rasterize,
             sh_degree=self.sh_degree,
             environment=environment,
             shading=self.shading,
@@ -53,9 +53,9 @@ class Shown:
 
 def shown_run(run: TrainedRun) -> Shown:
     """A trained run."""
-    rows = run.state.rows
-    status = f"{run.recipe.name}, {run.state.step:,} steps; {len(rows):,} Gaussians"
-    return Shown(rows, run.environment, run.shading, run.backend.rasterise, 3, status)
+    gaussians = run.state.gaussians
+    status = f"{run.recipe.name}, {run.state.step:,} steps; {len(gaussians):,} Gaussians"
+    return Shown(gaussians, run.environment, run.shading, run.backend.rasterize, 3, status)
 
 
 def shown_training(trainer: Trainer) -> Shown:
@@ -63,12 +63,13 @@ def shown_training(trainer: Trainer) -> Shown:
     state, steps = trainer.state, trainer.settings.steps
     stage = trainer.schedule.at(min(state.step, steps - 1)).stage
     light = state.environment.parameters if state.environment and stage.reflection else None
-    status = f"{trainer.recipe.name}, step {state.step:,} of {steps:,} ({stage.name}); {len(state.rows):,} Gaussians"
+    progress = f"step {state.step:,} of {steps:,} ({stage.name})"
+    status = f"{trainer.recipe.name}, {progress}; {len(state.gaussians):,} Gaussians"
     return Shown(
-        state.rows,
+        state.gaussians,
         light,
         trainer.recipe.shading(trainer.settings.refractive_index),
-        trainer.backend.rasterise,
+        trainer.backend.rasterize,
         trainer.schedule.sh_degree(min(state.step, steps - 1)),
         status,
     )

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from polarguide.camera import Camera
-from polarguide.evaluation.figures import Picture, png_bytes
-from polarguide.surroundings import Surroundings
+from polarguide.scene_frame import SceneFrame
 from polarguide.viewer.appearance import Painter
 from polarguide.viewer.frusta import Frusta
 from polarguide.viewer.keys import FRAMES_PER_SECOND, Keys
@@ -21,6 +20,7 @@ from polarguide.viewer.panel import NOWHERE, Offer, Panel
 from polarguide.viewer.photographs import Photograph
 from polarguide.viewer.place import Place, stand
 from polarguide.viewer.shown import Shown
+from polarguide.visualization.figures import Picture, png_bytes
 
 PATH_FILE, PICTURE_FILE = "camera_path.json", "polarguide.png"
 JPEG_QUALITY = 75
@@ -39,7 +39,7 @@ class Visitor:
         self,
         client: Any,
         photographs: Mapping[str, Photograph],
-        around: Surroundings,
+        around: SceneFrame,
         offer: Offer,
         wake: Callable[[], None],
     ) -> None:
@@ -160,9 +160,9 @@ class Visitor:
         camera, lens = self._client.camera, path[frame]
         ahead = float(np.linalg.norm(camera.look_at - camera.position))
         with self._client.atomic():
-            camera.position = lens.centre.numpy()
+            camera.position = lens.center.numpy()
             camera.up_direction = (-lens.rotation[1]).numpy()
-            camera.look_at = (lens.centre + ahead * lens.rotation[2]).numpy()
+            camera.look_at = (lens.center + ahead * lens.rotation[2]).numpy()
         self.pace.change(time.monotonic())
 
     def wants(self) -> str | None:
@@ -185,7 +185,7 @@ class Visitor:
         appearance = self.panel.appearance
         picture = self._painter.paint(shown, lens, appearance, view, settled=sharp)
         self._send(picture, size, sharp=sharp)
-        self._frusta.seen_from(None if view else lens.centre.numpy())
+        self._frusta.seen_from(None if view else lens.center.numpy())
         if screenshot and picture is not None:
             self._client.send_file_download(PICTURE_FILE, png_bytes(picture), save_immediately=True)
         now = time.monotonic()

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import rq
 
-from polarguide.capture.arrays import numbers, read_arrays
-from polarguide.capture.posed_camera import PosedCamera
+from polarguide.capture.colmap.write import PosedCamera
+from polarguide.capture.formats.arrays import numbers, read_arrays
 from polarguide.errors import PolarguideError
 
 _LARGEST_SKEW = 1e-3
@@ -23,7 +23,7 @@ Matrix = NDArray[np.float64]
 def read_projections(path: Path) -> dict[int, tuple[Matrix, Matrix, Matrix]]:
     """Cameras of a file with ``world_mat_<i>`` and ``scale_mat_<i>`` (IDR): P = world_mat @ scale_mat.
 
-    The world of the result is the normalised one, in which the object lies in the unit sphere.
+    The world of the result is the normalized one, in which the object lies in the unit sphere.
 
     Returns:
         Number -> K [3, 3] with K[2, 2] = 1, world-to-camera rotation [3, 3] and translation [3].
@@ -123,7 +123,7 @@ def distorted(
 ) -> PosedCamera:
     """A camera of OpenCV's calibration, with 4, 5 or 8 distortion coefficients.
 
-    OpenCV counts from the centre of the top-left pixel, COLMAP from its corner: the principal point moves by half.
+    OpenCV counts from the center of the top-left pixel, COLMAP from its corner: the principal point moves by half.
 
     Raises:
         PolarguideError: there are other coefficients.

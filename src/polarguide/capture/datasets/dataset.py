@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.pictures import decode_stored, read_file
-from polarguide.capture.posed_camera import PosedCamera
+from polarguide.capture.colmap.write import PosedCamera
+from polarguide.capture.formats.pictures import decode_stored, read_file
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 

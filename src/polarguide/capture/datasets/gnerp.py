@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.arrays import numbers as finite
-from polarguide.capture.arrays import read_array
+from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.datasets.cameras import checked_intrinsics, checked_pose, missing, pinhole
 from polarguide.capture.datasets.dataset import (
     Dataset,
@@ -26,12 +25,13 @@ from polarguide.capture.datasets.dataset import (
     same_shape,
     size_of_first,
 )
+from polarguide.capture.formats.arrays import numbers as finite
+from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_picture, linear_codes, read_file
 from polarguide.capture.layout import index_files
-from polarguide.capture.pictures import SUFFIXES, decode_mask, decode_picture, linear_codes, read_file
-from polarguide.capture.posed_camera import PosedCamera
-from polarguide.capture.sidecars import parse_json
 from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
+from polarguide.records import parse_json
 
 _SHAPES = ((3, 4), (4, 4))
 

@@ -1,7 +1,7 @@
 """NeISF: signed Stokes vectors as EXR pictures, one focal length, poses of LLFF.
 
 ``images_s0|s1|s2/img_%03d.exr`` and ``masks/img_%03d.png``, counted from 1; ``poses_bounds.npy``, [N, 17], one row a
-picture: a 3x5 matrix (camera axes down, right, back and centre in the world; height, width, focal length), two bounds.
+picture: a 3x5 matrix (camera axes down, right, back and center in the world; height, width, focal length), two bounds.
 Its release does not state the sense of its angles.
 """
 
@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.arrays import numbers as finite
-from polarguide.capture.arrays import read_array
+from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.datasets.cameras import checked_pose, pinhole
 from polarguide.capture.datasets.dataset import Dataset, Light, cameras_of_views, require_files, same_shape
+from polarguide.capture.formats.arrays import numbers as finite
+from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.formats.pictures import decode_mask, read_file
+from polarguide.capture.formats.radiance import read_radiance
 from polarguide.capture.layout import index_files
-from polarguide.capture.pictures import decode_mask, read_file
-from polarguide.capture.posed_camera import PosedCamera
-from polarguide.capture.radiance import read_radiance
 from polarguide.errors import PolarguideError
 
 _PARTS = ("images_s0", "images_s1", "images_s2")
@@ -82,7 +82,7 @@ def _cameras(path: Path) -> dict[int, PosedCamera]:
     cameras = {}
     for index, row in enumerate(rows):
         where = f"{path} (row {index})"
-        down, right, back, centre, inner = finite(where, row[:15], ((15,),)).reshape(3, 5).T
+        down, right, back, center, inner = finite(where, row[:15], ((15,),)).reshape(3, 5).T
         height, width, focal = inner
         if not (1 <= height <= 1e5 and 1 <= width <= 1e5 and focal > 0):
             raise PolarguideError(
@@ -96,5 +96,5 @@ def _cameras(path: Path) -> dict[int, PosedCamera]:
         )  # OpenCV's: right, down, forward
         rotation, _ = checked_pose(where, axes)
         middle = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        cameras[index + 1] = pinhole((round(width), round(height)), middle, rotation, -rotation @ centre)
+        cameras[index + 1] = pinhole((round(width), round(height)), middle, rotation, -rotation @ center)
     return cameras

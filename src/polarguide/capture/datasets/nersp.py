@@ -21,9 +21,9 @@ from polarguide.capture.datasets.dataset import (
     same_shape,
     size_of_first,
 )
+from polarguide.capture.formats.pictures import SUFFIXES, decode_stored, read_file
+from polarguide.capture.formats.radiance import read_radiance
 from polarguide.capture.layout import index_files
-from polarguide.capture.pictures import SUFFIXES, decode_stored, read_file
-from polarguide.capture.radiance import read_radiance
 
 _PARTS = ("s0", "s1", "s2")
 

@@ -1,4 +1,4 @@
-"""PISR: raw mosaics of a colour sensor, a calibrated lens.
+"""PISR: raw mosaics of a color sensor, a calibrated lens.
 
 ``raw/%03d.npy`` (12 bits in 16, 2448x2048); ``mask/%03d.png``; ``intrinsics.npz`` (camera_matrix at half the sensor's
 size, dist_coeffs, both of OpenCV); ``cameras_sphere.npz`` for the poses; ``gamma<number>.txt``: stored values are the
@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.arrays import numbers as finite
-from polarguide.capture.arrays import read_arrays
 from polarguide.capture.datasets.cameras import checked_intrinsics, distorted, missing, read_projections
 from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, numbered
+from polarguide.capture.formats.arrays import numbers as finite
+from polarguide.capture.formats.arrays import read_arrays
+from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
 from polarguide.capture.layout import index_files
-from polarguide.capture.pictures import SUFFIXES, decode_mask, read_file
 from polarguide.errors import PolarguideError
 
 SENSOR = "IMX250MYR"

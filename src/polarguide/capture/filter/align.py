@@ -37,7 +37,7 @@ def find_shifts(linear: NDArray[np.float32]) -> list[Shift]:
     """Shifts of the four shots against the first.
 
     Phase correlation of the logarithms' fine detail finds a start (brightness and polarization change slowly
-    across a surface, edges stay); maximising the enhanced correlation coefficient refines it to a fraction of
+    across a surface, edges stay); maximizing the enhanced correlation coefficient refines it to a fraction of
     a pixel. Edges of polarization can mislead both, so the shifts are trusted only if with them
     I0 + I90 = I45 + I135 holds better than without.
 
@@ -97,8 +97,8 @@ def _remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]
 
 
 def _detail(shot: NDArray[np.float32]) -> NDArray[np.float32]:
-    grey = np.log(shot.mean(axis=2) + np.float32(0.01))
-    fine = cv2.GaussianBlur(grey, (0, 0), 0.8) - cv2.GaussianBlur(grey, (0, 0), 5.0)
+    gray = np.log(shot.mean(axis=2) + np.float32(0.01))
+    fine = cv2.GaussianBlur(gray, (0, 0), 0.8) - cv2.GaussianBlur(gray, (0, 0), 5.0)
     return np.asarray(fine, np.float32)
 
 

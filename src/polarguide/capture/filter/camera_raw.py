@@ -1,7 +1,7 @@
 """Camera raw files -> linear pictures, every shot in the same way.
 
 LibRaw (package rawpy) develops them with everything off that looks at the picture: no automatic brightness, white
-level or white balance, no gamma, no colour matrix. What is left is the same for every shot: black level, fixed
+level or white balance, no gamma, no color matrix. What is left is the same for every shot: black level, fixed
 gains, a linear scale and demosaicing.
 """
 
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.pictures import LARGEST_PIXELS, read_file
+from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
 from polarguide.errors import PolarguideError
 
 CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
@@ -47,7 +47,7 @@ def read_camera_raw(
         opener: takes the file's bytes and returns what ``rawpy.imread`` would; rawpy itself if None.
 
     Returns:
-        [H, W, 3] linear RGB in the camera's own colours, not turned; and the EXIF orientation, 1 to 8.
+        [H, W, 3] linear RGB in the camera's own colors, not turned; and the EXIF orientation, 1 to 8.
 
     Raises:
         PolarguideError: rawpy is missing, or the file cannot be read or is damaged.
@@ -77,7 +77,7 @@ def read_camera_raw(
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint16:
         raise PolarguideError(
             path,
-            expected="a camera raw file with three colours",
+            expected="a camera raw file with three colors",
             found=f"an array {'x'.join(map(str, pixels.shape))} of {pixels.dtype}",
             remedy="Develop it to 16-bit linear TIFF.",
         )

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
 from polarguide.capture.filter.exif import orientation
+from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_file
 from polarguide.capture.layout import angle_folders, index_files, pictures_of_folders
-from polarguide.capture.pictures import SUFFIXES, decode_picture, read_file
 from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import require_alike
 from polarguide.errors import PolarguideError

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.pictures import TRANSFERS, linear_codes
+from polarguide.capture.formats.pictures import TRANSFERS, linear_codes
 from polarguide.capture.view import FULL_CODE
 
 _CLEARLY = 0.9

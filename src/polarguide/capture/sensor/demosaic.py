@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from polarguide.capture.sensor.interpolate import (
     GUIDED_RADIUS,
     bilinear,
-    guided_colour,
+    guided_color,
     guided_polarization,
     used_by_bilinear,
 )
@@ -44,12 +44,12 @@ def demosaic(
 ) -> Picture:
     """Demosaic one mosaic.
 
-    ``half``: each 2x2 polarizer cell is one pixel; the cells of a colour sensor form a Bayer picture per angle.
-    ``quarter``: each 4x4 superpixel is one pixel, the mean of its samples of an angle and colour; nothing is
-    interpolated. ``full``: every sensor pixel; colours are interpolated between cells of one angle, then angles
-    between neighbouring pixels.
+    ``half``: each 2x2 polarizer cell is one pixel; the cells of a color sensor form a Bayer picture per angle.
+    ``quarter``: each 4x4 superpixel is one pixel, the mean of its samples of an angle and color; nothing is
+    interpolated. ``full``: every sensor pixel; colors are interpolated between cells of one angle, then angles
+    between neighboring pixels.
 
-    The four samples of a cell lie half a cell apart. ``half`` brings them to its centre if ``registered``: S1 and S2
+    The four samples of a cell lie half a cell apart. ``half`` brings them to its center if ``registered``: S1 and S2
     are means over the cell of what ``full`` makes of it, and so is S0 if interpolation is guided; bilinear
     interpolation would only blur S0, which is that of the cell's own samples.
 
@@ -58,7 +58,7 @@ def demosaic(
         bad: unusable samples, [H, W].
         pattern: of the top-left pixel, which starts a whole polarizer cell.
         mode: a key of ``DEMOSAIC_MODES``.
-        interpolation: one of ``INTERPOLATIONS``; ``quarter`` and a monochrome ``half`` interpolate no colours.
+        interpolation: one of ``INTERPOLATIONS``; ``quarter`` and a monochrome ``half`` interpolate no colors.
         registered: whether ``half`` brings the four angles to one place.
 
     Returns:
@@ -79,46 +79,46 @@ def demosaic(
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Colours at every sensor pixel: position (row, column) in the cell -> [H/2, W/2, C], and what is bad."""
+    """Colors at every sensor pixel: position (row, column) in the cell -> [H/2, W/2, C], and what is bad."""
 
-    colours: dict[tuple[int, int], Array]
+    colors: dict[tuple[int, int], Array]
     bad: dict[tuple[int, int], Mask]
 
 
 def _cells(values: Array, bad: Mask, pattern: Pattern, interpolation: str) -> _Cells:
-    colours: dict[tuple[int, int], Array] = {}
+    colors: dict[tuple[int, int], Array] = {}
     wrong: dict[tuple[int, int], Mask] = {}
     for row, column in np.ndindex(2, 2):
         sample, mask = values[row::2, column::2], bad[row::2, column::2]
-        if pattern.colours is None:
-            colours[row, column], wrong[row, column] = sample[..., None], mask
+        if pattern.colors is None:
+            colors[row, column], wrong[row, column] = sample[..., None], mask
             continue
-        bayer = _tiled(pattern.colours[row::2, column::2], sample.shape)
+        bayer = _tiled(pattern.colors[row::2, column::2], sample.shape)
         if interpolation == "bilinear":
-            planes = [bilinear(sample, bayer == colour) for colour in range(3)]
-            uses = [used_by_bilinear(mask, bayer == colour) for colour in range(3)]
-            colours[row, column] = np.stack(planes, axis=-1)
+            planes = [bilinear(sample, bayer == color) for color in range(3)]
+            uses = [used_by_bilinear(mask, bayer == color) for color in range(3)]
+            colors[row, column] = np.stack(planes, axis=-1)
             wrong[row, column] = np.any(uses, axis=0)
         else:
-            colours[row, column] = guided_colour(sample, bayer)
+            colors[row, column] = guided_color(sample, bayer)
             wrong[row, column] = _grown(mask, GUIDED_RADIUS)
-    return _Cells(colours, wrong)
+    return _Cells(colors, wrong)
 
 
 def _in_order(cells: _Cells, pattern: Pattern) -> Picture:
     """Half size: the samples of a cell, by angle."""
-    angles = {int(pattern.angles[place]): place for place in cells.colours}
-    stack = np.stack([cells.colours[angles[angle]] for angle in ANGLES])
+    angles = {int(pattern.angles[place]): place for place in cells.colors}
+    stack = np.stack([cells.colors[angles[angle]] for angle in ANGLES])
     return Picture(_three(stack), np.any(list(cells.bad.values()), axis=0))
 
 
 def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Picture:
     """Full size: each channel is the mosaic of a monochrome polarization sensor."""
-    height, width, channels = cells.colours[0, 0].shape
+    height, width, channels = cells.colors[0, 0].shape
     mosaic = np.empty((2 * height, 2 * width, channels), np.float32)
     bad = np.empty((2 * height, 2 * width), bool)
-    for (row, column), colours in cells.colours.items():
-        mosaic[row::2, column::2], bad[row::2, column::2] = colours, cells.bad[row, column]
+    for (row, column), colors in cells.colors.items():
+        mosaic[row::2, column::2], bad[row::2, column::2] = colors, cells.bad[row, column]
     places = _tiled(pattern.angles[:2, :2], bad.shape)
     planes = []
     for channel in range(channels):
@@ -135,27 +135,27 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Picture:
 
 
 def _registered(plain: Picture, full: Picture, interpolation: str) -> Picture:
-    """Half size, all angles at the centres of the cells."""
+    """Half size, all angles at the centers of the cells."""
     angles, height, width, channels = plain.intensities.shape
     cells = full.intensities.reshape(angles, height, 2, width, 2, channels)
-    centred = cells.mean(axis=(2, 4), dtype=np.float32)
+    centered = cells.mean(axis=(2, 4), dtype=np.float32)
     if interpolation == "bilinear":
-        centred += (plain.intensities.sum(axis=0) - centred.sum(axis=0)) / np.float32(4)
+        centered += (plain.intensities.sum(axis=0) - centered.sum(axis=0)) / np.float32(4)
     invalid = full.invalid.reshape(height, 2, width, 2).any(axis=(1, 3))
-    return Picture(centred, np.asarray(plain.invalid | invalid))
+    return Picture(centered, np.asarray(plain.invalid | invalid))
 
 
 def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> Picture:
-    """Quarter size: means over the samples of one angle and colour in each 4x4 pixels."""
+    """Quarter size: means over the samples of one angle and color in each 4x4 pixels."""
     repeat = 4 // pattern.period
     angles = np.tile(pattern.angles, (repeat, repeat))
-    colours = None if pattern.colours is None else np.tile(pattern.colours, (repeat, repeat))
+    colors = None if pattern.colors is None else np.tile(pattern.colors, (repeat, repeat))
     rows, columns = values.shape[0] // 4, values.shape[1] // 4
     blocks = values.reshape(rows, 4, columns, 4)
-    picture = np.empty((4, rows, columns, 1 if colours is None else 3), np.float32)
+    picture = np.empty((4, rows, columns, 1 if colors is None else 3), np.float32)
     for index, angle in enumerate(ANGLES):
         for channel in range(picture.shape[3]):
-            chosen = angles == angle if colours is None else (angles == angle) & (colours == channel)
+            chosen = angles == angle if colors is None else (angles == angle) & (colors == channel)
             samples = [blocks[:, row, :, column] for row, column in np.argwhere(chosen)]
             picture[index, ..., channel] = np.mean(samples, axis=0, dtype=np.float32)
     return Picture(_three(picture), np.asarray(bad.reshape(rows, 4, columns, 4).any(axis=(1, 3))))

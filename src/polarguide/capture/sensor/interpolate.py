@@ -1,8 +1,8 @@
-"""Interpolation of sparse samples: bilinear, and guided by edges, colour differences and total intensity.
+"""Interpolation of sparse samples: bilinear, and guided by edges, color differences and total intensity.
 
-``guided_colour`` interpolates green along the weaker gradient with a second-difference correction (after Hamilton
+``guided_color`` interpolates green along the weaker gradient with a second-difference correction (after Hamilton
 and Adams, US patent 5,629,734, expired; half of their correction, which overshoots less) and then the differences
-of red and blue to green, which vary less than the colours. ``guided_polarization`` does the same across angles:
+of red and blue to green, which vary less than the colors. ``guided_polarization`` does the same across angles:
 half of S0, which every 2x2 pixels hold completely, takes the part of green, so that edges of the picture do not
 turn into polarization.
 """
@@ -45,18 +45,18 @@ def used_by_bilinear(bad: Mask, known: Mask) -> Mask:
     return np.where(known, bad, _filtered((bad & known).astype(np.float32)) > 0)
 
 
-def guided_colour(bayer: Array, colours: NDArray[np.int64]) -> Array:
-    """Bayer picture [H, W] with ``colours`` 0, 1, 2 (R, G, B) at its pixels -> [H, W, 3]."""
-    at = _Neighbours(bayer)
-    centre = 2 * bayer
-    bend_x, bend_y = centre - at(0, -2) - at(0, 2), centre - at(-2, 0) - at(2, 0)
+def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
+    """Bayer picture [H, W] with ``colors`` 0, 1, 2 (R, G, B) at its pixels -> [H, W, 3]."""
+    at = _Neighbors(bayer)
+    center = 2 * bayer
+    bend_x, bend_y = center - at(0, -2) - at(0, 2), center - at(-2, 0) - at(2, 0)
     weight_x = 1 / ((np.abs(at(0, -1) - at(0, 1)) + np.abs(bend_x)) ** 2 + _SOFT_SQUARE)
     weight_y = 1 / ((np.abs(at(-1, 0) - at(1, 0)) + np.abs(bend_y)) ** 2 + _SOFT_SQUARE)
     along_x = (at(0, -1) + at(0, 1)) / 2 + bend_x / 8
     along_y = (at(-1, 0) + at(1, 0)) / 2 + bend_y / 8
     between = (along_x * weight_x + along_y * weight_y) / (weight_x + weight_y)
-    green = np.where(colours == 1, bayer, between)
-    red, blue = (green + bilinear(bayer - green, colours == colour) for colour in (0, 2))
+    green = np.where(colors == 1, bayer, between)
+    red, blue = (green + bilinear(bayer - green, colors == color) for color in (0, 2))
     return np.stack([red, green, blue], axis=-1).astype(np.float32)
 
 
@@ -68,8 +68,8 @@ def guided_polarization(mosaic: Array, places: NDArray[np.int64]) -> Array:
 
 
 def _half_s0(mosaic: Array) -> Array:
-    """S0/2 at each pixel: mean of the four 2x2 windows it belongs to, weighted against gradients towards them."""
-    at = _Neighbours(mosaic)
+    """S0/2 at each pixel: mean of the four 2x2 windows it belongs to, weighted against gradients toward them."""
+    at = _Neighbors(mosaic)
     total, weights = np.zeros_like(mosaic), np.zeros_like(mosaic)
     for down in (-1, 1):
         for right in (-1, 1):
@@ -85,7 +85,7 @@ def _half_s0(mosaic: Array) -> Array:
     return total / weights
 
 
-class _Neighbours:
+class _Neighbors:
     """``at(y, x)``: the picture moved so that each pixel sees the one ``y`` below and ``x`` to the right of it."""
 
     def __init__(self, values: Array) -> None:

@@ -1,4 +1,4 @@
-"""Which polarizer and which colour filter lies over each pixel of a sensor."""
+"""Which polarizer and which color filter lies over each pixel of a sensor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _CELL = np.array([[90, 45], [135, 0]])
 _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry a polarizer cell
 
 SENSORS = {"IMX250MYR": True, "IMX264MYR": True, "IMX250MZR": False}
-"""Sony sensors by name, and whether they see colour."""
+"""Sony sensors by name, and whether they see color."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,12 +21,12 @@ class Pattern:
     """The repeating pattern of a sensor or of a region of it.
 
     Attributes:
-        angles: polarizer angle of each pixel in degrees, [4, 4] for a colour sensor, [2, 2] for a monochrome one.
-        colours: 0, 1, 2 for R, G, B in the same shape, or None for a monochrome sensor.
+        angles: polarizer angle of each pixel in degrees, [4, 4] for a color sensor, [2, 2] for a monochrome one.
+        colors: 0, 1, 2 for R, G, B in the same shape, or None for a monochrome sensor.
     """
 
     angles: NDArray[np.int64]
-    colours: NDArray[np.int64] | None
+    colors: NDArray[np.int64] | None
 
     @property
     def period(self) -> int:
@@ -37,25 +37,25 @@ class Pattern:
         """The pattern of a region whose top-left pixel is column ``x``, row ``y`` of this one."""
         return Pattern(
             np.roll(self.angles, (-y, -x), axis=(0, 1)),
-            None if self.colours is None else np.roll(self.colours, (-y, -x), axis=(0, 1)),
+            None if self.colors is None else np.roll(self.colors, (-y, -x), axis=(0, 1)),
         )
 
     def cell_corner(self) -> tuple[int, int]:
-        """Columns and rows to cut so that the region starts with a whole polarizer cell of one colour.
+        """Columns and rows to cut so that the region starts with a whole polarizer cell of one color.
 
         A monochrome pattern needs none: any 2x2 pixels hold all four angles.
         """
-        if self.colours is None:
+        if self.colors is None:
             return 0, 0
-        x = 0 if (self.colours[:, 0] == self.colours[:, 1]).all() else 1
-        y = 0 if (self.colours[0] == self.colours[1]).all() else 1
+        x = 0 if (self.colors[:, 0] == self.colors[:, 1]).all() else 1
+        y = 0 if (self.colors[0] == self.colors[1]).all() else 1
         return x, y
 
     def rows(self) -> list[str]:
         """The pattern in words, one string a row: "R90 R45 G90 G45", ..."""
         names = self.angles.astype(str).astype(object)
-        if self.colours is not None:
-            names = np.array(list("RGB"), dtype=object)[self.colours] + names
+        if self.colors is not None:
+            names = np.array(list("RGB"), dtype=object)[self.colors] + names
         return [" ".join(row) for row in names]
 
 

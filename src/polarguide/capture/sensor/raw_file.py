@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.arrays import read_array
-from polarguide.capture.pictures import decode_stored, read_file
+from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.formats.pictures import decode_stored, read_file
 from polarguide.capture.sensor.packing import PACKINGS, packed_size, unpack
 from polarguide.errors import PolarguideError
 
@@ -37,7 +37,7 @@ def read_mosaic(path: Path, raw: RawFormat) -> NDArray[Any]:
         [H, W] uint8 or uint16, the values as stored.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged, has colour channels or another size.
+        PolarguideError: the file cannot be read, is damaged, has color channels or another size.
     """
     suffix = path.suffix.lower()
     if suffix == ".raw":
@@ -51,7 +51,7 @@ def read_mosaic(path: Path, raw: RawFormat) -> NDArray[Any]:
             path,
             expected="a raw mosaic: one channel of 8- or 16-bit whole numbers",
             found=f"an array {shape} of {values.dtype}",
-            remedy="Save what the sensor delivers, before any demosaicing or conversion to colour.",
+            remedy="Save what the sensor delivers, before any demosaicing or conversion to color.",
         )
     found = (values.shape[1], values.shape[0])
     wanted = (raw.width or found[0], raw.height or found[1])

@@ -1,6 +1,6 @@
 // One fragment per Gaussian: what depends on the eye but not on the pixel.
-layout(location = 0) out vec4 colour;  // base colour or albedo; strength or roughness
-layout(location = 1) out vec4 normal;  // world axes, towards the eye; opacity
+layout(location = 0) out vec4 color;  // base color or albedo; strength or roughness
+layout(location = 1) out vec4 normal;  // world axes, toward the eye; opacity
 #if defined(LOCAL) || defined(DIRECTIONAL)
 layout(location = 2) out vec4 further; // light of its own, or features
 #endif
@@ -52,11 +52,11 @@ void main() {
   normal = vec4(axis, shares.x);
 #ifdef DIRECTIONAL
   uvec4 t3 = texel(gaussian, 3);
-  colour = vec4(direct, shares.y);
+  color = vec4(direct, shares.y);
   further = vec4(unpackSnorm2x16(t3.x), unpackSnorm2x16(t3.y));
 #else
   vec3 base = 0.28209479177387814 * direct + harmonics(gaussian, 3, unpackHalf2x16(t1.w).y, ray) + 0.5;
-  colour = vec4(max(base, 0.0), shares.y);
+  color = vec4(max(base, 0.0), shares.y);
 #endif
 #ifdef LOCAL
   uvec4 t6 = texel(gaussian, 6);

@@ -1,4 +1,4 @@
-// The learned environment: faces with a ring of the neighbours' texels, so that four taps are seamless; see cubemap.py.
+// The learned environment: faces with a ring of the neighbors' texels, so that four taps are seamless; see cubemap.py.
 precision highp float;
 precision highp int;
 precision highp sampler2D;

@@ -10,7 +10,7 @@ class Navigation {
     this.lens = camera;
     this.rotation = camera.rotation;
     this.eye = scaled(apply(transposed(camera.rotation), camera.translation), -1);
-    const ahead = dot(add(this.scene.centre, this.eye, -1), this.rotation.slice(6));
+    const ahead = dot(add(this.scene.center, this.eye, -1), this.rotation.slice(6));
     this.pivot = add(this.eye, this.rotation.slice(6), Math.max(ahead, 0.1 * this.scene.distance));
   }
 

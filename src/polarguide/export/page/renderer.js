@@ -150,8 +150,8 @@ class Renderer {
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    const [derivedColour, derivedNormal, derivedFurther] = this.derived.textures;
-    this.use(this.splatter, { records: this.tables.records, derivedColour, derivedNormal, derivedFurther }, {
+    const [derivedColor, derivedNormal, derivedFurther] = this.derived.textures;
+    this.use(this.splatter, { records: this.tables.records, derivedColor, derivedNormal, derivedFurther }, {
       ...this.lens(camera), eye: ["3f", eye],
     });
     gl.bindVertexArray(this.corners);

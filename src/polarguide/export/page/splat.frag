@@ -1,6 +1,6 @@
 // Premultiplied values, blended back to front into every target alike.
 precision highp float;
-flat in vec4 colour;
+flat in vec4 color;
 flat in vec4 normal;
 flat in vec4 further;
 in vec2 place;
@@ -16,15 +16,15 @@ layout(location = 3) out vec4 target3;
 void main() {
   float alpha = min(0.99, normal.w * exp(-0.5 * dot(place, place)));
   if (alpha < 1.0 / 255.0) discard;
-  target0 = vec4(alpha * colour.rgb, alpha);
+  target0 = vec4(alpha * color.rgb, alpha);
   target1 = vec4(alpha * normal.xyz, alpha);
 #if defined(DIRECTIONAL)
-  target2 = vec4(alpha * vec3(colour.a, further.xy), alpha);
+  target2 = vec4(alpha * vec3(color.a, further.xy), alpha);
   target3 = vec4(alpha * vec3(further.zw, 0.0), alpha);
 #elif defined(LOCAL)
-  target2 = vec4(alpha * colour.a, 0.0, 0.0, alpha);
+  target2 = vec4(alpha * color.a, 0.0, 0.0, alpha);
   target3 = vec4(alpha * further.rgb, alpha);
 #elif defined(LIT)
-  target2 = vec4(alpha * colour.a, 0.0, 0.0, alpha);
+  target2 = vec4(alpha * color.a, 0.0, 0.0, alpha);
 #endif
 }

@@ -1,12 +1,12 @@
-// EWA projection of a Gaussian (Zwicker et al. 2001) to the box around its ellipse; as the rasteriser of the program.
+// EWA projection of a Gaussian (Zwicker et al. 2001) to the box around its ellipse; as the rasterizer of the program.
 precision highp sampler2D;
-uniform sampler2D derivedColour, derivedNormal, derivedFurther;
+uniform sampler2D derivedColor, derivedNormal, derivedFurther;
 uniform mat3 rotation; // world to camera
 uniform vec3 eye;
 uniform vec4 lens;     // fx, fy, cx, cy in pixels
 uniform vec2 size;
 in uint gaussian;
-flat out vec4 colour;
+flat out vec4 color;
 flat out vec4 normal;
 flat out vec4 further;
 out vec2 place; // in standard deviations
@@ -17,7 +17,7 @@ void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: nothing is drawn
   int index = int(gaussian);
   ivec2 at = ivec2(index & 2047, index >> 11);
-  colour = texelFetch(derivedColour, at, 0);
+  color = texelFetch(derivedColor, at, 0);
   normal = texelFetch(derivedNormal, at, 0);
 #if defined(LOCAL) || defined(DIRECTIONAL)
   further = texelFetch(derivedFurther, at, 0);

@@ -1,0 +1,56 @@
+// One picture: from Gaussians to channels and back. Owns what the backward pass needs from the forward pass.
+#pragma once
+#include "raster.h"
+
+#include <memory>
+#include <vector>
+
+namespace polarguide {
+
+// An uninitialized array: pages are touched by the threads that use them.
+template <class T> class Buffer {
+  public:
+    void resize(int64_t count) {
+        if (count > capacity_) data_.reset(new T[size_t(count)]), capacity_ = count;
+    }
+    T *get() const { return data_.get(); }
+
+  private:
+    std::unique_ptr<T[]> data_;
+    int64_t capacity_ = 0;
+};
+
+struct GaussianInputs {
+    int64_t count;
+    int channels;
+    const float *means, *quats, *scales, *opacities, *features;
+};
+
+class Rasterizer {
+  public:
+    // `permutation` lists the channels, those of the statistic first.
+    Rasterizer(const PinholeCamera &camera, std::vector<int32_t> permutation, int statistic_channels);
+    void forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs);
+    struct Gradients {
+        float *means, *quats, *scales, *opacities, *features, *statistic; // statistic may be null
+    };
+    void backward(const GaussianInputs &in, const float *out, const float *grad_out, const float *grad_alpha,
+                  const Gradients &gradients);
+    int64_t pairs() const { return pairs_; }
+    int64_t instances() const { return instance_count_; }
+
+  private:
+    void bin(int64_t count);
+    RasterArgs raster_args(const GaussianInputs &in) const;
+    template <class F> void for_tiles(F &&body);
+
+    PinholeCamera camera_;
+    std::vector<int32_t> permutation_;
+    int statistic_channels_, channels_, tiles_x_, tiles_y_;
+    int64_t instance_count_ = 0, longest_ = 0, pairs_ = 0;
+    Buffer<float> screen_, depth_, transmittance_;
+    Buffer<int32_t> box_, gaussians_;
+    Buffer<int64_t> instance_begin_, tile_begin_, instances_;
+};
+
+} // namespace polarguide

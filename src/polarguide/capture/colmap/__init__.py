@@ -1,0 +1,1 @@
+"""COLMAP models: the only room that knows pycolmap."""

@@ -1,0 +1,88 @@
+"""Whether the binary files of a COLMAP model are complete, judged by their structure.
+
+COLMAP reads a file that was cut short without a word and keeps whatever was in memory, and counts in a damaged
+file can keep it busy for ever. Walking the files first gives one clear answer.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+from polarguide.capture.colmap.write import MODELS
+from polarguide.capture.formats.pictures import read_file
+from polarguide.errors import PolarguideError
+
+_PARAMETERS = dict(MODELS.values())
+_LONGEST_NAME = 4096
+
+
+def check_model_files(folder: Path, kind: str) -> None:
+    """Check the files of a model, of suffix ``kind``; those that are not there and text files are passed over.
+
+    Raises:
+        PolarguideError: a file is cut short, damaged, or has bytes after its end.
+    """
+    walkers: dict[str, Callable[[bytes], int]] = {"cameras": _cameras, "images": _images, "points3D": _points}
+    for name, walk in walkers.items():
+        path = folder / (name + kind)
+        if not path.exists():
+            continue
+        data = read_file(path)
+        found = "an empty file" if not data and name != "points3D" else None
+        if kind == ".bin":
+            try:
+                end = walk(data)
+                if end != len(data):
+                    found = f"{len(data)} bytes where its counts ask for {end}"
+            except (struct.error, ValueError) as error:
+                found = f"a damaged one ({error})" if data else "an empty file"
+        if found is not None:
+            raise PolarguideError(
+                path,
+                expected=f"a complete COLMAP {name}{kind}",
+                found=found,
+                remedy="Copy or export the model again.",
+            )
+
+
+def _cameras(data: bytes) -> int:
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    for _ in range(_at_most(count, len(data) // 48)):
+        _, model, width, height = struct.unpack_from("<IiQQ", data, at)
+        if not (0 < width < 1 << 20 and 0 < height < 1 << 20):
+            raise ValueError(f"a camera of {width}x{height} pixels")
+        if model not in _PARAMETERS:  # a newer model: its length is not known here
+            return len(data)
+        at += 24 + 8 * _PARAMETERS[model]
+    return at
+
+
+def _images(data: bytes) -> int:
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    for _ in range(_at_most(count, len(data) // 73)):
+        name = data.find(b"\0", at + 64, at + 64 + _LONGEST_NAME)
+        if name < 0:
+            raise ValueError("an image without the end of its name")
+        (points,) = struct.unpack_from("<Q", data, name + 1)
+        at = name + 9 + 24 * _at_most(points, (len(data) - name) // 24)
+    return at
+
+
+def _points(data: bytes) -> int:
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    for _ in range(_at_most(count, len(data) // 51)):
+        (track,) = struct.unpack_from("<Q", data, at + 43)
+        at += 51 + 8 * _at_most(track, (len(data) - at) // 8)
+    return at
+
+
+def _at_most(count: int, most: int) -> int:
+    """The count, if the file is long enough for it."""
+    if count > most:
+        raise ValueError(f"a count of {count} that the file is too short for")
+    return count

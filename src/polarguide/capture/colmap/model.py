@@ -1,0 +1,271 @@
+"""COLMAP models -> cameras and points. The only file that knows pycolmap's types."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.capture.colmap.files import check_model_files
+from polarguide.capture.view import listed
+from polarguide.errors import PolarguideError
+
+MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
+# Perspective models that are a plain pinhole when all of their distortion parameters are zero.
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """Poses, intrinsics and points of a COLMAP model.
+
+    Attributes:
+        folder: the folder with its files.
+        files: the files that were read.
+        points: [M, 3] float32, in the order of their COLMAP ids.
+        point_colors: [M, 3] uint8.
+        warnings: plain sentences.
+    """
+
+    folder: Path
+    files: tuple[Path, ...]
+    points: Tensor
+    point_colors: Tensor
+    warnings: tuple[str, ...]
+    _images: dict[str, list[Any]] = field(repr=False)
+    _cameras: dict[int, Any] = field(repr=False)
+    _tracks: tuple[tuple[int, ...], ...] = field(repr=False, default=())
+
+    @property
+    def names(self) -> list[str]:
+        """Names (stems) of the posed images, sorted."""
+        return sorted(self._images)
+
+    def camera(self, view: str) -> Camera:
+        """Camera of the image whose name without folder and suffix is ``view``, at the size the model states.
+
+        Raises:
+            PolarguideError: there is no such image or more than one, it is distorted, or has broken numbers.
+        """
+        images = self._images.get(view, [])
+        if len(images) != 1:
+            near = difflib.get_close_matches(view, self.names, n=3, cutoff=0.4) or self.names[:3]
+            raise PolarguideError(
+                self.folder,
+                expected=f"one posed image called {view} (any suffix)",
+                found=", ".join(sorted(image.name for image in images))
+                or f"none; the nearest are {', '.join(near)}",
+                remedy="Register the view in COLMAP under this name, or leave out its pictures.",
+            )
+        return _camera_of(self.folder, images[0], self._cameras[images[0].camera_id])
+
+    def sightings(self, views: Sequence[str]) -> Tensor:
+        """Which of the views each point was triangulated from, [M, V] bool; all False where no tracks are stored."""
+        columns = {view: column for column, view in enumerate(views)}
+        by_id = {
+            image.image_id: columns[view]
+            for view, images in self._images.items()
+            if view in columns
+            for image in images
+        }
+        seen = torch.zeros(len(self._tracks), len(views), dtype=torch.bool)
+        for row, track in enumerate(self._tracks):
+            seen[row, [by_id[number] for number in track if number in by_id]] = True
+        return seen
+
+
+def read_model(root: Path) -> ColmapModel:
+    """Read the COLMAP model in ``root/sparse/0`` or ``root/sparse``: binary, else text.
+
+    Raises:
+        PolarguideError: there is no model, it cannot be read, or it has no points.
+    """
+    folder, kind = find_model(root, itself=False)
+    files = tuple(path for path in (folder / (name + kind) for name in MODEL_FILES) if path.exists())
+    model = load_model(folder, kind)
+    images = posed_images(model)
+    points, colors, tracks, dropped = _points_of(model)
+    if len(points) == 0:
+        raise PolarguideError(
+            folder / ("points3D" + kind),
+            expected="3D points to start from",
+            found="none",
+            remedy="Triangulate points with the known poses (colmap point_triangulator).",
+        )
+    warnings = (
+        (f"{dropped} of {dropped + len(points)} 3D points are not finite and were left out.",)
+        if dropped
+        else ()
+    )
+    return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks)
+
+
+def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: str) -> Camera:
+    """The camera at the size of the pictures, rescaled where the model was made at another resolution.
+
+    Raises:
+        PolarguideError: the two sizes differ by more than one common factor.
+    """
+    if (camera.width, camera.height) == (width, height):
+        return camera
+    if camera.width * height != camera.height * width:
+        raise PolarguideError(
+            f"{folder} (camera of view {view})",
+            expected=f"the size of the pictures, {width}x{height}",
+            found=f"{camera.width}x{camera.height}",
+            remedy="Give intrinsics for these pictures, or pictures of the size COLMAP saw (no crop).",
+        )
+    factor = width / camera.width
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * factor,
+        fy=camera.fy * factor,
+        cx=camera.cx * factor,
+        cy=camera.cy * factor,
+    )
+
+
+def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
+    """A warning about posed images that are no view of the capture, or nothing."""
+    unused = sorted(set(model.names) - set(names))
+    if not unused:
+        return []
+    return [f"The COLMAP model has poses for {len(unused)} images without pictures ({listed(unused)})."]
+
+
+def find_model(root: Path, *, itself: bool = True, points: bool = True) -> tuple[Path, str]:
+    """The folder of a model and the suffix of its files: in ``sparse/0`` or ``sparse``, else ``0`` or ``root`` itself.
+
+    Args:
+        root: where to look.
+        itself: whether the files may lie in ``root`` or ``root/0``.
+        points: whether the file of points has to be there.
+
+    Raises:
+        PolarguideError: there is none, or a file of it is missing.
+    """
+    needed = ("images", "points3D") if points else ("images",)
+    for folder in (root / "sparse" / "0", root / "sparse", *([root / "0", root] if itself else [])):
+        for kind in (".bin", ".txt"):
+            if (folder / ("cameras" + kind)).exists():
+                missing = [n for n in needed if not (folder / (n + kind)).exists()]
+                if missing:
+                    raise PolarguideError(
+                        folder / (missing[0] + kind),
+                        expected="this file of the COLMAP model",
+                        found="nothing",
+                        remedy=f"A model is cameras{kind}, images{kind} and points3D{kind} together.",
+                    )
+                return folder, kind
+    raise PolarguideError(
+        root if itself else root / "sparse" / "0",
+        expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
+        found="none there nor in sparse/",
+        remedy="Run structure from motion on the pictures, or copy the model there.",
+    )
+
+
+def load_model(folder: Path, kind: str) -> Any:
+    """The model in a folder, as pycolmap's ``Reconstruction``; without points if it has no file of them.
+
+    Raises:
+        PolarguideError: pycolmap refuses it.
+    """
+    import pycolmap  # here, so that a machine which only trains on packed scenes can do without
+
+    model = pycolmap.Reconstruction()
+    check_model_files(folder, kind)
+    try:
+        with _whole(folder, kind) as whole:
+            model.read_binary(str(whole)) if kind == ".bin" else model.read_text(str(whole))
+    except Exception as error:  # pycolmap raises whatever C++ threw: ValueError, IndexError, MemoryError, ...
+        raise PolarguideError(
+            folder,
+            expected="a readable COLMAP model",
+            found=f"one that pycolmap refuses ({str(error).strip().splitlines()[0]})",
+            remedy="Export the model again; text files need two lines per image.",
+        ) from error
+    return model
+
+
+@contextlib.contextmanager
+def _whole(folder: Path, kind: str) -> Iterator[Path]:
+    """The folder, or a copy with an empty file of points where it has none."""
+    if (folder / ("points3D" + kind)).exists():
+        yield folder
+        return
+    with tempfile.TemporaryDirectory() as made:
+        for name in MODEL_FILES:
+            if (folder / (name + kind)).exists():
+                shutil.copyfile(folder / (name + kind), Path(made) / (name + kind))
+        (Path(made) / ("points3D" + kind)).write_bytes(bytes(8) if kind == ".bin" else b"")
+        yield Path(made)
+
+
+def posed_images(model: Any) -> dict[str, list[Any]]:
+    """The images with a pose of pycolmap's ``Reconstruction``, by name without folder and suffix."""
+    images: dict[str, list[Any]] = {}
+    for image in model.images.values():
+        if image.has_pose:
+            images.setdefault(PurePosixPath(image.name.replace("\\", "/")).stem, []).append(image)
+    return images
+
+
+def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
+    where = f"{folder} (camera {camera.camera_id}, image {image.name})"
+    model = camera.model_name
+    if model not in PINHOLES or any(camera.params[index] != 0.0 for index in camera.extra_params_idxs()):
+        raise PolarguideError(
+            where,
+            expected="an undistorted camera (PINHOLE or SIMPLE_PINHOLE)",
+            found=f"{model} with parameters {', '.join(f'{value:g}' for value in camera.params)}",
+            remedy="Undistort the four intensities of each view, and the model with them.",
+        )
+    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+    rotation = np.asarray(pose.rotation.matrix(), dtype=np.float64)
+    translation = np.asarray(pose.translation, dtype=np.float64)
+    inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
+    numbers = np.isfinite([*translation, *inner]).all() and min(inner[:2]) > 0
+    if not numbers or abs(float(np.linalg.norm(pose.rotation.quat)) - 1.0) > 1e-6:
+        raise PolarguideError(
+            where,
+            expected="a unit quaternion, a finite translation and positive focal lengths",
+            found=f"quaternion {pose.rotation.quat}, translation {translation}, intrinsics {inner}",
+            remedy="Export the model again.",
+        )
+    return Camera(
+        width=int(camera.width),
+        height=int(camera.height),
+        fx=float(inner[0]),
+        fy=float(inner[1]),
+        cx=float(inner[2]),
+        cy=float(inner[3]),
+        rotation=torch.from_numpy(rotation.copy()),
+        translation=torch.from_numpy(translation.copy()),
+    )
+
+
+def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], int]:
+    """Finite points, their colors and the numbers of the images that see them; how many points are not finite."""
+    points = [point for _, point in sorted(model.points3D.items())]
+    with np.errstate(over="ignore"):
+        places = np.array([point.xyz for point in points]).reshape(-1, 3).astype(np.float32)
+    colors = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+    finite = np.isfinite(places).all(axis=1)
+    tracks = tuple(
+        tuple(element.image_id for element in point.track.elements)
+        for point in (points[place] for place in np.flatnonzero(finite))
+    )
+    return torch.from_numpy(places[finite]), torch.from_numpy(colors[finite]), tracks, int((~finite).sum())

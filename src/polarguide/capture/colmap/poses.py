@@ -1,0 +1,172 @@
+"""A COLMAP model for the developed pictures: matched by name, scaled, and undistorted with one map for all angles."""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polarguide.capture.colmap.model import MODEL_FILES, find_model, load_model, posed_images
+from polarguide.capture.colmap.undistort import Geometry, Warp, fitted_camera, warp_of
+from polarguide.capture.colmap.write import PosedCamera, write_cameras
+from polarguide.capture.view import listed
+from polarguide.errors import PolarguideError
+
+Key = tuple[int, Geometry]
+
+
+class Poses:
+    """A COLMAP model and the views of a capture that it has poses for."""
+
+    def __init__(self, model: Any, where: Path, views: list[str], files: Sequence[Path] = ()) -> None:
+        """Match the images of a model with views by stem.
+
+        Args:
+            model: pycolmap's ``Reconstruction``.
+            where: where it came from, for messages.
+            views: view names of the capture.
+            files: the files it was read from.
+
+        Raises:
+            PolarguideError: none of its images is a view, two images claim one, or a pose or camera has
+                broken numbers.
+        """
+        self.folder = where
+        self.files = tuple(files)
+        self._model = model
+        images = posed_images(self._model)
+        self.views = [view for view in views if view in images]
+        self.missing = [view for view in views if view not in images]
+        if not self.views:
+            raise PolarguideError(
+                self.folder,
+                expected=f"images called like the views ({listed(views, 3)}), with any suffix",
+                found=listed(sorted(images), 3) or "no posed image",
+                remedy="Rename the images in the model or the pictures; names are matched without folder and suffix.",
+            )
+        self._images = {view: images[view][0] for view in self.views}
+        for view in self.views:
+            if len(images[view]) > 1:
+                raise PolarguideError(
+                    self.folder,
+                    expected=f"one image called {view}",
+                    found=", ".join(sorted(image.name for image in images[view])),
+                    remedy="Keep the one that is meant.",
+                )
+            self._require_numbers(view)
+        self._warps: dict[Key, Warp] = {}
+        self._of_camera: dict[int, Warp] = {}
+
+    @classmethod
+    def read(cls, path: Path, views: list[str]) -> Poses:
+        """A model from a folder with its files, or with ``sparse/0`` or ``sparse``; it may lack points.
+
+        Raises:
+            PolarguideError: there is no readable model, or as for the model itself.
+        """
+        folder, kind = find_model(path, points=False)
+        files = [folder / (name + kind) for name in MODEL_FILES]
+        return cls(load_model(folder, kind), folder, views, [file for file in files if file.exists()])
+
+    @classmethod
+    def of_cameras(cls, cameras: Mapping[str, PosedCamera], where: Path, views: list[str]) -> Poses:
+        """A model without points from cameras by view name; ``where`` they came from is for messages."""
+        with tempfile.TemporaryDirectory() as made:
+            write_cameras(Path(made), cameras)
+            return cls(load_model(Path(made), ".bin"), where, views)
+
+    @property
+    def points(self) -> int:
+        """How many 3D points the model has."""
+        return len(self._model.points3D)
+
+    def developed(self, geometries: Mapping[str, Geometry]) -> dict[str, PosedCamera]:
+        """Cameras of the developed pictures, distortion and all, by view.
+
+        Raises:
+            PolarguideError: as in ``warp``.
+        """
+        found = {}
+        for view in self.views:
+            image = self._images[view]
+            camera = self.warp(view, geometries[view]).source
+            pose = _pose(image)
+            found[view] = PosedCamera(
+                camera.width,
+                camera.height,
+                camera.model_name,
+                tuple(float(value) for value in camera.params),
+                np.asarray(pose.rotation.matrix(), np.float64),
+                np.asarray(pose.translation, np.float64),
+            )
+        return found
+
+    def warp(self, view: str, geometry: Geometry) -> Warp:
+        """What the view's picture has to go through.
+
+        Raises:
+            PolarguideError: the camera is neither of the stored nor the developed size, nor a resized one.
+        """
+        number = self._images[view].camera_id
+        key = (number, geometry)
+        if key not in self._warps:
+            camera = fitted_camera(
+                self._model.cameras[number], geometry, f"{self.folder} (camera of view {view})"
+            )
+            self._warps[key] = warp_of(camera)
+        warp = self._warps[key]
+        if self._of_camera.setdefault(number, warp) is not warp:
+            raise PolarguideError(
+                f"{self.folder} (camera of view {view})",
+                expected="pictures of one size for one camera",
+                found=f"{geometry.size[0]}x{geometry.size[1]} beside another size",
+                remedy="Give each size a camera of its own in the model.",
+            )
+        return warp
+
+    def write(self, folder: Path) -> None:
+        """Write the model for the developed pictures, binary; ``warp`` was called for every view."""
+        model = copy.deepcopy(self._model)
+        for image in model.images.values():
+            if image.camera_id in self._of_camera and len(image.points2D):
+                self._move_points(image, model.cameras[image.camera_id], self._of_camera[image.camera_id])
+        for number, warp in self._of_camera.items():
+            camera = model.cameras[number]
+            camera.model, camera.width, camera.height = (
+                warp.target.model,
+                warp.target.width,
+                warp.target.height,
+            )
+            camera.params = warp.target.params
+        model.write_binary(str(folder))
+
+    def _move_points(self, image: Any, before: Any, warp: Warp) -> None:
+        """Observed points go where their pixels went."""
+        places = np.array([point.xy for point in image.points2D])
+        rays = np.nan_to_num(before.cam_from_img(places))
+        moved = warp.target.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+        for point, place in zip(image.points2D, moved, strict=True):
+            point.xy = place
+
+    def _require_numbers(self, view: str) -> None:
+        image = self._images[view]
+        pose = _pose(image)
+        quaternion, translation = np.asarray(pose.rotation.quat), np.asarray(pose.translation)
+        camera = self._model.cameras[image.camera_id]
+        finite = np.isfinite([*quaternion, *translation, *camera.params]).all()
+        if not finite or abs(float(np.linalg.norm(quaternion)) - 1) > 1e-3 or camera.mean_focal_length() <= 0:
+            raise PolarguideError(
+                f"{self.folder} (image {image.name})",
+                expected="a finite pose and positive focal lengths",
+                found=f"quaternion {quaternion}, translation {translation}, camera {camera.params}",
+                remedy="Export the model again, or leave the image out.",
+            )
+
+
+def _pose(image: Any) -> Any:
+    """World to camera, whatever the version of pycolmap."""
+    return image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world

@@ -1,0 +1,131 @@
+"""Structure from motion on the photographs, with pycolmap."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from polarguide.capture.colmap.features import match, run, seeded
+from polarguide.capture.colmap.write import PosedCamera
+from polarguide.color import srgb_encode_array
+from polarguide.errors import PolarguideError
+from polarguide.files import guarded
+from polarguide.progress import Reporter
+
+_FEW_SHARE = 0.8
+_LEAST = 3
+ADVICE = (
+    "More views with more overlap (15 degrees or less between neighbors), a textured ground under the object and "
+    "sharp pictures help; --matching exhaustive finds more pairs than sequential."
+)
+
+
+def tone_mapped(intensities: NDArray[np.float32], pictures: str = "photograph") -> NDArray[np.uint8]:
+    """A view as an 8-bit sRGB picture, BGR, with the 99th percentile at white.
+
+    Args:
+        intensities: [4, H, W, 3] linear.
+        pictures: "photograph" for S0/2, "minimum" for the least of the four, which has less glare.
+    """
+    photograph = intensities.min(axis=0) if pictures == "minimum" else intensities.mean(axis=0)
+    white = max(float(np.percentile(photograph, 99.0)), 1e-4)
+    shown = srgb_encode_array(np.clip(photograph / white, 0.0, 1.0))
+    return np.rint(255.0 * shown[..., ::-1]).astype(np.uint8)
+
+
+def reconstruct(
+    folder: Path,
+    sizes: dict[str, tuple[int, int]],
+    *,
+    matching: str,
+    seed: int,
+    reporter: Reporter,
+    intrinsics: tuple[str, tuple[float, ...]] | None = None,
+    refine: bool = True,
+) -> Path:
+    """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
+
+    Where there is ``folder/masks/<view>.png``, only its white parts are looked at.
+
+    Features and matches are kept in a database, so that a run that was stopped does not repeat them. The
+    largest model wins.
+
+    Args:
+        folder: with the pictures; the database and the model are written there.
+        sizes: width and height of every picture, by view.
+        matching: "exhaustive", or "sequential" for views taken in the order of their names.
+        seed: of all random draws.
+        reporter: for progress and what was registered.
+        intrinsics: model and parameters of all pictures, where they are known.
+        refine: whether known ones may change.
+
+    Returns:
+        The folder of the model, with one camera for pictures of one size: of the model given, or SIMPLE_RADIAL.
+
+    Raises:
+        PolarguideError: fewer than three views were registered, or COLMAP failed.
+    """
+    model = folder / "model"
+    if model.is_dir():
+        return model
+    database, images, trial = folder / "database.db", folder / "images", folder / "models"
+    cameras = None
+    if intrinsics is not None:
+        still = np.eye(3), np.zeros(3)
+        cameras = {view: PosedCamera(*size, *intrinsics, *still) for view, size in sizes.items()}
+    match(
+        database, images, sizes,
+        matching=matching, seed=seed, reporter=reporter, cameras=cameras, masks=folder / "masks",
+    )  # fmt: skip
+    shutil.rmtree(trial, ignore_errors=True)
+    guarded(lambda: trial.mkdir(), trial)
+    free = intrinsics is None or refine
+    models = _map(database, images, trial, len(sizes), seed, reporter, free)
+    best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
+    registered = 0 if best is None else best.num_reg_images()
+    if best is None or registered < _LEAST:
+        raise PolarguideError(
+            images,
+            expected="pictures that structure from motion can connect",
+            found=f"{registered} of {len(sizes)} views registered",
+            remedy=ADVICE + " Or bring a COLMAP model with --poses PATH.",
+        )
+    chosen = folder / "chosen"
+    shutil.rmtree(chosen, ignore_errors=True)
+    guarded(chosen.mkdir, chosen)
+    best.write_binary(str(chosen))
+    chosen.rename(model)
+    said = f"{registered} of {len(sizes)} views registered"
+    reporter.say(
+        f"{said}, {best.num_points3D()} points, mean reprojection error "
+        f"{best.compute_mean_reprojection_error():.2f} pixels; {len(models)} model(s) found."
+    )
+    if registered < _FEW_SHARE * len(sizes):
+        reporter.warn(f"Only {said}. {ADVICE}")
+    return model
+
+
+def _map(
+    database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter, free: bool
+) -> dict[int, Any]:
+    """Incremental mapping: pycolmap's models, by number; ``free`` intrinsics are estimated."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = _LEAST
+    options.ba_refine_focal_length = options.ba_refine_extra_params = free
+    for part in (options, options.mapper, options.triangulation):
+        seeded(part, seed)
+    placed = [0]
+
+    def step() -> None:
+        placed[0] += 1
+
+    found: dict[int, Any] = run(
+        lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
+        seed, reporter, "placing cameras", count, lambda: placed[0] + 2 if placed[0] else 0,
+    )  # fmt: skip
+    return found

@@ -1,0 +1,142 @@
+"""Pictures of one camera -> those of a pinhole camera: intrinsics scaled to the picture, distortion taken out."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from polarguide.capture.colmap.model import PINHOLES
+from polarguide.errors import PolarguideError
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """How a developed picture lies in the stored one: developed = (stored - crop) / step, in pixels from the corner.
+
+    Attributes:
+        stored: width and height of the stored picture, as displayed.
+        crop: columns and rows cut at the left and top.
+        step: stored pixels per developed pixel.
+        size: width and height of the developed picture.
+    """
+
+    stored: tuple[int, int]
+    crop: tuple[int, int]
+    step: int
+    size: tuple[int, int]
+
+    def record(self) -> dict[str, Any]:
+        """As plain JSON types."""
+        return {
+            "stored": list(self.stored), "crop": list(self.crop), "step": self.step, "size": list(self.size)
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, record: dict[str, Any]) -> Geometry:
+        """What ``record`` made."""
+        stored, crop, size = ((int(x), int(y)) for x, y in (record[n] for n in ("stored", "crop", "size")))
+        return cls(stored, crop, int(record["step"]), size)
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """How a picture becomes that of a pinhole camera.
+
+    Attributes:
+        source: the camera of the developed picture, as pycolmap's.
+        target: the pinhole camera.
+        moves: whether pixels move.
+    """
+
+    source: Any
+    target: Any
+    moves: bool
+
+    def record(self) -> dict[str, Any] | None:
+        """The camera that was taken out, or None."""
+        if not self.moves:
+            return None
+        return {"model": self.source.model_name, "parameters": [float(value) for value in self.source.params]}
+
+    def apply_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Resample an object mask [H, W]; what lies beyond the picture is no object."""
+        if not self.moves:
+            return mask
+        x, y = self._map
+        return np.asarray(cv2.remap(mask.astype(np.float32), x, y, cv2.INTER_LINEAR) >= 0.5)
+
+    def apply(
+        self, intensities: NDArray[np.float32], invalid: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Resample intensities [4, H, W, 3] with one map; a pixel is invalid if it uses one, or none inside."""
+        if not self.moves:
+            return intensities, invalid
+        x, y = self._map
+        moved = [cv2.remap(p, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in intensities]
+        wrong = cv2.remap(
+            invalid.astype(np.float32),
+            x,
+            y,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=1.0,
+        )
+        return np.stack(moved), np.asarray(wrong > 0)
+
+    @functools.cached_property
+    def _map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Where the pixels of the target lie in the source, in OpenCV's pixels."""
+        rows, columns = np.mgrid[: self.target.height, : self.target.width]
+        places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)  # COLMAP's pixel centers
+        rays = self.target.cam_from_img(places)
+        seen = self.source.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+        seen = np.nan_to_num(seen, nan=-10.0).reshape(*rows.shape, 2).astype(np.float32) - np.float32(0.5)
+        return np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
+
+
+def fitted_camera(camera: Any, geometry: Geometry, where: str) -> Any:
+    """A COLMAP camera in the pixels of the developed picture."""
+    width, height = geometry.size
+    size = (camera.width, camera.height)
+    if size == geometry.size:
+        crop, step = (0.0, 0.0), 1.0
+    elif size == geometry.stored:
+        crop, step = (float(geometry.crop[0]), float(geometry.crop[1])), float(geometry.step)
+    elif size[0] > 0 and size[0] * height == size[1] * width:
+        crop, step = (0.0, 0.0), size[0] / width
+    else:
+        raise PolarguideError(
+            where,
+            expected=f"the size of the pictures, {width}x{height}, or of the files, "
+            f"{geometry.stored[0]}x{geometry.stored[1]}",
+            found=f"{size[0]}x{size[1]}",
+            remedy="Give a model that was made from these pictures, without a crop.",
+        )
+    fitted = copy.copy(camera)
+    params = np.array(camera.params, dtype=np.float64)
+    params[list(camera.focal_length_idxs())] /= step
+    for index, cut in zip(camera.principal_point_idxs(), crop, strict=True):
+        params[index] = (params[index] - cut) / step
+    fitted.params, fitted.width, fitted.height = params, width, height
+    return fitted
+
+
+def warp_of(camera: Any) -> Warp:
+    """What pictures of a COLMAP camera have to go through."""
+    straight = camera.model_name in PINHOLES and all(
+        camera.params[i] == 0 for i in camera.extra_params_idxs()
+    )
+    if not straight:
+        return Warp(camera, pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera), True)
+    inner = [camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y]
+    target = pycolmap.Camera(
+        model="PINHOLE", width=camera.width, height=camera.height, params=inner, camera_id=camera.camera_id
+    )
+    return Warp(camera, target, False)

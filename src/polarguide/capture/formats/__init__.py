@@ -1,0 +1,1 @@
+"""Files of pictures and arrays: strict decoding with limits on size."""

@@ -1,0 +1,104 @@
+"""NumPy files -> arrays: sizes are checked before anything is allocated, and nothing is unpickled."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.formats.pictures import read_file
+from polarguide.errors import PolarguideError
+
+_LARGEST_ARCHIVE = 1 << 26
+"""Bytes that an ``.npz`` file of cameras may unfold to."""
+
+
+def read_array(path: Path) -> NDArray[Any]:
+    """The array in an ``.npy`` file.
+
+    Raises:
+        PolarguideError: the file cannot be read, is cut short or no ``.npy`` file, or holds Python objects.
+    """
+    data = read_file(path)
+    try:
+        return _array(data)
+    except (ValueError, EOFError, OSError, MemoryError, SyntaxError) as error:
+        raise PolarguideError(
+            path,
+            expected="a complete .npy file of numbers",
+            found="an empty file" if not data else f"{len(data)} bytes that are none",
+            remedy="Copy or export the file again.",
+        ) from error
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays in an ``.npz`` file, by name.
+
+    Raises:
+        PolarguideError: the file cannot be read, is damaged or unfolds to more than cameras need.
+    """
+    data = read_file(path)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+            if size > _LARGEST_ARCHIVE:
+                raise ValueError(f"an archive that unfolds to {size} bytes")
+            return {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
+    except (
+        ValueError,
+        EOFError,
+        OSError,
+        MemoryError,
+        SyntaxError,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
+        found = f"a damaged one ({error})"
+    except zipfile.BadZipFile as error:
+        found = "an empty file" if not data else f"one that cannot be unpacked ({error})"
+    raise PolarguideError(
+        path, expected="a complete .npz file of numbers", found=found, remedy="Copy or export the file again."
+    )
+
+
+def numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
+    """An array of finite numbers in one of the shapes, as float64.
+
+    Raises:
+        PolarguideError: it has another shape or type, or values that are not finite.
+    """
+    expected = f"finite numbers in shape {' or '.join('x'.join(map(str, shape)) for shape in shapes)}"
+    try:
+        found = np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise PolarguideError(
+            where, expected=expected, found=f"something else ({error})", remedy="Export the cameras again."
+        ) from None
+    if found.shape not in shapes or not np.isfinite(found).all():
+        shape = "x".join(map(str, found.shape)) or "a single value"
+        raise PolarguideError(
+            where,
+            expected=expected,
+            found=shape if found.shape not in shapes else "values that are not finite",
+            remedy="Export the cameras again.",
+        )
+    return found
+
+
+def _array(data: bytes) -> NDArray[Any]:
+    """Decode ``.npy``; a header that promises more than there is, is refused before memory is taken for it."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    size = dtype.itemsize
+    for length in shape:
+        size *= length
+    if dtype.hasobject or dtype.kind not in "biuf" or size > len(data) - stream.tell():
+        raise ValueError("no complete array of numbers")
+    stream.seek(0)
+    return np.asarray(np.load(stream, allow_pickle=False))

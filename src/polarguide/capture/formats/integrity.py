@@ -1,0 +1,137 @@
+"""Whether a picture file is complete, judged by its structure.
+
+Decoders differ by version in what they do with a file cut short: some refuse, some return gray or stale rows
+for the part that is missing. Walking the file's own marks first gives one answer with every decoder.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+# Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.
+_JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+_TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
+_TIFF_CODES = {1: "B", 3: "H", 4: "I"}
+_TIFF_STRIPS = ((273, 279), (324, 325))
+
+
+def find_damage(data: bytes) -> str | None:
+    """What is wrong with a PNG, JPEG or TIFF file as far as its structure tells, or None.
+
+    Args:
+        data: the whole file.
+
+    Returns:
+        A noun phrase for the "found" part of a message: "an empty file", "a PNG file cut short", ...
+    """
+    if not data:
+        return "an empty file"
+    if data.startswith(_PNG_SIGNATURE):
+        return _png_damage(data)
+    if data.startswith(b"\xff\xd8"):
+        return None if _jpeg_is_complete(data) else f"a JPEG file cut short (it ends after {len(data)} bytes)"
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        return None if _tiff_is_complete(data) else f"a TIFF file cut short (it ends after {len(data)} bytes)"
+    if data[:4] in (b"II+\0", b"MM\0+"):  # BigTIFF: left to the decoder
+        return None
+    return "a file that is none of these"
+
+
+def stated_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that the head of a PNG, JPEG or TIFF file without damage states; None where it does not."""
+    if data.startswith(_PNG_SIGNATURE):
+        return struct.unpack_from(">II", data, 16) if len(data) >= 24 else None
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_size(data)
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        return _tiff_size(data)
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        kind = data[at + 1]
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 1 if kind == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    order = "<" if data[:2] == b"II" else ">"
+    found = {}
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, start)
+    for index in range(count):
+        tag, kind = struct.unpack_from(order + "HH", data, start + 2 + 12 * index)
+        if tag in (256, 257) and kind in (3, 4):
+            (found[tag],) = struct.unpack_from(order + _TIFF_CODES[kind], data, start + 10 + 12 * index)
+    return (found[256], found[257]) if len(found) == 2 else None
+
+
+def _png_damage(data: bytes) -> str | None:
+    """Walk the chunks of a PNG file and check their checksums."""
+    at = len(_PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 12 + length
+        if end > len(data):
+            break
+        (stored,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != stored:
+            return f"a damaged PNG file (wrong checksum at byte {at})"
+        if kind == b"IEND":
+            return None
+        at = end
+    return f"a PNG file cut short (it ends after {len(data)} bytes)"
+
+
+def _jpeg_is_complete(data: bytes) -> bool:
+    """Walk the segments of a JPEG file to its end-of-image mark."""
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return False
+        kind = data[at + 1]
+        if kind == 0xD9:
+            return True
+        if kind == 0xFF:  # fill byte
+            at += 1
+            continue
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if kind == 0xDA:
+            mark = _JPEG_SCAN_END.search(data, at)
+            if mark is None:
+                return False
+            at = mark.start()
+    return data[at : at + 2] == b"\xff\xd9"
+
+
+def _tiff_is_complete(data: bytes) -> bool:
+    """Whether the first directory of a TIFF file and all of its strips or tiles lie within the file."""
+    order = "<" if data[:2] == b"II" else ">"
+    try:
+        (start,) = struct.unpack_from(order + "I", data, 4)
+        (count,) = struct.unpack_from(order + "H", data, start)
+        tags = {}
+        for index in range(count):
+            entry = start + 2 + 12 * index
+            tag, kind, length = struct.unpack_from(order + "HHI", data, entry)
+            size = length * _TIFF_SIZES.get(kind, 0)
+            at = entry + 8 if size <= 4 else struct.unpack_from(order + "I", data, entry + 8)[0]
+            if at + size > len(data):
+                return False
+            if kind in _TIFF_CODES and any(tag in pair for pair in _TIFF_STRIPS):
+                tags[tag] = struct.unpack_from(f"{order}{length}{_TIFF_CODES[kind]}", data, at)
+    except struct.error:
+        return False
+    for offsets, sizes in _TIFF_STRIPS:
+        if offsets in tags and sizes in tags:
+            ends = (at + size for at, size in zip(tags[offsets], tags[sizes], strict=False))
+            return all(end <= len(data) for end in ends)
+    return True

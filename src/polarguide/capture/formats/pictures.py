@@ -1,0 +1,135 @@
+"""Picture files -> arrays: strict decoding, three channels in RGB order, linear 16-bit codes."""
+
+from __future__ import annotations
+
+import functools
+import stat
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.formats.integrity import find_damage, stated_size
+from polarguide.capture.view import FULL_CODE
+from polarguide.color import srgb_decode_array
+from polarguide.errors import PolarguideError
+
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+TRANSFERS = ("linear", "srgb")
+LARGEST_PIXELS = 150_000_000
+"""More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
+_LARGEST_FILE = 1 << 31
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        PolarguideError: the file cannot be read.
+    """
+    try:
+        about = path.stat()
+        if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):  # reading may never end
+            raise OSError("a pipe or device")
+        if about.st_size > _LARGEST_FILE:
+            raise OSError(f"one of {about.st_size} bytes, more than 2 GiB")
+        return path.read_bytes()
+    except OSError as error:
+        raise PolarguideError(
+            path,
+            expected="a readable file",
+            found=error.strerror or str(error),
+            remedy="Check that the file exists and may be read.",
+        ) from error
+
+
+def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
+    """Decode a photograph.
+
+    Args:
+        path: where ``data`` came from, for messages.
+        data: the whole file: PNG, JPEG or TIFF with 8 or 16 bits a channel, gray or color. Alpha is dropped,
+            an orientation tag is not applied (poses belong to the stored pixels).
+
+    Returns:
+        [H, W, 3] uint8 or uint16, RGB, as stored. A gray picture becomes three equal channels.
+
+    Raises:
+        PolarguideError: the file is damaged, cut short, or of another kind.
+    """
+    pixels = decode_stored(path, data)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise PolarguideError(
+            path,
+            expected="a picture with 8 or 16 bits a channel",
+            found=f"values of type {pixels.dtype}",
+            remedy="Save it as 16-bit PNG with value 65535 for linear intensity 1.",
+        )
+    if pixels.ndim == 2:
+        return np.repeat(pixels[..., None], 3, axis=2)
+    return np.ascontiguousarray(pixels[..., 2::-1])
+
+
+def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_]:
+    """Decode a mask picture into [H, W] bool.
+
+    Args:
+        path: where ``data`` came from, for messages.
+        data: the whole file.
+        any_value: True where any channel is not zero; otherwise where it reaches half of the picture's
+            maximum, which reads masks of 0 and 1, of 0 and 255, and those with soft edges alike.
+
+    Raises:
+        PolarguideError: the file is damaged, cut short, or of another kind.
+    """
+    pixels = decode_stored(path, data)
+    gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
+    if any_value:
+        return np.asarray(gray > 0)
+    return np.asarray((gray > 0) & (2.0 * gray >= float(gray.max())))
+
+
+def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
+    """Stored 8- or 16-bit values -> round(65535 * linear intensity), same shape, uint16."""
+    if pixels.dtype == np.uint16 and transfer == "linear":
+        return pixels.astype(np.uint16, copy=False)
+    return _table(int(np.iinfo(pixels.dtype).max), transfer)[pixels]
+
+
+@functools.cache
+def _table(full: int, transfer: str) -> NDArray[np.uint16]:
+    """Linear code of every stored value in 0..full."""
+    shown = np.arange(full + 1) / full
+    if transfer == "srgb":
+        shown = srgb_decode_array(shown)
+    return np.rint(shown * FULL_CODE).astype(np.uint16)
+
+
+def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
+    """Decode a picture exactly as stored: [H, W] or [H, W, C] in OpenCV's channel order, any value type.
+
+    Raises:
+        PolarguideError: the file is damaged, cut short, or of another kind.
+    """
+    damage = find_damage(data)
+    size = None if damage is not None else stated_size(data)
+    if size is not None and size[0] * size[1] > LARGEST_PIXELS:
+        damage = f"one of {size[0]}x{size[1]} pixels, more than any camera takes"
+    pixels = None
+    if damage is None:
+        try:
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            pixels = None
+        if pixels is None:
+            damage = "one that cannot be decoded"
+    if damage is not None:
+        raise PolarguideError(
+            path,
+            expected="a complete PNG, JPEG or TIFF file",
+            found=damage,
+            remedy="Copy or export the file again.",
+        )
+    return np.asarray(pixels)

@@ -1,0 +1,130 @@
+"""Files of linear radiance (.hdr, .exr, .npy) -> float pictures of three channels."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
+from polarguide.errors import PolarguideError
+
+RADIANCE_SUFFIXES = (".hdr", ".exr", ".npy")
+_HDR_SIZE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
+
+openexr: ModuleType | None
+try:
+    openexr = importlib.import_module("OpenEXR")
+except ImportError:
+    openexr = None
+
+
+def read_radiance(path: Path) -> NDArray[np.float32]:
+    """Read a linear picture; values may be negative or above 1, and are returned as they are.
+
+    Args:
+        path: Radiance ``.hdr``, OpenEXR ``.exr`` (package OpenEXR) or ``.npy`` with [H, W], [H, W, 1] or [H, W, 3].
+
+    Returns:
+        [H, W, 3] float32, RGB. A gray picture becomes three equal channels.
+
+    Raises:
+        PolarguideError: the file cannot be read, is damaged or of another kind, or a package is missing.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".hdr":
+        pixels = _read_hdr(path)
+    elif suffix == ".exr":
+        pixels = _read_exr(path)
+    else:
+        pixels = read_array(path)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.ndim != 3 or pixels.shape[2] not in (1, 3) or 0 in pixels.shape or pixels.dtype.kind != "f":
+        shape = "x".join(map(str, pixels.shape)) or "a single value"
+        raise PolarguideError(
+            path,
+            expected="a picture of floating-point numbers with one or three channels",
+            found=f"an array {shape} of {pixels.dtype}",
+            remedy="Export the file again.",
+        )
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), dtype=np.float32)
+
+
+def _read_hdr(path: Path) -> NDArray[Any]:
+    data = read_file(path)
+    found = "an empty file" if not data else "a file that is none"
+    size = _HDR_SIZE.search(data[:4096])
+    pixels = None
+    if data.startswith(b"#?") and size is not None:
+        height, width = int(size[1]), int(size[2])
+        found = f"one that is damaged or cut short (it ends after {len(data)} bytes)"
+        # Run lengths reach 127 pixels with two bytes a channel: fewer bytes than this cannot be complete.
+        if 0 < height * width <= min(LARGEST_PIXELS, 64 * len(data)):
+            pixels = _decoded(data)
+    if pixels is None or pixels.dtype != np.float32 or pixels.ndim != 3:
+        raise PolarguideError(
+            path,
+            expected="a complete Radiance HDR file",
+            found=found,
+            remedy="Copy or export the file again.",
+        )
+    return pixels[..., 2::-1]
+
+
+def _decoded(data: bytes) -> NDArray[Any] | None:
+    """OpenCV's reading of a picture file, without its own words on what is wrong."""
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def _read_exr(path: Path) -> NDArray[Any]:
+    data = read_file(path)
+    if openexr is None:
+        raise PolarguideError(
+            path,
+            expected="the package OpenEXR, which reads this format",
+            found="that it is not installed",
+            remedy="pip install 'polarguide[exr]'",
+        )
+    found = "an empty file" if not data else "one that is damaged, cut short or something else"
+    pixels = None
+    if data.startswith(b"\x76\x2f\x31\x01"):
+        try:
+            pixels = _exr_channels(path, openexr)
+        except Exception as error:  # the binding raises whatever C++ threw
+            found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
+    if pixels is None:
+        raise PolarguideError(
+            path,
+            expected="a complete OpenEXR file with channels R, G and B, or Y",
+            found=found,
+            remedy="Copy or export the file again.",
+        )
+    return pixels
+
+
+def _exr_channels(path: Path, package: ModuleType) -> NDArray[Any] | None:
+    with package.File(str(path), separate_channels=True) as file:
+        window = file.header()["dataWindow"]
+        width, height = (int(window[1][axis]) - int(window[0][axis]) + 1 for axis in (0, 1))
+        if not 0 < width * height <= LARGEST_PIXELS:
+            raise ValueError(f"{width}x{height} pixels")
+        channels = file.channels()
+        names = next((n for n in (("R", "G", "B"), ("Y",)) if all(name in channels for name in n)), None)
+        if names is None:
+            return None
+        return np.stack([np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1)

@@ -1,0 +1,57 @@
+"""The display transfer: sRGB (IEC 61966-2-1). Radiance is linear everywhere else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+def srgb_encode(linear: Tensor) -> Tensor:
+    """Linear values to shown ones: ``12.92 v`` up to 0.0031308, else ``1.055 v^(1/2.4) - 0.055``.
+
+    Args:
+        linear: any shape; [0, 1] maps to [0, 1], both ends exactly. Not clipped: the
+            straight part goes on below 0, the curve above 1.
+
+    Returns:
+        The same shape, differentiable.
+    """
+    curved = 1.055 * (linear.clamp(min=0.0031308) ** (1 / 2.4) - 1) + 1  # exactly 1 at 1
+    return torch.where(linear <= 0.0031308, 12.92 * linear, curved)
+
+
+def srgb_decode(shown: Tensor) -> Tensor:
+    """Shown values to linear ones: ``v / 12.92`` up to 0.04045, else ``((v + 0.055) / 1.055)^2.4``.
+
+    Args:
+        shown: any shape; [0, 1] maps to [0, 1]. Not clipped.
+
+    Returns:
+        The same shape, differentiable.
+    """
+    curved = ((shown.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(shown <= 0.04045, shown / 12.92, curved)
+
+
+def shown(linear: Tensor) -> Tensor:
+    """The picture as a display shows it: clipped to [0, 1], then ``srgb_encode``. NaN stays NaN.
+
+    Args:
+        linear: [...] linear radiance.
+    """
+    return srgb_encode(linear.clamp(0.0, 1.0))
+
+
+def srgb_encode_array(linear: NDArray[Any]) -> NDArray[Any]:
+    """``srgb_encode`` for NumPy arrays in [0, 1]."""
+    curved = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, curved)
+
+
+def srgb_decode_array(shown: NDArray[Any]) -> NDArray[Any]:
+    """``srgb_decode`` for NumPy arrays in [0, 1]."""
+    return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,1 @@
+"""Comparisons and ablations: many runs, their tables and their report."""

@@ -1,0 +1,102 @@
+"""Many runs -> the rows of a table: means and spreads over seeds, and over scenes."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict
+
+from polarguide.evaluation.table import KEYS
+
+
+class Cell(TypedDict):
+    """One quantity of one row.
+
+    ``mean`` is None where no run has a value; ``spread`` is the sample standard deviation over seeds, None with fewer
+    than two; ``count`` is the number of seeds with a value.
+    """
+
+    mean: float | None
+    spread: float | None
+    count: int
+
+
+class Row(TypedDict):
+    """One recipe on one scene (``scene`` None: the mean over scenes), of ``finished`` runs."""
+
+    scene: str | None
+    recipe: str
+    finished: int
+    cells: dict[str, Cell]
+
+
+def aggregate(runs: Sequence[Mapping[str, Any]], scenes: Sequence[str], recipes: Sequence[str]) -> list[Row]:
+    """The table of a comparison.
+
+    Args:
+        runs: records with ``scene``, ``recipe``, ``seed`` and ``metrics`` (key -> number or None; None for a run that
+            has not finished).
+        scenes, recipes: names, in the order in which rows are wanted.
+
+    Returns:
+        A row for every scene and recipe, and, with several scenes, one for the mean over scenes of every recipe. In
+        that mean every scene has one weight, and a quantity is given only where the recipe has it on every scene on
+        which any recipe has it: means over different scenes are not to be compared.
+    """
+    rows = [_scene_row(runs, scene, recipe) for scene in scenes for recipe in recipes]
+    if len(scenes) > 1:
+        rows += [_mean_row(runs, rows, scenes, recipe) for recipe in recipes]
+    return rows
+
+
+def _finished(runs: Sequence[Mapping[str, Any]], scene: str, recipe: str) -> list[Mapping[str, Any]]:
+    return [r for r in runs if r["scene"] == scene and r["recipe"] == recipe and r["metrics"] is not None]
+
+
+def _scene_row(runs: Sequence[Mapping[str, Any]], scene: str, recipe: str) -> Row:
+    finished = _finished(runs, scene, recipe)
+    cells = {key: cell_of([run["metrics"].get(key) for run in finished]) for key in KEYS}
+    return Row(scene=scene, recipe=recipe, finished=len(finished), cells=cells)
+
+
+def _mean_row(
+    runs: Sequence[Mapping[str, Any]], rows: Sequence[Row], scenes: Sequence[str], recipe: str
+) -> Row:
+    own = {row["scene"]: row for row in rows if row["recipe"] == recipe}
+    cells: dict[str, Cell] = {}
+    for key in KEYS:
+        wanted = [s for s in scenes if any(r["scene"] == s and r["cells"][key]["count"] for r in rows)]
+        means = [own[scene]["cells"][key]["mean"] for scene in wanted]
+        numbers = [mean for mean in means if mean is not None]
+        if not numbers or len(numbers) < len(wanted):
+            cells[key] = Cell(mean=None, spread=None, count=0)
+            continue
+        over_seeds = cell_of(list(_by_seed(runs, wanted, recipe, key).values()))
+        cells[key] = Cell(
+            mean=math.fsum(numbers) / len(numbers), spread=over_seeds["spread"], count=over_seeds["count"]
+        )
+    return Row(scene=None, recipe=recipe, finished=sum(r["finished"] for r in own.values()), cells=cells)
+
+
+def _by_seed(
+    runs: Sequence[Mapping[str, Any]], scenes: Sequence[str], recipe: str, key: str
+) -> dict[int, float]:
+    """The mean over scenes of every seed that has a value on all of them."""
+    values: dict[int, list[float]] = {}
+    for scene in scenes:
+        for run in _finished(runs, scene, recipe):
+            value = run["metrics"].get(key)
+            if value is not None:
+                values.setdefault(run["seed"], []).append(value)
+    return {seed: math.fsum(v) / len(v) for seed, v in values.items() if len(v) == len(scenes)}
+
+
+def cell_of(values: Sequence[float | None]) -> Cell:
+    """Mean and sample standard deviation of what is not None."""
+    numbers = [float(value) for value in values if value is not None]
+    return Cell(
+        mean=math.fsum(numbers) / len(numbers) if numbers else None,
+        spread=statistics.stdev(numbers) if len(numbers) > 1 else None,
+        count=len(numbers),
+    )

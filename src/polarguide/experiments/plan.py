@@ -1,0 +1,219 @@
+"""Which runs a comparison consists of, where each lives, and what is still to be done for it.
+
+A run's folder carries a digest of everything that its result depends on: the same command finds finished runs again,
+and whatever changes gets a folder of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from polarguide import __version__
+from polarguide.cli.common import Transfer, read_scene
+from polarguide.cli.evaluate import METRICS
+from polarguide.errors import PolarguideError
+from polarguide.evaluation import validate_metrics
+from polarguide.evaluation.sources import scoring_digest, training_digest
+from polarguide.raster import DeviceName
+from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration, recipe_data
+from polarguide.training.recipe import Recipe
+from polarguide.training.trainer import TrainSettings
+
+State = Literal["new", "begun", "trained", "done"]
+RUNS = "runs"
+KEY_DIGITS = 10
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What was asked for.
+
+    Attributes:
+        scenes: folders. recipes: the methods, in the order of the tables.
+        settings: steps, first seed (0) and refractive index. seeds: how many seeds, from 0 up.
+        downscale, transfer, device: as for ``train``.
+        jobs: trainings at a time. threads: of each.
+        speed: whether to time pictures that were not timed alone. report_views: test views a scene in the report.
+        out: folder to write.
+    """
+
+    scenes: tuple[Path, ...]
+    recipes: tuple[Recipe, ...]
+    settings: TrainSettings
+    seeds: int
+    downscale: int
+    transfer: Transfer
+    device: DeviceName
+    jobs: int
+    threads: int
+    speed: bool
+    report_views: int
+    out: Path
+
+    @property
+    def command(self) -> str:
+        """A command line that asks for the same."""
+        words = [
+            "polarguide",
+            "compare",
+            *map(str, self.scenes),
+            "--recipes",
+            *(r.name for r in self.recipes),
+        ]
+        words += ["--steps", str(self.settings.steps), "--seeds", str(self.seeds), "--out", str(self.out)]
+        words += ["--downscale", str(self.downscale), "--transfer", self.transfer]
+        words += ["--refractive-index", str(self.settings.refractive_index)]
+        return shlex.join(words)
+
+
+@dataclass(frozen=True)
+class SceneEntry:
+    """A scene as far as the record needs it."""
+
+    path: Path
+    name: str
+    digest: str
+    views: int
+    test_views: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One training: a scene, a recipe and a seed."""
+
+    scene: SceneEntry
+    recipe: Recipe
+    settings: TrainSettings
+    downscale: int
+    transfer: Transfer
+    folder: Path
+
+    @property
+    def label(self) -> str:
+        """What messages call it."""
+        return f"{self.scene.name}, {self.recipe.name}, seed {self.settings.seed}"
+
+    def state(self) -> State:
+        """How far it is, by what its folder holds."""
+        if not (self.folder / CONFIGURATION).exists():
+            return "new"
+        found = self._configuration()
+        if found is None:
+            return "begun"  # going on with it will say what does not match
+        if self.metrics() is not None:
+            return "done"
+        # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
+        moved = found.scene != str(self.scene.path.resolve())
+        return "trained" if (self.folder / PLY).exists() and not moved else "begun"
+
+    def metrics(self) -> dict[str, Any] | None:
+        """The record of its scores, or None where there is no valid one by this version."""
+        try:
+            record = json.loads((self.folder / METRICS).read_text(encoding="utf-8"))
+            validate_metrics(record)
+        except (OSError, ValueError, KeyError, PolarguideError):
+            return None
+        whole = record["steps"] == self.settings.steps
+        return record if whole and record["provenance"].get("sources") == scoring_digest() else None
+
+    def _configuration(self) -> RunConfiguration | None:
+        """What the folder's run was trained as, or None where that is not this run."""
+        try:
+            found = RunConfiguration.load(self.folder)
+        except PolarguideError:
+            return None
+        same = (
+            found.scene_digest == self.scene.digest
+            and found.recipe_data == recipe_data(self.recipe)
+            and found.settings == self.settings
+            and (found.recipe, found.downscale, found.transfer)
+            == (self.recipe.name, self.downscale, self.transfer)
+        )
+        return found if same else None
+
+
+def scene_entries(comparison: Comparison) -> list[SceneEntry]:
+    """Read every scene once: its digest and its test views.
+
+    Raises:
+        PolarguideError: a scene that cannot be read, has no test views, or is called like another.
+    """
+    entries: list[SceneEntry] = []
+    for path in comparison.scenes:
+        scene = read_scene(path, downscale=comparison.downscale, transfer=comparison.transfer)
+        if scene.name in [entry.name for entry in entries]:
+            raise PolarguideError(
+                path,
+                expected="scenes with names of their own",
+                found=f"{scene.name} twice",
+                remedy="Rename a folder.",
+            )
+        if not scene.test_names:
+            raise PolarguideError(
+                path, expected="test views", found="none", remedy="Name some in split.json to score on."
+            )
+        entries.append(SceneEntry(path, scene.name, scene.digest, len(scene.views), scene.test_names))
+    return entries
+
+
+def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:
+    """All runs, scene by scene; within a scene seed by seed, so that first results compare all recipes."""
+    return [
+        _planned(comparison, scene, recipe, seed)
+        for scene in scenes
+        for seed in range(comparison.seeds)
+        for recipe in comparison.recipes
+    ]
+
+
+def _planned(comparison: Comparison, scene: SceneEntry, recipe: Recipe, seed: int) -> PlannedRun:
+    settings = TrainSettings(comparison.settings.steps, seed, comparison.settings.refractive_index)
+    key = run_key(
+        scene.digest,
+        recipe_data(recipe),
+        settings,
+        downscale=comparison.downscale,
+        transfer=comparison.transfer,
+        code=f"{__version__} {training_digest()}",
+    )
+    folder = comparison.out / RUNS / scene.name / recipe.name.replace(":", "__") / f"{seed}-{key}"
+    return PlannedRun(scene, recipe, settings, comparison.downscale, comparison.transfer, folder)
+
+
+def run_key(
+    scene_digest: str,
+    recipe: Mapping[str, Any],
+    settings: TrainSettings,
+    *,
+    downscale: int,
+    transfer: str,
+    code: str,
+) -> str:
+    """A short digest of everything that a training's result depends on.
+
+    Args:
+        scene_digest: of the scene's files.
+        recipe: all values of the recipe.
+        settings: steps, seed and refractive index.
+        downscale, transfer: how the pictures are read.
+        code: which version of the program trains.
+
+    Returns:
+        Ten hexadecimal digits.
+    """
+    parts = [
+        scene_digest,
+        recipe,
+        [settings.steps, settings.seed, settings.refractive_index],
+        downscale,
+        transfer,
+        code,
+    ]
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]

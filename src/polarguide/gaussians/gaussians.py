@@ -1,0 +1,150 @@
+"""The trainable rows: one row per Gaussian in every tensor, and an Adam optimizer whose moments follow the rows.
+
+Rows are edited (kept, appended, overwritten) only through the methods here, so a tensor and its moments cannot get
+out of step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from polarguide.errors import PolarguideError
+
+# What every recipe trains, with the shape of one row. Recipes may add side tensors of their own.
+CORE_SHAPES = {
+    "means": (3,),
+    "quaternions": (4,),
+    "log_scales": (3,),
+    "opacity_logits": (),
+    "sh_dc": (3,),
+    "sh_rest": (15, 3),
+}
+
+
+class Gaussians:
+    """Named per-Gaussian tensors with their Adam moments (Kingma and Ba 2015, epsilon 1e-15 as in 3DGS).
+
+    Args:
+        tensors: the rows, all with the same first axis; ``CORE_SHAPES`` and any side tensors.
+        rates: learning rate by name; a name without one is not trained.
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
+        self._tensors = {
+            name: t.detach().clone().contiguous().requires_grad_() for name, t in tensors.items()
+        }
+        self._check()
+        groups = [
+            {"params": [self._tensors[name]], "lr": rate, "name": name}
+            for name, rate in rates.items()
+            if name in self._tensors
+        ]
+        self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+    def _check(self) -> None:
+        counts = {name: t.shape[0] for name, t in self._tensors.items()}
+        if len(set(counts.values())) > 1:
+            raise PolarguideError(
+                "Gaussian rows",
+                expected="one row count",
+                found=str(counts),
+                remedy="Give every tensor one row each.",
+            )
+
+    def __len__(self) -> int:
+        return self._tensors["means"].shape[0]
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._tensors[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._tensors
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all tensors."""
+        return tuple(self._tensors)
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """Detached copies of all rows."""
+        return {name: t.detach().clone() for name, t in self._tensors.items()}
+
+    def trained(self) -> list[Tensor]:
+        """The tensors that are trained, in the order of their rates."""
+        return [group["params"][0] for group in self._optimizer.param_groups]
+
+    def set_betas(self, betas: tuple[float, float]) -> None:
+        """Set the decay of Adam's moments; torch's default otherwise."""
+        for group in self._optimizer.param_groups:
+            group["betas"] = betas
+
+    def set_rate(self, name: str, rate: float) -> None:
+        """Set the learning rate of one tensor."""
+        for group in self._optimizer.param_groups:
+            if group["name"] == name:
+                group["lr"] = rate
+
+    def step(self) -> None:
+        """One Adam step on every tensor that has a gradient; then the gradients are dropped."""
+        self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+
+    @torch.no_grad()
+    def overwrite(self, name: str, values: Tensor) -> None:
+        """Replace a tensor's values and zero its moments, as 3DGS does at every reset."""
+        self._tensors[name].copy_(values)
+        state = self._optimizer.state.get(self._tensors[name], {})
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in state:
+                state[key].zero_()
+
+    def keep(self, index: Tensor) -> None:
+        """Keep only the rows that ``index`` (a mask or indices) selects."""
+        self._replace({name: t.detach()[index] for name, t in self._tensors.items()}, lambda m: m[index])
+
+    def append(self, gaussians: Mapping[str, Tensor]) -> None:
+        """Append rows to every tensor; their moments start at zero."""
+        joined = {name: torch.cat((t.detach(), gaussians[name])) for name, t in self._tensors.items()}
+        count = gaussians["means"].shape[0]
+        self._replace(joined, lambda m: torch.cat((m, m.new_zeros(count, *m.shape[1:]))))
+
+    def _replace(self, tensors: Mapping[str, Tensor], follow: Callable[[Tensor], Tensor]) -> None:
+        """Put other rows in the tensors' place; ``follow`` makes the same edit on a moment."""
+        groups = {group["name"]: group for group in self._optimizer.param_groups}
+        for name, values in tensors.items():
+            old, new = self._tensors[name], values.contiguous().requires_grad_()
+            self._tensors[name] = new
+            state = self._optimizer.state.pop(old, None)
+            if name in groups:
+                groups[name]["params"][0] = new
+            if state:
+                moments = {key: follow(state[key]).contiguous() for key in ("exp_avg", "exp_avg_sq")}
+                self._optimizer.state[new] = {**state, **moments}
+        self._check()
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything needed to go on: ``gaussians.NAME`` and ``adam.NAME.{exp_avg,exp_avg_sq,step}``."""
+        out = {f"gaussians.{name}": t.detach().contiguous() for name, t in self._tensors.items()}
+        for group in self._optimizer.param_groups:
+            for key, value in self._optimizer.state.get(group["params"][0], {}).items():
+                out[f"adam.{group['name']}.{key}"] = value.detach().contiguous()
+        return out
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], rates: Mapping[str, float]) -> Gaussians:
+        """The inverse of ``state``."""
+        tensors = {
+            key.removeprefix("gaussians."): value
+            for key, value in state.items()
+            if key.startswith("gaussians.")
+        }
+        gaussians = cls(tensors, rates)
+        for group in gaussians._optimizer.param_groups:
+            prefix = f"adam.{group['name']}."
+            moments = {key[len(prefix) :]: v.clone() for key, v in state.items() if key.startswith(prefix)}
+            if moments:
+                gaussians._optimizer.state[group["params"][0]] = moments
+        return gaussians

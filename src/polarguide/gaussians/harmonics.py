@@ -1,0 +1,136 @@
+"""Real spherical harmonics to degree 3, in the order and with the signs of the 3DGS release.
+
+Degree 1 is in the order -y, z, -x. On the CPU in float32 a native kernel evaluates the colors;
+``evaluate_sh_reference`` is its twin in plain torch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from polarguide import _native
+
+SH_C0 = 0.28209479177387814
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """The basis functions at unit directions.
+
+    Args:
+        directions: [..., 3], unit length.
+        degree: 0 to 3.
+
+    Returns:
+        [..., (degree + 1)^2], differentiable.
+
+    Raises:
+        ValueError: for another degree.
+    """
+    if not 0 <= degree <= 3:
+        raise ValueError(f"degree: expected 0 to 3, found {degree}")
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, SH_C0)]
+    if degree > 0:
+        basis += [-_C1 * y, _C1 * z, -_C1 * x]
+    xx, yy, zz = x * x, y * y, z * z
+    if degree > 1:
+        basis += [
+            _C2[0] * x * y,
+            _C2[1] * y * z,
+            _C2[2] * (2 * zz - xx - yy),
+            _C2[3] * x * z,
+            _C2[4] * (xx - yy),
+        ]
+    if degree > 2:
+        basis += [
+            _C3[0] * y * (3 * xx - yy),
+            _C3[1] * x * y * z,
+            _C3[2] * y * (4 * zz - xx - yy),
+            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            _C3[4] * x * (4 * zz - xx - yy),
+            _C3[5] * z * (xx - yy),
+            _C3[6] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def _directions(means: Tensor, center: Tensor) -> Tensor:
+    """Unit vectors from the center to the means; zero, with gradient zero, for a mean at the center."""
+    offsets = means - center
+    squared = offsets.square().sum(dim=-1, keepdim=True)
+    return offsets * squared.masked_fill(squared <= 1e-24, torch.inf).rsqrt()
+
+
+def evaluate_sh_reference(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
+    """The slow twin of ``evaluate_sh``: plain torch, any dtype and device."""
+    basis = sh_basis(_directions(means, center), degree)
+    coefficients = torch.cat((dc[:, None], rest), dim=1)[:, : basis.shape[-1]]
+    return (basis[..., None] * coefficients).sum(dim=1)
+
+
+class _Harmonics(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
+        means, center, dc, rest = (t.detach().contiguous() for t in (means, center, dc, rest))
+        out = torch.empty_like(dc)
+        _native.harmonics_forward(degree, means, center, dc, rest, out)
+        ctx.save_for_backward(means, center, dc, rest)
+        ctx.degree = degree
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        means, center, dc, rest = ctx.saved_tensors
+        to_means, to_dc, to_rest = (torch.empty_like(t) for t in (means, dc, rest))
+        _native.harmonics_backward(
+            ctx.degree, means, center, dc, rest, grad.contiguous(), to_means, to_dc, to_rest
+        )
+        return to_means, None, to_dc, to_rest, None
+
+
+def evaluate_sh(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
+    """Each Gaussian's color from a camera: ``sum_k basis_k(d) coefficient_k``, ``d`` from center to mean.
+
+    ``d`` has unit length, or is 0 for a Gaussian at the center. The 0.5 that 3DGS adds is not in it.
+
+    Args:
+        means: [N, 3] Gaussian centers.
+        center: [3] camera center; of any dtype and device, and gets no gradient.
+        dc: [N, 3] coefficients of degree 0.
+        rest: [N, 15, 3] coefficients of degrees 1 to 3.
+        degree: 0 to 3; coefficients beyond it count as zero and get a zero gradient.
+
+    Returns:
+        [N, 3], differentiable in means (through the direction), dc and rest.
+
+    Raises:
+        ValueError: if a shape or the degree is not as above.
+    """
+    count = means.shape[0]
+    expected = {"means": (means, (count, 3)), "center": (center, (3,)), "dc": (dc, (count, 3))}
+    for name, (tensor, shape) in (expected | {"rest": (rest, (count, 15, 3))}).items():
+        if tensor.shape != shape:
+            raise ValueError(f"{name}: expected shape {list(shape)}, found {list(tensor.shape)}")
+    if not 0 <= degree <= 3:
+        raise ValueError(f"degree: expected 0 to 3, found {degree}")
+    center = center.detach().to(means)
+    if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (means, dc, rest)):
+        result: Tensor = _Harmonics.apply(means, center, dc, rest, degree)
+        return result
+    return evaluate_sh_reference(means, center, dc, rest, degree)

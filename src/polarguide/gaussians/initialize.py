@@ -1,0 +1,87 @@
+"""First Gaussians: on the SfM points, and far around the capture, where SfM has none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from polarguide.gaussians.harmonics import SH_C0
+
+
+@dataclass(frozen=True)
+class Initialization:
+    """How many Gaussians are added to the SfM points.
+
+    Attributes:
+        shell: ones far around the capture, for surroundings that SfM does not triangulate. None are added inside:
+            random Gaussians among the cameras end as haze in front of them.
+        shell_radii: nearest and farthest shell, in units of the cameras' distance from the middle of the points.
+        opacity: first opacity of all.
+    """
+
+    shell: int = 4000
+    shell_radii: tuple[float, float] = (3.0, 12.0)
+    opacity: float = 0.1
+
+
+def scene_extent(centers: Tensor) -> float:
+    """1.1 times the largest distance of a camera from the cameras' mean (Kerbl et al. 2023). centers: [V, 3]."""
+    return 1.1 * float((centers - centers.mean(dim=0)).norm(dim=1).max())
+
+
+def neighbor_distance(points: np.ndarray) -> np.ndarray:
+    """Root mean squared distance of each point [M, 3] to its three nearest neighbors, [M]."""
+    neighbors = min(4, len(points))
+    distance, _ = cKDTree(points).query(points, k=neighbors)
+    distance = np.asarray(distance).reshape(len(points), -1)[:, 1:]
+    if distance.shape[1] == 0:
+        return np.full(len(points), 0.01)
+    return np.sqrt((distance**2).mean(axis=1)).clip(min=1e-7)
+
+
+def initial_parameters(
+    points: Tensor, colors: Tensor, centers: Tensor, settings: Initialization, *, seed: int
+) -> dict[str, Tensor]:
+    """The rows to begin with.
+
+    Args:
+        points: [M, 3] SfM points.
+        colors: [M, 3] linear colors in [0, 1].
+        centers: [V, 3] camera centers.
+        settings: how many are added.
+        seed: of the random positions and orientations.
+
+    Returns:
+        The tensors of ``CORE_SHAPES``, float32.
+    """
+    random = np.random.default_rng(seed)
+    sfm = points.double().numpy()
+    cameras = centers.double().numpy()
+    middle = np.median(sfm, axis=0)
+    radius = float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
+    directions = random.normal(size=(settings.shell, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    near, far = (radius * r for r in settings.shell_radii)
+    # Evenly spaced in 1/distance, as parallax is.
+    away = 1 / (1 / near + (1 / far - 1 / near) * random.random(settings.shell))
+    added = middle + directions * away[:, None]
+    means = np.concatenate((sfm, added))
+    gray = colors.double().mean(dim=0, keepdim=True).numpy() if len(sfm) else np.full((1, 3), 0.5)
+    rgb = np.concatenate((colors.double().numpy(), np.repeat(gray, len(added), axis=0)))
+    # Each kind measures its spacing among its own: a shell Gaussian must not shrink because SfM points are dense.
+    parts = (sfm, added)
+    spacing = np.concatenate([neighbor_distance(part) for part in parts if len(part)])
+    count = len(means)
+    parameters = {
+        "means": means,
+        "quaternions": random.normal(size=(count, 4)),
+        "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1),
+        "opacity_logits": np.full(count, np.log(settings.opacity / (1 - settings.opacity))),
+        "sh_dc": (rgb - 0.5) / SH_C0,
+        "sh_rest": np.zeros((count, 15, 3)),
+    }
+    return {name: torch.from_numpy(values).float() for name, values in parameters.items()}

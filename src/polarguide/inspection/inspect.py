@@ -1,0 +1,185 @@
+"""``inspect_scene``: reads a capture, runs every check it can carry, and puts the findings together."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from polarguide.capture import load_scene
+from polarguide.errors import PolarguideError
+from polarguide.inspection.angle_checks import Angles, handedness_check, order_check, weigh, zero_check
+from polarguide.inspection.dielectric import dielectric_check
+from polarguide.inspection.likelihood import Evidence
+from polarguide.inspection.picture_checks import pairing_of, picture_checks
+from polarguide.inspection.pictures import Capture, Pictures, read_capture
+from polarguide.inspection.points import point_evidence
+from polarguide.inspection.pose_checks import coverage_check, pose_check
+from polarguide.inspection.readings import Readings, read_view_figures
+from polarguide.inspection.short_run import LONGEST, short_run, surface_of
+from polarguide.inspection.surfaces import Pixels, Surface, surface_evidence, surface_pixels
+from polarguide.inspection.verdict import Check, Verdict, worst
+from polarguide.raster import Backend
+
+Normals = Literal["auto", "points", "train"]
+SURE = 0.98
+"""Probability from which on ``auto`` is content with the points."""
+FEWEST_TO_TRAIN = 8
+RUN_FOLDER = "short_run"
+Progress = Callable[[int], None]
+Track = Callable[[str, int], AbstractContextManager[Progress]]
+
+
+@dataclass(frozen=True)
+class InspectSettings:
+    """What the user chooses.
+
+    Attributes:
+        downscale: side of the pixel boxes to average; 0: chosen. transfer: how the files are encoded.
+        refractive_index: of the surfaces; None: that of ``scene.json``, else 1.5.
+        normals: "points" uses points seen in several views alone, "train" trains for normals as well, "auto" does so
+            if the points do not decide.
+        steps: of the short training.
+    """
+
+    downscale: int = 0
+    transfer: str = "linear"
+    refractive_index: float | None = None
+    normals: Normals = "auto"
+    steps: int = 600
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """The findings.
+
+    Attributes:
+        capture: what was inspected. settings: how. index: the refractive index that was used.
+        readings: of each view. checks: in the order in which they are shown. angles: order, sense and zero.
+    """
+
+    capture: Capture
+    settings: InspectSettings
+    index: float
+    readings: tuple[Readings, ...]
+    checks: tuple[Check, ...]
+    angles: Angles
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of all checks."""
+        return worst(self.checks)
+
+    def check(self, key: str) -> Check:
+        """The check with this key."""
+        return next(check for check in self.checks if check.key == key)
+
+
+@contextlib.contextmanager
+def silent(label: str, total: int) -> Iterator[Progress]:
+    """Progress that nobody sees."""
+    yield lambda done: None
+
+
+def inspect_scene(
+    path: Path, out: Path, settings: InspectSettings, backend: Backend, track: Track = silent
+) -> Inspection:
+    """Inspect a scene folder.
+
+    Args:
+        path: the scene; it may have no poses.
+        out: folder for what is kept of a short training.
+        settings: the user's choices.
+        backend: what the short training runs on.
+        track: opens a progress bar, given a label and a total.
+
+    Raises:
+        PolarguideError: the scene cannot be read.
+    """
+    with track("reading", 0) as advance:
+        capture = read_capture(
+            path,
+            downscale=settings.downscale,
+            transfer=settings.transfer,
+            progress=lambda done, total: advance(done),
+        )
+    index = settings.refractive_index or capture.refractive_index or 1.5
+    readings: list[Readings] = []
+    with track("measuring", len(capture.views)) as advance:
+        for view in capture.views:
+            readings.append(read_view_figures(view, index))
+            advance(len(readings))
+    pairing = pairing_of(capture)
+    checks = picture_checks(capture, readings, pairing)
+    with track("matching features", 1):
+        checks += [pose_check(capture), coverage_check(capture)]
+    angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, track)
+    checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
+    checks.append(dielectric_check(readings, pixels, index))
+    return Inspection(capture, settings, index, tuple(readings), tuple(checks), angles)
+
+
+def _angles(
+    capture: Capture,
+    out: Path,
+    settings: InspectSettings,
+    index: float,
+    pairing: int,
+    backend: Backend,
+    track: Track,
+) -> tuple[Angles, Pixels | None]:
+    """Order, sense and zero by what geometry there is; and the pixels with normals if there are any."""
+    sources: list[Evidence] = []
+    if capture.model is None or len(capture.posed) < 2:
+        return weigh(sources, pairing), None
+    with track("weighing points", 1):
+        evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
+    sources.append(evidence)
+    angles = weigh(sources, pairing)
+    sure = angles.odds is not None and max(angles.odds.probabilities) >= SURE
+    if settings.normals == "points" or (settings.normals == "auto" and sure):
+        return angles, pixels
+    if len(capture.posed) < FEWEST_TO_TRAIN:
+        return angles, pixels
+    pixels = _trained_pixels(capture, out, settings, pairing, backend, track)
+    sources.append(surface_evidence(pixels, index))
+    return weigh(sources, pairing), pixels
+
+
+def _trained_pixels(
+    capture: Capture, out: Path, settings: InspectSettings, pairing: int, backend: Backend, track: Track
+) -> Pixels:
+    factor = max(1, math.ceil(max(capture.size) / LONGEST))
+    names = [view.name for view in capture.posed]
+    with track("reading for the short training", 0) as advance:
+        scene = load_scene(
+            capture.root,
+            downscale=factor,
+            transfer=settings.transfer,
+            views=names,
+            progress=lambda done, total: advance(done),
+        )
+    if not scene.train_views:
+        raise PolarguideError(
+            capture.root, expected="views to train on", found="none", remedy="Use --normals points."
+        )
+    with track("short training", settings.steps) as advance:
+        state = short_run(
+            scene,
+            out / RUN_FOLDER,
+            steps=settings.steps,
+            backend=backend,
+            on_step=lambda report: advance(report.step + 1),
+        )
+    with track("comparing with normals", len(names)) as advance:
+
+        def surfaces() -> Iterator[tuple[Pictures, Surface]]:
+            for done, view in enumerate(capture.posed):
+                yield view, surface_of(state, scene.view(view.name), backend)
+                advance(done + 1)
+
+        return surface_pixels(surfaces(), pairing)

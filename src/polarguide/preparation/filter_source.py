@@ -1,0 +1,166 @@
+"""A folder of shots through a filter turned by hand or motor, four a view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.calibration import (
+    LARGEST_IMBALANCE,
+    UNIDENTIFIED,
+    UNIT_GAINS,
+    balancing_gains,
+    oriented,
+    pair_ratio,
+)
+from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.filter import (
+    Shift,
+    aligned,
+    decide_transfer,
+    decoded,
+    find_shifts,
+    find_shots,
+    is_camera_raw,
+    read_shots,
+)
+from polarguide.capture.filter.exif import turned, turned_angles
+from polarguide.capture.filter.shots import require_all
+from polarguide.capture.view import ANGLES
+from polarguide.errors import PolarguideError
+from polarguide.preparation.settings import PrepareSettings, white_gains
+from polarguide.preparation.source import Developed
+
+_JUDGED_VIEWS = 8
+
+
+class FilterSource:
+    """Shots of an ordinary camera through a rotating linear polarizer."""
+
+    kind = "filter"
+    cameras = None
+
+    def __init__(self, root: Path, settings: PrepareSettings) -> None:
+        self._settings = settings
+        shots = find_shots(root)
+        require_all(root, shots)
+        self._files = dict(sorted(shots.items()))
+        self._raw = [path for path in self.paths if is_camera_raw(path)]
+        white = white_gains(settings.white_balance)
+        if white is None or (white != (1.0, 1.0, 1.0) and len(self._raw) < len(self.paths)):
+            raise PolarguideError(
+                "--white-balance",
+                expected="none for pictures; none or three gains for camera raw",
+                found=settings.white_balance,
+                remedy="Leave it out.",
+            )
+        self._white = white
+        if self._raw and settings.transfer == "srgb":
+            raise PolarguideError(
+                "--transfer",
+                expected="auto or linear for camera raw, which is developed without tone curve",
+                found="srgb",
+                remedy="Leave it out.",
+            )
+
+    @property
+    def views(self) -> list[str]:
+        """View names, sorted."""
+        return list(self._files)
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files that are read."""
+        return [files[angle] for files in self._files.values() for angle in ANGLES]
+
+    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+        """The transfer of the capture, from a few views spread over it."""
+        asked = self._settings
+        notes: list[str] = []
+        transfer = asked.transfer
+        if transfer == "auto" and len(self._raw) == len(self.paths):
+            transfer = "linear"
+            notes.append("Transfer linear: camera raw, developed without tone curve, alike for all shots.")
+        if transfer == "auto":
+            step = max(1, math.ceil(len(self._files) / _JUDGED_VIEWS))
+            judged = []
+            for view in self.views[::step]:
+                judged.append(read_shots(self._files[view], self._white))
+                advance(len(judged) * step)
+            suffix = self.paths[0].suffix.lower()
+            decision = decide_transfer(judged, jpeg=suffix in (".jpg", ".jpeg"))
+            transfer = decision.transfer
+            notes.append(f"Transfer {decision.reason}.")
+        if asked.calibration.gains is not None:
+            scale = min(1.0, *asked.calibration.gains)
+        else:
+            # One scale for all shots, with room for the largest gain that is corrected.
+            scale = math.sqrt(1.0 - LARGEST_IMBALANCE) if asked.gains == "auto" else 1.0
+            notes += [UNIDENTIFIED] if asked.gains == "auto" else []
+        return {"transfer": transfer, "scale": scale / asked.calibration.peak, "notes": notes}
+
+    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
+        """Read the four shots: validity, transfer, shifts, gains, the sense of the angles, then the turn."""
+        asked = self._settings
+        shots = read_shots(self._files[view], self._white)
+        linear, bad = decoded(shots.pictures, measured["transfer"]), shots.clipped | shots.dark
+        shifts, notes = [Shift(0.0, 0.0, True)] * 4, []
+        if asked.align:
+            shifts = find_shifts(linear)
+            linear, bad = aligned(linear, bad, shifts)
+            notes = _shift_notes(view, shifts)
+        invalid = np.asarray(bad.any(axis=0))
+        ratio = pair_ratio(linear.mean(axis=3), ~invalid)
+        gains = asked.calibration.gains or UNIT_GAINS
+        if asked.calibration.gains is None and asked.gains == "auto":
+            found = balancing_gains(ratio)
+            gains = found or UNIT_GAINS
+            if found is None:
+                said = (
+                    "is too dark to tell"
+                    if ratio is None
+                    else f"is off by {ratio - 1:+.1%}, too much for gains"
+                )
+                notes.append(f"{view}: (I0 + I90)/(I45 + I135) {said}; not corrected.")
+        factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
+        linear = oriented(linear * factors[:, None, None, None], asked.calibration)
+        upright = _upright(linear, shots.orientation)
+        height, width = upright.shape[1:3]
+        return Developed(
+            intensities=upright,
+            invalid=np.ascontiguousarray(turned(invalid, shots.orientation)),
+            geometry=Geometry((width, height), (0, 0), 1, (width, height)),
+            record={
+                "orientation": shots.orientation,
+                "shifts": [[shift.x, shift.y] for shift in shifts],
+                "shifts_corrected": [shift.corrected for shift in shifts],
+                "pair_ratio": ratio,
+                "gains": list(gains),
+                "clipped_share": round(float(shots.clipped.any(axis=0).mean()), 6),
+                "dark_share": round(float(shots.dark.mean()), 6),
+                "invalid_share": round(float(invalid.mean()), 6),
+            },
+            notes=tuple(notes),
+        )
+
+
+def _upright(linear: NDArray[np.float32], code: int) -> NDArray[np.float32]:
+    """Turn the pixels as EXIF says, and the angles with the camera's frame."""
+    pictures = np.stack([turned(picture, code) for picture in linear])
+    return np.ascontiguousarray(oriented(pictures, turned_angles(code)))
+
+
+def _shift_notes(view: str, shifts: list[Shift]) -> list[str]:
+    """At most one line for the shots that were moved, and one for those whose shift cannot be trusted."""
+    named = list(zip(ANGLES, shifts, strict=True))
+    moved = [f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})" for angle, shift in named if shift.corrected]
+    doubtful = [str(angle) for angle, shift in named if not shift.trusted]
+    notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
+    if doubtful:
+        notes.append(f"{view}: no trustworthy shift of the shots at {', '.join(doubtful)}; used as they are.")
+    return notes

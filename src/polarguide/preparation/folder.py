@@ -1,0 +1,165 @@
+"""The scene folder while it is written: nothing half-written looks whole, and what is done is done once.
+
+``prepare.json`` keeps what was asked and which views are written; ``scene.json`` takes its place as the last file.
+A folder without ``scene.json`` is not finished; the same command goes on with it.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.formats.pictures import read_file
+from polarguide.capture.view import ANGLES
+from polarguide.capture.write import encoded_png, picture_codes
+from polarguide.errors import PolarguideError
+from polarguide.files import guarded, write_whole
+from polarguide.records import parse_json
+
+JOURNAL = "prepare.json"
+SCENE = "scene.json"
+SFM = ".sfm"
+_OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
+
+
+class SceneFolder:
+    """An ``--out`` folder, new or gone on with."""
+
+    def __init__(self, root: Path, request: dict[str, Any]) -> None:
+        """Open it; nothing is written yet.
+
+        Args:
+            root: the folder.
+            request: what is asked for: source, its files, settings. ``settings.poses`` may follow on none.
+
+        Raises:
+            PolarguideError: the folder holds something else, or a preparation of something else.
+        """
+        self.root = root
+        self.request = request
+        self.measured: dict[str, Any] | None = None
+        self.views: dict[str, dict[str, Any]] = {}
+        self.finished = False
+        self._follows_none = False
+        if root.exists() and not root.is_dir():
+            raise PolarguideError(
+                root, expected="a folder to write", found="a file", remedy="Give another --out."
+            )
+        whole, journal = root / SCENE, root / JOURNAL
+        path = journal if journal.exists() else whole
+        if path.exists():
+            self._go_on(path)
+            self.finished = path == whole and not self._follows_none
+        elif root.exists() and any(root.iterdir()):
+            raise PolarguideError(
+                root,
+                expected="a new or empty folder, or an unfinished preparation",
+                found="other files",
+                remedy="Give another --out; nothing was written.",
+            )
+
+    def _go_on(self, path: Path) -> None:
+        state = parse_json(path, read_file(path)).get("prepare")
+        if not isinstance(state, dict) or not isinstance(state.get("request"), dict):
+            raise PolarguideError(
+                self.root,
+                expected="a new folder, or one that prepare wrote",
+                found=f"a {path.name} of another origin",
+                remedy="Give another --out; nothing was written.",
+            )
+        before, now = json.loads(json.dumps(state["request"])), json.loads(json.dumps(self.request))
+        self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
+        if self._follows_none:
+            for record in (before, now):
+                record["settings"] = {k: v for k, v in record["settings"].items() if k not in _OF_POSES}
+                record.pop("model", None)
+        differing = _first_difference(before, now)
+        if differing is not None:
+            name, old, new = differing
+            raise PolarguideError(
+                self.root,
+                expected=f"a preparation with {name} {old}",
+                found=f"{name} {new}",
+                remedy="Repeat the command as it was, or give another --out; nothing was written.",
+            )
+        self.measured, self.views = state.get("measured"), state.get("views", {})
+
+    def start(self) -> None:
+        """Create the folder and take note of the request."""
+        guarded(lambda: (self.root / "polar").mkdir(parents=True, exist_ok=True), self.root)
+        guarded(lambda: (self.root / "invalid").mkdir(exist_ok=True), self.root)
+        self.save()
+        (self.root / SCENE).unlink(missing_ok=True)
+
+    def save(self) -> None:
+        """Write the journal."""
+        write_whole(self.root / JOURNAL, _json({"prepare": self._state()}))
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Write ``scene.json``, the sign that the scene is whole, and drop the journal."""
+        write_whole(self.root / SCENE, _json({**summary, "prepare": self._state()}))
+        (self.root / JOURNAL).unlink(missing_ok=True)
+
+    def has(self, view: str, warp: object) -> bool:
+        """Whether a view is written as it would be now."""
+        record = self.views.get(view)
+        return (
+            record is not None
+            and record["warp"] == warp
+            and all(
+                (self.root / name).is_file() and (self.root / name).stat().st_size == size
+                for name, size in record["files"].items()
+            )
+        )
+
+    def write_view(
+        self,
+        view: str,
+        intensities: NDArray[np.float32],
+        invalid: NDArray[np.bool_],
+        record: dict[str, Any],
+        mask: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Write the pictures of a view, then note it."""
+        files = {}
+        for angle, codes in zip(ANGLES, picture_codes(intensities, invalid), strict=True):
+            files[f"polar/{view}_{angle:03d}.png"] = codes[..., ::-1]
+        files[f"invalid/{view}.png"] = invalid.astype(np.uint8) * 255
+        if mask is not None:
+            guarded(lambda: (self.root / "masks").mkdir(exist_ok=True), self.root)
+            files[f"masks/{view}.png"] = mask.astype(np.uint8) * 255
+        sizes = {name: write_whole(self.root / name, encoded_png(pixels)) for name, pixels in files.items()}
+        self.views[view] = {**record, "files": sizes}
+        self.save()
+
+    def drop(self, view: str) -> None:
+        """Remove a view that an earlier call without poses wrote, and that has none."""
+        for name in self.views.pop(view)["files"]:
+            (self.root / name).unlink(missing_ok=True)
+        self.save()
+
+    def _state(self) -> dict[str, Any]:
+        return {"request": self.request, "measured": self.measured, "views": self.views}
+
+
+def _json(content: dict[str, Any]) -> bytes:
+    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> tuple[str, str, str] | None:
+    """Name, old and new value of the first thing that differs."""
+    for part in sorted(before.keys() | now.keys()):
+        old, new = before.get(part), now.get(part)
+        if old == new:
+            continue
+        if isinstance(old, dict) and isinstance(new, dict):
+            key = next(k for k in sorted(old.keys() | new.keys()) if old.get(k) != new.get(k))
+            if part == "settings":
+                return key, str(old.get(key)), str(new.get(key))
+            return f"{part} {key}", "as it was", "that was changed, added or removed"
+        return part, str(old), str(new)
+    return None

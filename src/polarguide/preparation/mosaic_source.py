@@ -1,0 +1,242 @@
+"""A folder of raw mosaics, one file a view."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_gains, oriented, pair_ratio
+from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.datasets import Dataset, fitted_mask
+from polarguide.capture.layout import index_files
+from polarguide.capture.sensor import (
+    DEMOSAIC_MODES,
+    PACKINGS,
+    RAW_SUFFIXES,
+    SENSORS,
+    Levels,
+    RawFormat,
+    demosaic,
+    find_levels,
+    read_mosaic,
+    sensor_pattern,
+    unusable_samples,
+)
+from polarguide.capture.view import ANGLES
+from polarguide.errors import PolarguideError
+from polarguide.preparation.mosaic_samples import blocks, gray_world, sampled
+from polarguide.preparation.settings import PrepareSettings, white_gains
+from polarguide.preparation.source import Developed
+
+_SMALLEST = 16
+
+
+class MosaicSource:
+    """Raw mosaics of a division-of-focal-plane sensor."""
+
+    def __init__(self, root: Path, settings: PrepareSettings, dataset: Dataset | None = None) -> None:
+        """Look for the files.
+
+        Args:
+            root: the folder of mosaics.
+            settings: what to do.
+            dataset: what else is known of them, where they belong to a published dataset.
+
+        Raises:
+            PolarguideError: the sensor is not named, or a setting does not fit it.
+        """
+        self.kind = "mosaic" if dataset is None else dataset.name
+        self.cameras = None if dataset is None else dataset.cameras
+        self._dataset = dataset
+        if settings.sensor is None:
+            raise PolarguideError(
+                "--sensor",
+                expected=f"the sensor of raw mosaics: {', '.join(SENSORS)}",
+                found="none",
+                remedy="Name it; color (MYR) and monochrome (MZR) sensors have different patterns.",
+            )
+        self._settings = settings
+        self._raw = RawFormat(settings.width, settings.height, settings.packing)
+        self._dark_path = None if settings.dark_frame is None else Path(settings.dark_frame)
+        files = index_files(root, RAW_SUFFIXES)
+        if self._dark_path is not None:
+            dark = os.path.realpath(self._dark_path)
+            files = {view: path for view, path in files.items() if os.path.realpath(path) != dark}
+        names = files.keys() if dataset is None else dataset.views
+        self._files = {view: files[view] for view in sorted(names)}
+        pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
+        self._crop = pattern.cell_corner()
+        self._pattern = pattern.shifted(*self._crop)
+        self._white = white_gains(settings.white_balance)
+        if self._pattern.colors is None and settings.white_balance != "none":
+            raise PolarguideError(
+                "--white-balance",
+                expected="none for a monochrome sensor",
+                found=settings.white_balance,
+                remedy="Leave it out.",
+            )
+
+    @property
+    def views(self) -> list[str]:
+        """View names, sorted."""
+        return list(self._files)
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files that are read."""
+        own = list(self._files.values()) if self._dataset is None else self._dataset.paths
+        return [*own, *([] if self._dark_path is None else [self._dark_path])]
+
+    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+        """Levels, gains of the angles and white balance of the capture; every file is read once."""
+        largest = used = 0
+        container, shape = 0, None
+        samples: list[NDArray[Any]] = []
+        for count, path in enumerate(self._files.values(), 1):
+            values = read_mosaic(path, self._raw)
+            shape = shape or (values.shape, values.dtype)
+            self._require_alike(path, values, shape)
+            container = self._container(path, values)
+            largest, used = max(largest, int(values.max())), used | int(np.bitwise_or.reduce(values, None))
+            samples.append(blocks(self._cut(values), 2 * self._pattern.period))
+            advance(count)
+        assert shape is not None
+        asked = self._settings
+        levels = find_levels(
+            largest, used, container, bits=asked.bits, black=asked.black_level, saturation=asked.saturation
+        )
+        if self._dataset is not None:
+            levels = replace(levels, gamma=self._dataset.gamma)
+        dark = self._dark(shape[0])
+        floor = None if dark is None else blocks(dark, 2 * self._pattern.period)
+        angles, colors, usable = sampled(samples, levels, floor, self._pattern)
+        ratio = pair_ratio(angles, usable)
+        gains, notes = self._gains(ratio)
+        notes += [] if self._dataset is None else self._dataset.notes
+        if asked.bits is None and container == 16:
+            notes.append(
+                f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale."
+            )
+        white = self._white or gray_world(colors[:, usable])
+        peak = max(white) / min(gains) * asked.calibration.peak
+        return {
+            "levels": asdict(levels),
+            "pattern": self._pattern.rows(),
+            "crop": list(self._crop),
+            "pair_ratio": ratio,
+            "gains": list(gains),
+            "white_balance": list(white),
+            "scale": 1.0 / max(1.0, peak),
+            "notes": notes,
+        }
+
+    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
+        """Read one mosaic: validity, levels, gains, then demosaicing, then the sense of the angles."""
+        path = self._files[view]
+        stored = read_mosaic(path, self._raw)
+        dark = self._dark(stored.shape)
+        values = self._cut(stored)
+        levels = Levels(**measured["levels"])
+        saturated, black = unusable_samples(values, levels, dark)
+        linear = levels.linear(values, dark) * self._sample_gains(values.shape, measured)
+        asked = self._settings
+        picture = demosaic(
+            linear, saturated | black, self._pattern,
+            mode=asked.demosaic, interpolation=asked.interpolation, registered=asked.register,
+        )  # fmt: skip
+        intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), asked.calibration)
+        height, width = picture.invalid.shape
+        return Developed(
+            intensities=intensities,
+            invalid=picture.invalid,
+            geometry=Geometry(
+                (stored.shape[1], stored.shape[0]),
+                self._crop,
+                DEMOSAIC_MODES[asked.demosaic],
+                (width, height),
+            ),
+            record={
+                "clipped_share": round(float(saturated.mean()), 6),
+                "dark_share": round(float(black.mean()), 6),
+                "invalid_share": round(float(picture.invalid.mean()), 6),
+            },
+            mask=self._mask(view, (height, width)),
+        )
+
+    def _mask(self, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        """The object mask, resized where it was made for another resolution of the same picture."""
+        return None if self._dataset is None else fitted_mask(self._dataset, view, size)
+
+    def _container(self, path: Path, values: NDArray[Any]) -> int:
+        """Bits that a pixel takes in the file."""
+        packing = self._settings.packing if path.suffix.lower() == ".raw" else None
+        return values.dtype.itemsize * 8 if packing is None else PACKINGS[packing][2]
+
+    def _require_alike(self, path: Path, values: NDArray[Any], first: tuple[Any, Any]) -> None:
+        if (values.shape, values.dtype) != first:
+            (height, width), kind = first
+            raise PolarguideError(
+                path,
+                expected=f"{width}x{height} pixels of {kind} like the first file",
+                found=f"{values.shape[1]}x{values.shape[0]} of {values.dtype}",
+                remedy="Prepare captures of different size or depth one by one.",
+            )
+        if min(values.shape) < _SMALLEST:
+            raise PolarguideError(
+                path,
+                expected=f"a mosaic of at least {_SMALLEST}x{_SMALLEST} pixels",
+                found=f"{values.shape[1]}x{values.shape[0]}",
+                remedy="Give the whole picture of the sensor.",
+            )
+
+    def _cut(self, values: NDArray[Any]) -> NDArray[Any]:
+        """From the first whole cell on, whole cells only."""
+        values = values[self._crop[1] :, self._crop[0] :]
+        return np.ascontiguousarray(values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2])
+
+    def _dark(self, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+        """The dark frame, cut like the mosaics."""
+        if self._dark_path is None:
+            return None
+        dark = read_mosaic(self._dark_path, self._raw)
+        if dark.shape != shape:
+            raise PolarguideError(
+                self._dark_path,
+                expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
+                found=f"{dark.shape[1]}x{dark.shape[0]}",
+                remedy="Take it with the same region and settings, the lens covered.",
+            )
+        return self._cut(dark).astype(np.float32)
+
+    def _gains(self, ratio: float | None) -> tuple[tuple[float, float, float, float], list[str]]:
+        """Gains of the angles, and what to say about them."""
+        asked = self._settings
+        if asked.calibration.gains is not None:
+            return asked.calibration.gains, []
+        if asked.gains == "none":
+            return UNIT_GAINS, []
+        if ratio is None:
+            return UNIT_GAINS, ["The pictures are too dark to estimate the gains of the angles."]
+        gains = balancing_gains(ratio)
+        said = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
+        if gains is None:
+            return UNIT_GAINS, [
+                f"{said}, too much for gains: not corrected. Check --sensor, --offset-x, --offset-y and --order."
+            ]
+        return gains, [f"{said}; corrected. {UNIDENTIFIED}"]
+
+    def _sample_gains(self, shape: tuple[int, ...], measured: dict[str, Any]) -> NDArray[np.float32]:
+        """What every sample is multiplied by, [H, W]."""
+        pattern = self._pattern
+        of_angle = dict(zip(ANGLES, measured["gains"], strict=True))
+        gains = np.vectorize(lambda angle: measured["scale"] / of_angle[angle])(pattern.angles)
+        if pattern.colors is not None:
+            gains = gains * np.asarray(measured["white_balance"])[pattern.colors]
+        repeat = [-(-length // pattern.period) for length in shape]
+        return np.tile(gains.astype(np.float32), repeat)[: shape[0], : shape[1]]

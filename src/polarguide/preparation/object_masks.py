@@ -1,0 +1,111 @@
+"""Object masks that the user brings beside the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.colmap.write import PosedCamera
+from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
+from polarguide.capture.view import listed
+from polarguide.errors import PolarguideError
+from polarguide.preparation.source import Developed, Source
+
+
+class MaskedSource:
+    """A source whose views get the masks of a folder; white (half of a mask's maximum or more) is the object."""
+
+    def __init__(self, pictures: Source, folder: Path) -> None:
+        """Find the masks, called like the views.
+
+        Args:
+            pictures: the source without them.
+            folder: with one picture for each view that has a mask.
+
+        Raises:
+            PolarguideError: there is no such folder, or none of its pictures is called like a view.
+        """
+        if not folder.is_dir():
+            raise PolarguideError(
+                "--masks",
+                expected="a folder of masks called like the views",
+                found=f"{folder}, which is no folder",
+                remedy="Give the folder that holds <view>.png.",
+            )
+        found = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in SUFFIXES}
+        self._masks = {view: found[view] for view in pictures.views if view in found}
+        if not self._masks:
+            raise PolarguideError(
+                folder,
+                expected=f"masks called like the views ({listed(pictures.views, 3)})",
+                found=listed(sorted(found), 3) or "no picture",
+                remedy="Rename them; views without a mask are taken whole.",
+            )
+        self._pictures = pictures
+
+    @property
+    def kind(self) -> str:
+        """Name of the format."""
+        return self._pictures.kind
+
+    @property
+    def cameras(self) -> Mapping[str, PosedCamera] | None:
+        """Cameras by view name, where the source brings poses."""
+        return self._pictures.cameras
+
+    @property
+    def views(self) -> list[str]:
+        """View names, sorted."""
+        return self._pictures.views
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files that are read."""
+        return [*self._pictures.paths, *self._masks.values()]
+
+    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+        """As of the source; and which views have no mask."""
+        measured = self._pictures.measure(advance)
+        bare = [view for view in self.views if view not in self._masks]
+        if bare:
+            note = (
+                f"{len(bare)} of {len(self.views)} views have no mask and are taken whole ({listed(bare)})."
+            )
+            measured["notes"] = [*measured["notes"], note]
+        return measured
+
+    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
+        """Read one view, with its mask.
+
+        Raises:
+            PolarguideError: the mask cannot be read, or is neither of the stored nor the developed size.
+        """
+        done = self._pictures.develop(view, measured)
+        path = self._masks.get(view)
+        return done if path is None else replace(done, mask=_fitted(path, done))
+
+
+def _fitted(path: Path, view: Developed) -> NDArray[np.bool_]:
+    """A mask at the size of the developed picture: where half of a pixel or more is object."""
+    mask = decode_mask(path, read_file(path), any_value=False)
+    geometry = view.geometry
+    size = (mask.shape[1], mask.shape[0])
+    if size == geometry.size:
+        return mask
+    if size != geometry.stored:
+        (width, height), stored = geometry.size, geometry.stored
+        raise PolarguideError(
+            path,
+            expected=f"the size of the picture, {width}x{height}, or of the file, {stored[0]}x{stored[1]}",
+            found=f"{size[0]}x{size[1]}",
+            remedy="Draw the mask on one of them.",
+        )
+    (left, top), (width, height), step = geometry.crop, geometry.size, geometry.step
+    cut = mask[top : top + height * step, left : left + width * step].astype(np.float32)
+    return np.asarray(cv2.resize(cut, geometry.size, interpolation=cv2.INTER_AREA) >= 0.5)

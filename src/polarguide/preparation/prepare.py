@@ -1,0 +1,204 @@
+"""``prepare_scene``: camera files -> a scene folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from polarguide import __version__
+from polarguide.capture.colmap.model import read_model
+from polarguide.capture.colmap.poses import Poses
+from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.view import listed
+from polarguide.errors import PolarguideError
+from polarguide.files import guarded
+from polarguide.preparation.folder import SFM, SceneFolder
+from polarguide.preparation.settings import PrepareSettings, check_settings
+from polarguide.preparation.source import Source
+from polarguide.preparation.sources import given_poses, open_source, origin_of_poses
+from polarguide.preparation.working_folder import PHOTOGRAPHS, Workshop
+from polarguide.progress import Reporter
+
+_PARTIAL = ".sparse.partial"
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What came of it.
+
+    Attributes:
+        folder: the scene.
+        views: names of the views in it.
+        left_out: views without a pose.
+        posed: whether it has a COLMAP model.
+        new: whether anything was written by this call.
+    """
+
+    folder: Path
+    views: list[str]
+    left_out: list[str]
+    posed: bool
+    new: bool
+
+
+def prepare_scene(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    settings: PrepareSettings | None = None,
+    reporter: Reporter | None = None,
+) -> Prepared:
+    """Write a scene folder from camera files; see docs/formats.md.
+
+    A call that was stopped is gone on with by the same call. Nothing but unfinished work of the same request
+    is ever replaced.
+
+    Args:
+        source: folder of raw mosaics or of filter shots.
+        out: scene folder: new, empty, or of the same request.
+        settings: what to do.
+        reporter: where messages and progress go.
+
+    Raises:
+        PolarguideError: the source or a setting cannot be used, or ``out`` holds something else.
+    """
+    settings, reporter = settings or PrepareSettings(), reporter or Reporter()
+    root, target = Path(source), Path(out)
+    check_settings(settings)
+    pictures = open_source(root, settings)
+    settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
+    if settings.poses != "sfm" and settings.intrinsics is not None:
+        raise PolarguideError(
+            "--intrinsics",
+            expected="poses by structure from motion, which they are for",
+            found=f"--poses {settings.poses}",
+            remedy="Leave them out: the cameras come with the poses.",
+        )
+    poses = given_poses(root, pictures, settings.poses)
+    folder = SceneFolder(target, _request(root, pictures, settings, poses))
+    if folder.finished:
+        reporter.say(f"{target} is complete already; nothing to do.")
+        return _outcome(folder, pictures, settings, new=False)
+    reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
+    if folder.measured is None:
+        with reporter.track("measuring", len(pictures.views)) as advance:
+            folder.measured = pictures.measure(advance)
+        for note in folder.measured["notes"]:
+            reporter.say(note)
+    folder.start()
+    work = Workshop(folder, pictures, settings, reporter)
+    points: dict[str, Any] | None = None
+    if settings.poses == "sfm":
+        poses = Poses.read(work.structure(), pictures.views)
+        points = {"from": "structure from motion", "count": poses.points}
+    elif poses is not None and not poses.points:
+        poses, points = work.points(poses)
+    elif poses is not None:
+        points = {"from": "the model given", "count": poses.points}
+    if poses is not None and poses.missing:
+        reporter.warn(
+            f"{len(poses.missing)} of {len(pictures.views)} views have no pose and are left out "
+            f"({listed(poses.missing)})."
+        )
+    _write_views(folder, pictures, poses, reporter)
+    if poses is not None:
+        _write_model(folder, poses)
+    folder.finish(_summary(folder, pictures, settings, points))
+    shutil.rmtree(target / SFM, ignore_errors=True)
+    return _outcome(folder, pictures, settings, new=True)
+
+
+def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Poses | None) -> dict[str, Any]:
+    """What must not change between the calls that write one scene."""
+
+    def fingerprint(path: Path) -> list[int]:
+        found = path.stat()
+        return [found.st_size, found.st_mtime_ns]
+
+    request = {
+        "source": os.path.realpath(root),
+        "format": pictures.kind,
+        "settings": settings.record(),
+        "file": {str(path): fingerprint(path) for path in pictures.paths if path.exists()},
+    }
+    if poses is not None and poses.files:
+        request["model"] = {path.name: fingerprint(path) for path in poses.files}
+    return request
+
+
+def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:
+    assert folder.measured is not None
+    views = pictures.views if poses is None else poses.views
+    for view in folder.views.keys() - set(views):
+        folder.drop(view)
+    with reporter.track("writing views", len(views)) as advance:
+        for count, view in enumerate(views, 1):
+            known = folder.views.get(view)
+            if known is not None and poses is not None:
+                warp = poses.warp(view, Geometry.of(known["geometry"])).record()
+            else:
+                warp = None
+            if not folder.has(view, warp):
+                _write_view(folder, pictures, view, poses, reporter)
+            advance(count)
+
+
+def _write_view(
+    folder: SceneFolder, pictures: Source, view: str, poses: Poses | None, reporter: Reporter
+) -> None:
+    assert folder.measured is not None
+    done = pictures.develop(view, folder.measured)
+    intensities, invalid, mask, warped = done.intensities, done.invalid, done.mask, None
+    if poses is not None:
+        warp = poses.warp(view, done.geometry)
+        intensities, invalid = warp.apply(intensities, invalid)
+        mask = None if mask is None else warp.apply_mask(mask)
+        warped = warp.record()
+    record = {**done.record, "geometry": done.geometry.record(), "warp": warped}
+    folder.write_view(view, intensities, invalid, record, mask)
+    for note in done.notes:
+        reporter.say(note)
+
+
+def _write_model(folder: SceneFolder, poses: Poses) -> None:
+    """Put the model into place in one step, after reading it back."""
+    partial, final = folder.root / _PARTIAL, folder.root / "sparse"
+    for old in (partial, final):
+        shutil.rmtree(old, ignore_errors=True)
+    guarded(lambda: (partial / "sparse" / "0").mkdir(parents=True), partial)
+    poses.write(partial / "sparse" / "0")
+    model = read_model(partial)
+    for view in poses.views:
+        model.camera(view)
+    guarded(lambda: (partial / "sparse").rename(final), final)
+    shutil.rmtree(partial, ignore_errors=True)
+
+
+def _summary(
+    folder: SceneFolder, pictures: Source, settings: PrepareSettings, points: dict[str, Any] | None
+) -> dict[str, Any]:
+    """What ``scene.json`` says to people; everything else is under "prepare"."""
+    measured = dict(folder.measured or {})
+    measured.pop(PHOTOGRAPHS, None)
+    calibration = settings.calibration.record()
+    calibration["sense"] = measured.pop("sense", calibration["sense"])
+    shares = [record["clipped_share"] for record in folder.views.values()]
+    return {
+        "prepared_by": f"polarguide {__version__}",
+        "format": pictures.kind,
+        "sensor": settings.sensor,
+        "packing": settings.packing,
+        **measured,
+        "calibration": calibration,
+        "clipped_share": round(sum(shares) / max(1, len(shares)), 6),
+        "poses": settings.poses,
+        "points": points,
+    }
+
+
+def _outcome(folder: SceneFolder, pictures: Source, settings: PrepareSettings, *, new: bool) -> Prepared:
+    views = sorted(folder.views)
+    left_out = [view for view in pictures.views if view not in folder.views]
+    return Prepared(folder.root, views, left_out, settings.poses != "none", new)

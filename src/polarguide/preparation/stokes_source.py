@@ -1,0 +1,130 @@
+"""A published dataset whose files are Stokes vectors: the four intensities are made from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.calibration import oriented
+from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.datasets import Dataset, fitted_mask
+from polarguide.errors import PolarguideError
+from polarguide.preparation.settings import PrepareSettings
+from polarguide.preparation.source import Developed
+
+PAIR_SUMS = (
+    "n/a: the four intensities were made from Stokes vectors, so that I0 + I90 = I45 + I135 by construction"
+)
+_BRIGHT = 99.9
+_HEADROOM = 2.0
+_SAMPLES = 20_000
+
+
+class StokesSource:
+    """Stokes vectors, in any unit and without a full scale."""
+
+    def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
+        """Take a dataset that has ``light``; the sense of its angles counts where the settings name none."""
+        self.kind = dataset.name
+        self.cameras = dataset.cameras
+        self._dataset = dataset
+        asked = settings.calibration
+        self._calibration = replace(asked, sense=asked.sense or dataset.sense)
+
+    @property
+    def views(self) -> list[str]:
+        """View names, sorted."""
+        return self._dataset.views
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files that are read."""
+        return self._dataset.paths
+
+    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+        """One scale for the whole capture, and what it costs; every file is read once.
+
+        The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
+        else twice this one does, and what exceeds it clips.
+        """
+        peaks: list[NDArray[np.float32]] = []
+        largest, negative, broken, count = 0.0, 0, 0, 0
+        for number, view in enumerate(self.views, 1):
+            stokes, _ = self._stokes(view)
+            finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
+            intensities = behind(np.where(finite[..., None], stokes, 0))
+            peak = intensities.max(axis=(0, 3))
+            peaks.append(peak.ravel()[:: max(1, peak.size // _SAMPLES)])
+            largest = max(largest, float(peak.max()))
+            negative += int((intensities < 0).sum())
+            broken += int((~finite).sum())
+            count += peak.size
+            advance(number)
+        bright = float(np.percentile(np.concatenate(peaks), _BRIGHT))
+        if not largest > 0:
+            raise PolarguideError(
+                self.paths[0],
+                expected="light in at least one view",
+                found="intensities that are all 0 or less",
+                remedy="Take the files from the dataset as they were published.",
+            )
+        white = min(largest, _HEADROOM * bright) if bright > 0 else largest
+        share = negative / max(1, 12 * count)
+        notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}."]
+        notes.append(
+            f"Angles count {'clockwise' if self._calibration.sense == 'cw' else 'counter-clockwise'} as displayed "
+            f"({self.kind}; --sense and --zero say otherwise)."
+        )
+        notes.append(
+            f"One scale for all views: {white:.6g} of the dataset becomes full scale. {share:.3%} of the intensities "
+            "are negative (more polarized than light can be: noise, or coarse files) and become 0."
+        )
+        if broken:
+            notes.append(f"{broken / count:.3%} of the pixels are not finite and become invalid.")
+        return {
+            "scale": 1.0 / (white * self._calibration.peak),
+            "full_scale": white,
+            "negative_share": round(share, 6),
+            "not_finite_share": round(broken / count, 6),
+            "pair_sums": PAIR_SUMS,
+            "sense": self._calibration.sense,
+            "notes": notes,
+        }
+
+    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
+        """Read one view: scale, four intensities, the sense of the angles."""
+        stokes, clipped = self._stokes(view)
+        finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
+        scaled = np.where(finite[..., None], stokes, 0) * np.float32(measured["scale"])
+        intensities = behind(scaled)
+        # Rounding of the scale may leave the largest intensity a hair above 1.
+        clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
+        height, width = clipped.shape
+        turned = oriented(np.clip(intensities, 0.0, 1.0), self._calibration)
+        return Developed(
+            intensities=turned,
+            invalid=clipped | ~finite,
+            geometry=Geometry((width, height), (0, 0), 1, (width, height)),
+            record={
+                "clipped_share": round(float(clipped.mean()), 6),
+                "negative_share": round(float((intensities < 0).mean()), 6),
+                "invalid_share": round(float((clipped | ~finite).mean()), 6),
+            },
+            mask=fitted_mask(self._dataset, view, (height, width)),
+        )
+
+    def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        assert self._dataset.light is not None
+        light = self._dataset.light(view)
+        return light.stokes, light.clipped
+
+
+def behind(stokes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Intensities (S0 + S1 cos 2a + S2 sin 2a) / 2 at 0, 45, 90 and 135 degrees: [3, ...] -> [4, ...]."""
+    s0, s1, s2 = stokes
+    return np.asarray(np.stack([s0 + s1, s0 + s2, s0 - s1, s0 - s2]) / 2, np.float32)

@@ -1,0 +1,1 @@
+"""What a trained run shows: pictures, films, other light, and polarization priors."""

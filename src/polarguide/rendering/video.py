@@ -1,0 +1,59 @@
+"""Pictures one after the other as an MP4 file (H.264)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.errors import PolarguideError, optional_import
+from polarguide.files import atomic
+
+Picture = NDArray[np.uint8]
+
+
+def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:
+    """Write uint8 RGB pictures [H, W, 3] of one size; odd sides lose their last row or column, as H.264 wants.
+
+    Returns:
+        How many were written.
+
+    Raises:
+        PolarguideError: imageio-ffmpeg is not installed, or the encoder fails.
+    """
+    encoder = optional_import("imageio_ffmpeg", "--video")
+    count = 0
+    # The encoder chooses the format by the name's suffix.
+    with atomic(path) as temporary:
+        named = temporary.with_name(temporary.name + ".mp4")
+        try:
+            writer = None
+            for picture in pictures:
+                height, width = (side - side % 2 for side in picture.shape[:2])
+                if writer is None:
+                    writer = encoder.write_frames(
+                        str(named),
+                        (width, height),
+                        fps=frames_per_second,
+                        codec="libx264",
+                        macro_block_size=2,
+                        output_params=["-crf", "18", "-movflags", "+faststart"],
+                    )
+                    writer.send(None)
+                writer.send(np.ascontiguousarray(picture[:height, :width]))
+                count += 1
+            if writer is not None:
+                writer.close()
+            named.replace(temporary)
+        except (OSError, RuntimeError) as error:
+            raise PolarguideError(
+                path,
+                expected="that the video can be encoded",
+                found=str(error).strip().splitlines()[-1][:200] if str(error).strip() else "a failure",
+                remedy="Choose another place or fewer layers.",
+            ) from None
+        finally:
+            named.unlink(missing_ok=True)
+    return count

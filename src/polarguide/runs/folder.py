@@ -1,0 +1,179 @@
+"""A run folder: the configuration, atomically written checkpoints, the log, and the exported PLY.
+
+RUN/run.json            what was asked for (scene, recipe, settings), plain JSON
+RUN/checkpoint.safetensors   everything training needs to go on, and all that rendering needs
+RUN/log.jsonl           one line per logged step
+RUN/point_cloud.ply     for other viewers, at the end
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from polarguide.files import atomic
+from polarguide import __version__
+from polarguide.errors import PolarguideError
+from polarguide.training.recipe import Recipe
+from polarguide.training.state import TrainingState
+from polarguide.training.trainer import TrainSettings
+
+CONFIGURATION = "run.json"
+CHECKPOINT = "checkpoint.safetensors"
+LOG = "log.jsonl"
+PLY = "point_cloud.ply"
+
+
+@dataclass(frozen=True)
+class RunConfiguration:
+    """What defines a run.
+
+    Attributes:
+        scene: absolute path of the scene folder.
+        scene_digest: hash of the scene's files, so that a run does not go on with other data.
+        recipe: its name. recipe_data: all its values, for the record.
+        settings: steps, seed, refractive index.
+        downscale: side of the averaged pixel boxes. transfer: how the files were read.
+        device: what it trained on. version: of the program.
+    """
+
+    scene: str
+    scene_digest: str
+    recipe: str
+    recipe_data: dict[str, Any]
+    settings: TrainSettings
+    downscale: int
+    transfer: str
+    device: str
+    version: str = __version__
+
+    def save(self, run: Path) -> None:
+        """Write ``run.json``."""
+        with atomic(run / CONFIGURATION) as path:
+            path.write_text(json.dumps(dataclasses.asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, run: Path) -> RunConfiguration:
+        """Read ``run.json``.
+
+        Raises:
+            PolarguideError: not a run folder, or a file that is not what this version writes.
+        """
+        path = run / CONFIGURATION
+        try:
+            data = json.loads(path.read_text())
+            data["settings"] = TrainSettings(**data["settings"])
+            configuration = cls(**data)
+            _check_types(configuration)
+            _check_types(configuration.settings)
+            return configuration
+        except FileNotFoundError:
+            raise PolarguideError(
+                run,
+                expected=f"a run folder with {CONFIGURATION}",
+                found="none",
+                remedy="Give the --out of a training.",
+            ) from None
+        except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError) as error:
+            raise PolarguideError(
+                path,
+                expected="the configuration of a run",
+                found=f"something else ({error})",
+                remedy="Restore the file, or train again into a new folder.",
+            ) from None
+
+
+def _check_types(record: Any) -> None:
+    """TypeError where a field of a dataclass with plain types holds another type."""
+    plain: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
+    for field in dataclasses.fields(record):
+        expected, value = plain.get(str(field.type)), getattr(record, field.name)
+        if expected is not None and (not isinstance(value, expected) or isinstance(value, bool)):
+            raise TypeError(f"{field.name} is {value!r}, not {field.type}")
+
+
+def recipe_data(recipe: Recipe) -> dict[str, Any]:
+    """All values of a recipe as plain JSON types."""
+    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(recipe)))
+    return plain
+
+
+
+
+def save_checkpoint(run: Path, state: TrainingState) -> None:
+    """Write the state so that a kill at any moment leaves either the old checkpoint or the new one."""
+    with atomic(run / CHECKPOINT) as path:
+        save_file(state.tensors(), path, metadata={"step": str(state.step), "version": __version__})
+
+
+def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState:
+    """Read the state of a run, whatever it was trained on, to a device.
+
+    Raises:
+        PolarguideError: there is none, or it is damaged.
+    """
+    path = run / CHECKPOINT
+    if not path.exists():
+        raise PolarguideError(
+            run,
+            expected=f"a checkpoint ({CHECKPOINT})",
+            found="none",
+            remedy="Train first, or without --resume.",
+        )
+    try:
+        with safe_open(path, framework="pt") as file:
+            names = list(file.keys())
+            tensors: dict[str, Tensor] = {key: file.get_tensor(key).to(device) for key in names}
+        return TrainingState.from_tensors(tensors, recipe.rates, recipe.environment_rates)
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise PolarguideError(
+            path,
+            expected="a checkpoint of this program",
+            found=f"damaged or foreign data ({error})",
+            remedy="Train again into a new folder.",
+        ) from None
+
+
+class RunLog:
+    """Appends one JSON line at a time."""
+
+    def __init__(self, run: Path) -> None:
+        self._path = run / LOG
+
+    def append(self, **values: Any) -> None:
+        """Write one line."""
+        with open(self._path, "a") as file:
+            file.write(json.dumps(values) + "\n")
+
+    def cut(self, step: int) -> None:
+        """Drop lines at or after a step: they will be written again after a resume."""
+        if not self._path.exists():
+            return
+        lines = [line for line in self._path.read_text().splitlines() if line]
+        kept = []
+        for line in lines:
+            try:
+                if json.loads(line)["step"] < step:
+                    kept.append(line)
+            except (json.JSONDecodeError, KeyError):
+                continue  # a line cut short by a kill
+        with atomic(self._path) as path:
+            path.write_text("".join(line + "\n" for line in kept))
+
+    def elapsed(self) -> tuple[float, bool]:
+        """Training seconds that the log accounts for, and whether the machine worked for nobody else."""
+        if not self._path.exists():
+            return 0.0, True
+        rows = [json.loads(line) for line in self._path.read_text().splitlines() if line]
+        return (float(rows[-1]["seconds"]), bool(rows[-1]["alone"])) if rows else (0.0, True)

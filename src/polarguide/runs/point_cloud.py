@@ -1,0 +1,64 @@
+"""The PLY of a run: display values that ordinary 3DGS viewers show right, and our linear fields beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.gaussians.ply import refit_sh_to_display, write_ply
+from polarguide.color import srgb_encode
+from polarguide.shading.model import ShadingModel
+from polarguide.shading.deferred import harmonic_colors
+from polarguide.files import atomic
+from polarguide.training.state import TrainingState
+
+
+@torch.no_grad()
+def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor) -> Tensor:
+    """Display colors of every Gaussian toward viewing directions, reflections included.
+
+    Args:
+        state: of a training. shading: of its recipe. directions: [K, 3] unit, from the camera to the Gaussian.
+
+    Returns:
+        [N, K, 3] in [0, 1]. Reflection is shaded per Gaussian at its own normal, as far as a splat can carry it.
+    """
+    gaussians = state.gaussians
+    columns = []
+    normals = shortest_axis_normals(gaussians["means"], gaussians["quaternions"], gaussians["log_scales"], torch.zeros(3))
+    for direction in directions.to(gaussians["means"].device):
+        # A camera far behind each Gaussian sees it along one direction.
+        rays = direction.expand(len(gaussians), 3)
+        if state.environment is None:
+            color = harmonic_colors(gaussians, rays)
+        else:
+            facing = torch.where((normals @ direction)[:, None] > 0, -normals, normals)
+            color = shading.colors(gaussians, state.environment.parameters, rays, facing)
+        columns.append(srgb_encode(color.clamp(0, 1)))
+    return torch.stack(columns, dim=1)
+
+
+@torch.no_grad()
+def write_run_ply(path: Path, state: TrainingState, shading: ShadingModel) -> None:
+    """Write the trained Gaussians; see the module's text."""
+    gaussians = state.gaussians
+    dc, rest = refit_sh_to_display(
+        lambda directions: shown_colors(state, shading, directions).cpu(), len(gaussians)
+    )
+    plain = {
+        name: gaussians[name].detach().cpu() for name in ("means", "log_scales", "quaternions", "opacity_logits")
+    }
+    with atomic(path) as temporary:
+        write_ply(
+            temporary,
+            means=plain["means"],
+            log_scales=plain["log_scales"],
+            quaternions=torch.nn.functional.normalize(plain["quaternions"], dim=-1),
+            opacity_logits=plain["opacity_logits"],
+            sh_dc=dc,
+            sh_rest=rest,
+            extra={name: field.detach().cpu() for name, field in shading.fields(gaussians).items()},
+        )

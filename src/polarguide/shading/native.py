@@ -1,0 +1,77 @@
+"""Deferred reflection on the CPU in one native pass; ``render.reflect`` is its twin in plain torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from polarguide import _native
+
+
+class _Reflect(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, features: Tensor, rays: Tensor, texels: Tensor, fresnel: bool, local: bool, index: float
+    ) -> tuple[Tensor, ...]:
+        features, rays, texels = (t.detach().contiguous() for t in (features, rays, texels))
+        directions, seen = torch.empty_like(rays), torch.empty_like(rays)
+        layers = tuple(torch.empty_like(rays) for _ in range(4))
+        _native.reflect_directions(features, rays, directions)
+        _native.cubemap_forward(texels, directions, seen)
+        _native.reflect_layers(features, rays, seen, fresnel, local, index, *layers)
+        ctx.save_for_backward(features, rays, texels, directions, seen)
+        ctx.model = (fresnel, local, index)
+        ctx.set_materialize_grads(False)
+        return layers
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        features, rays, texels, directions, seen = ctx.saved_tensors
+        fresnel, local, index = ctx.model
+        final, specular, diffuse, reflection = (None if g is None else g.contiguous() for g in grads)
+        to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
+        _native.reflect_backward_layers(
+            features,
+            rays,
+            seen,
+            fresnel,
+            local,
+            index,
+            final,
+            specular,
+            diffuse,
+            reflection,
+            to_seen,
+            to_features,
+        )
+        to_texels, to_directions = torch.empty_like(texels), torch.empty_like(directions)
+        _native.cubemap_backward(texels, directions, to_seen, to_texels, to_directions)
+        _native.reflect_backward_directions(features, rays, to_directions, to_features)
+        return to_features, None, to_texels, None, None, None
+
+
+def reflect_native(
+    features: Tensor, rays: Tensor, texels: Tensor, *, fresnel: bool, local: bool, index: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The layers of a picture from its G-buffer (Ye et al. 2024, Eq. 5, or Fresnel-weighted).
+
+    Args:
+        features: [P, D] blended base color, normal, strength and, with ``local``, light; others may follow.
+        rays: [P, 3] unit, world. texels: [6, R, R, 3] raw. All float32 on the CPU.
+        fresnel: Fresnel's weight and exponential light in place of the lerp and the logistic function.
+        local: whether channels 7 to 9 are light that is added to the environment's.
+        index: refractive index of Fresnel's weight.
+
+    Returns:
+        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and texels;
+        the same bits for any number of threads.
+
+    Raises:
+        ValueError: if a shape is not as above.
+    """
+    final, specular, diffuse, reflection = _Reflect.apply(features, rays, texels, fresnel, local, index)
+    return final, specular, diffuse, reflection

@@ -1,0 +1,46 @@
+"""From where each Gaussian is seen: the side of a surface that is outside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.raster import Rasterize
+from polarguide.shading.deferred import Parameters, render
+from polarguide.vectors import unit
+
+# A Gaussian at most this much behind the rendered surface, relative to its depth, is seen.
+DEPTH_SLACK = 0.02
+
+
+@torch.no_grad()
+def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: Rasterize) -> Tensor:
+    """Sum of the unit directions to the cameras that see each Gaussian.
+
+    A camera sees it where its center lies in the picture and not behind the rendered depth.
+
+    Args:
+        gaussians: the Gaussians. views: whose cameras look. rasterize: of the backend.
+
+    Returns:
+        [N, 3]; zero where no camera sees it.
+    """
+    means = gaussians["means"]
+    total = torch.zeros_like(means)
+    for view in views:
+        camera = view.camera
+        depth = render(gaussians, camera, rasterize, sh_degree=0, normals=False, depth=True).depth
+        assert depth is not None
+        center = camera.pose(means.dtype, means.device).center
+        x, y, z = camera.to_camera(means - center).unbind(-1)
+        safe = z.clamp(min=1e-6)
+        column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()
+        row = (camera.fy * y / safe + camera.cy).floor().clamp(-1, camera.height).long()
+        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        surface = depth[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+        seen = inside & (z < surface * (1 + DEPTH_SLACK))
+        total += seen[:, None] * unit(center - means)
+    return total

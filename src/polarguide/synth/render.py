@@ -1,0 +1,188 @@
+"""``polarguide synth``: a scene as data -> a scene folder with ground truth."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polarguide.camera import Camera
+from polarguide.progress import Reporter
+from polarguide.synth import folder
+from polarguide.synth.build import Built, build_scene
+from polarguide.synth.cameras import held_out_names, place_cameras, view_names
+from polarguide.synth.film import Light, expose
+from polarguide.synth.geometry import pixel_truth
+from polarguide.synth.manifest import verify_scene, write_manifest
+from polarguide.synth.mesh import Array
+from polarguide.synth.record import scene_record
+from polarguide.synth.schema import SceneSpec
+from polarguide.synth.sensor import Sensor, mosaic, noisy
+from polarguide.synth.settings import SynthSettings
+from polarguide.synth.sheet import write_sheet
+from polarguide.synth.sparse import find_points, write_model
+from polarguide.synth.transport import Walk
+from polarguide.synth.variant import choose_variant, slow_estimate
+
+TEST_SAMPLES = 4
+METER_VIEWS, METER_SAMPLES, METER_WIDTH = 4, 16, 64
+BRIGHT = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """All that the rendering of a view needs."""
+
+    built: Built
+    settings: SynthSettings
+    out: Path
+    names: list[str]
+    tests: list[str]
+    cameras: list[Camera]
+    exposure: float
+    sensor: Sensor
+
+    @property
+    def mosaics(self) -> bool:
+        """Whether raw mosaics are written."""
+        return self.settings.sensor != "ideal"
+
+    def has_ground_truth(self, name: str) -> bool:
+        """Whether a view gets ground truth."""
+        return self.settings.ground_truth == "all" or name in self.tests
+
+    def files(self, name: str) -> list[Path]:
+        """The files of a view."""
+        return folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name), raw=self.mosaics)
+
+
+def synthesise(
+    spec: SceneSpec, out: Path, settings: SynthSettings, reporter: Reporter, *, threads: int = 0
+) -> Path:
+    """Render a scene, or go on with a rendering that was stopped.
+
+    Args:
+        spec: the scene.
+        out: folder to write.
+        settings: how.
+        reporter: told what is going on.
+        threads: threads to use; 0 takes all cores.
+
+    Raises:
+        PolarguideError: Mitsuba is missing, the folder holds something else, or the scene has a mistake.
+    """
+    settings.check()
+    if folder.open_folder(out, {"scene": spec.data(), "settings": settings.data()}):
+        verify_scene(out)
+        reporter.say(f"{out} is finished already; all its files have their checksums.")
+        return out
+    variant = choose_variant(settings.color, threads=threads)
+    names = view_names(spec.camera.views)
+    tests = held_out_names(names)
+    if variant.note:
+        paths = (
+            settings.width
+            * settings.height
+            * settings.samples
+            * (len(names) + (TEST_SAMPLES - 1) * len(tests))
+        )
+        reporter.warn(f"{variant.note} It will take {slow_estimate(paths)} on this scene.")
+    built = build_scene(spec, out, variant)
+    cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
+    exposure = spec.exposure or _metered(built, cameras, settings.seed)
+    job = Job(built, settings, out, names, tests, cameras, exposure, Sensor())
+    _render_all(job, reporter)
+    _write_model(job, names)
+    folder.write_file(out / "split.json", json.dumps({"test": tests}).encode())
+    clipped = folder.clipped_share(out, names)
+    record = scene_record(spec, settings, variant, names, tests, exposure=exposure, clipped=clipped)
+    if job.mosaics:
+        gains = {str(45 * k): gain for k, gain in enumerate(job.sensor.gains)}
+        folder.write_file(out / "calibration.json", json.dumps({"gains": gains}).encode())
+        record["sensor"] = {"name": settings.sensor.upper(), **job.sensor.data()}
+    with_truth = [number for number, name in enumerate(names) if job.has_ground_truth(name)]
+    if with_truth:
+        write_sheet(out, [names[k] for k in with_truth], [cameras[k] for k in with_truth])
+    record["sha256"] = write_manifest(out)
+    folder.write_file(out / "scene.json", json.dumps(record, indent=1).encode())
+    return out
+
+
+def _render_all(job: Job, reporter: Reporter) -> None:
+    """Render the views that are not finished."""
+    left = [number for number, name in enumerate(job.names) if not all(f.exists() for f in job.files(name))]
+    if len(left) < len(job.names):
+        reporter.say(f"Going on: {len(job.names) - len(left)} of {len(job.names)} views are finished.")
+    with reporter.track(f"rendering {job.built.spec.name}", len(job.names)) as progress:
+        progress(len(job.names) - len(left))
+        for done, number in enumerate(left, 1):
+            _render_view(job, number)
+            progress(len(job.names) - len(left) + done)
+
+
+def _render_view(job: Job, number: int) -> None:
+    """Render one view and write its files."""
+    settings, name, camera = job.settings, job.names[number], job.cameras[number]
+    samples = settings.samples * (TEST_SAMPLES if name in job.tests else 1)
+    big = _doubled(camera) if job.mosaics else camera
+    if job.mosaics:
+        samples = max(1, samples // 4)
+    walk = Walk(job.built.spec.depth, job.built.spec.clamp / job.exposure)
+    light = expose(job.built.scenes, big, samples, seed=settings.seed * 100003 + number, walk=walk)
+    random = np.random.default_rng((settings.seed, 31, number))
+    if job.mosaics:
+        raw = mosaic(light.stokes * job.exposure, settings.sensor.upper(), settings.noise, random, job.sensor)
+        folder.write_picture(job.out / "raw" / f"{name}.png", raw)
+        light = Light(_halved(light.specular), _halved(light.diffuse), _halved(light.seen))
+    stokes = light.stokes * job.exposure
+    if job.has_ground_truth(name):
+        arrays: dict[str, Any] = pixel_truth(job.built, camera)
+        arrays["stokes"] = stokes.astype(np.float16)
+        arrays["specular"] = (light.specular[0] * job.exposure).astype(np.float16)
+        arrays["diffuse"] = (light.diffuse[0] * job.exposure).astype(np.float16)
+        data = io.BytesIO()
+        np.savez_compressed(data, **arrays)
+        folder.write_file(job.out / "gt" / f"{name}.npz", data.getvalue())
+    # With a sensor the noise is in its mosaics, and these pictures are what they should lead to.
+    noise = 0.0 if job.mosaics else settings.noise
+    codes = folder.picture_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
+    for path, picture in zip(
+        folder.view_files(job.out, name, ground_truth=False, raw=False), codes, strict=True
+    ):
+        folder.write_picture(path, picture)
+
+
+def _write_model(job: Job, names: list[str]) -> None:
+    pictures = [folder.photograph(job.out, name) for name in names]
+    sparse = find_points(job.built, job.cameras, pictures, job.settings.points, job.settings.seed)
+    write_model(job.out / "sparse" / "0", job.cameras, names, sparse)
+
+
+def _metered(built: Built, cameras: list[Camera], seed: int) -> float:
+    """The exposure by which 1 % of S0 in some small pictures lies above ``BRIGHT``, three quarters of full scale."""
+    values = []
+    for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
+        factor = max(1, camera.width // METER_WIDTH)
+        light = expose(
+            built.scenes, camera.downscaled(factor), METER_SAMPLES, seed=seed, walk=Walk(built.spec.depth)
+        )
+        values.append(light.stokes[0].ravel())
+    return float(f"{BRIGHT / max(float(np.percentile(np.concatenate(values), 99)), 1e-9):.4g}")
+
+
+def _doubled(camera: Camera) -> Camera:
+    return replace(
+        camera, width=2 * camera.width, height=2 * camera.height,
+        fx=2 * camera.fx, fy=2 * camera.fy, cx=2 * camera.cx, cy=2 * camera.cy,
+    )  # fmt: skip
+
+
+def _halved(values: Array) -> Array:
+    """Means over boxes of 2x2 pixels: [..., 2H, 2W, 3] to [..., H, W, 3]."""
+    *lead, height, width, colors = values.shape
+    boxes = values.reshape(*lead, height // 2, 2, width // 2, 2, colors)
+    return np.asarray(boxes.mean(axis=(-4, -2)))

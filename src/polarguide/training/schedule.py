@@ -1,0 +1,62 @@
+"""A recipe's stages laid over a number of steps: which stage a step belongs to, and what is due before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from polarguide.training.recipe import Action, Recipe, Repeat, Stage
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a step lies: its stage, and which actions are due before it.
+
+    Attributes:
+        stage: the stage.
+        actions: due now, in order.
+    """
+
+    stage: Stage
+    actions: tuple[Action, ...]
+
+
+class Schedule:
+    """The stages of a recipe laid over a number of steps."""
+
+    def __init__(self, recipe: Recipe, steps: int) -> None:
+        self.recipe = recipe
+        self.steps = steps
+        self._starts: list[int] = []
+        share = 0.0
+        for stage in recipe.stages:
+            self._starts.append(round(share * steps))
+            share += stage.fraction
+        if abs(share - 1) > 1e-6:
+            raise ValueError(f"stages of {recipe.name} cover {share:.6f} of the steps, not 1")
+
+    def at(self, step: int) -> Position:
+        """The stage of a step (0-based) and the actions due before it."""
+        index = max(i for i, start in enumerate(self._starts) if start <= step)
+        stage, since = self.recipe.stages[index], step - self._starts[index]
+        if since == 0:
+            return Position(stage, stage.on_enter)
+        due = [r.action for r in stage.repeats if since % self.period(r) == 0]
+        # An opacity reset and a propagation would undo each other: the reset wins, as in the release.
+        if "reset_opacity" in due:
+            due = [a for a in due if a != "propagate_normals"]
+        return Position(stage, tuple(due))
+
+    def period(self, repeat: Repeat) -> int:
+        """Steps between two occurrences."""
+        return max(repeat.minimum, round(repeat.fraction * self.steps))
+
+    def sh_degree(self, step: int) -> int:
+        """SH degree in use at a step."""
+        return sum(step >= f * self.steps for f in self.recipe.sh_fractions)
+
+    def rates(self, step: int) -> dict[str, float]:
+        """Learning rates at a step by name; that of the means is before the scene's extent."""
+        factors = self.at(step).stage.rate_factors
+        rates = {name: rate * factors.get(name, 1.0) for name, rate in self.recipe.rates.items()}
+        rates["means"] *= self.recipe.means_decay ** (step / max(1, self.steps - 1))
+        return rates

@@ -1,0 +1,1 @@
+"""Arrays to pictures for people: false colors, contact sheets, layers, pictures inside a page."""

@@ -1,0 +1,181 @@
+"""Layers as pictures for people, uint8 RGB [H, W, 3]: false colors, PNG files and contact sheets."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.color import shown
+from polarguide.errors import PolarguideError
+from polarguide.visualization.sheet import Picture, check_picture, contact_sheet
+
+__all__ = [
+    "COLOR_MAPS",
+    "Picture",
+    "aolp_to_rgb",
+    "contact_sheet",
+    "dolp_to_rgb",
+    "error_to_rgb",
+    "normal_to_rgb",
+    "png_bytes",
+    "radiance_to_rgb",
+    "scalar_to_rgb",
+    "write_png",
+]
+
+COLOR_MAPS = {
+    "viridis": cv2.COLORMAP_VIRIDIS,
+    "turbo": cv2.COLORMAP_TURBO,
+    "magma": cv2.COLORMAP_MAGMA,
+    "inferno": cv2.COLORMAP_INFERNO,
+}
+"""Names that ``scalar_to_rgb`` knows."""
+
+
+def radiance_to_rgb(linear: Tensor) -> Picture:
+    """Linear radiance [H, W, 3] as a display shows it: clipped to [0, 1], sRGB. NaN is black."""
+    return _to_uint8(shown(linear.detach().nan_to_num(nan=0.0)))
+
+
+def normal_to_rgb(normals_world: Tensor, camera: Camera) -> Picture:
+    """World normals in the usual colors: camera-space (x, -y, -z) from [-1, 1] to [0, 255].
+
+    Right is red, up is green, toward the camera is blue.
+
+    Args:
+        normals_world: [H, W, 3] of any length.
+        camera: the view.
+
+    Returns:
+        uint8 [H, W, 3]; mid gray (128) where there is no normal (zero or not finite).
+    """
+    normals = camera.to_camera(normals_world.detach().to("cpu", torch.float64).nan_to_num(0.0, 0.0, 0.0))
+    length = torch.linalg.vector_norm(normals, dim=-1, keepdim=True)
+    there = length > 1e-8
+    unit = torch.where(there, normals / torch.where(there, length, 1.0), 0.0)
+    return _to_uint8((unit * unit.new_tensor([1.0, -1.0, -1.0]) + 1) / 2)
+
+
+def scalar_to_rgb(
+    values: Tensor,
+    low: float,
+    high: float,
+    colormap: str = "viridis",
+    *,
+    invert: bool = False,
+) -> Picture:
+    """A map of numbers in false colors.
+
+    Args:
+        values: [H, W].
+        low, high: the values at the two ends of the color map, ``low < high``; beyond them colors saturate.
+        colormap: a name in ``COLOR_MAPS``.
+        invert: give ``low`` the last color and ``high`` the first, for example to make near depths bright.
+
+    Returns:
+        uint8 [H, W, 3]; black where the value is not finite.
+
+    Raises:
+        ValueError: an empty range.
+        PolarguideError: an unknown color map.
+    """
+    if not low < high:
+        raise ValueError(f"range: expected low < high, found {low} and {high}")
+    if colormap not in COLOR_MAPS:
+        raise PolarguideError(
+            "colormap",
+            expected=f"one of {', '.join(COLOR_MAPS)}",
+            found=repr(colormap),
+            remedy="Choose one of these.",
+        )
+    numbers = values.detach().to("cpu", torch.float64)
+    place = ((numbers - low) / (high - low)).nan_to_num(0.0).clamp(0, 1)
+    colors = cv2.applyColorMap(_to_uint8(1 - place if invert else place), COLOR_MAPS[colormap])
+    picture = np.ascontiguousarray(colors[..., ::-1], dtype=np.uint8)
+    picture[~numbers.isfinite().numpy()] = 0
+    return picture
+
+
+def dolp_to_rgb(dolp: Tensor, high: float = 1.0) -> Picture:
+    """Degree of linear polarization [H, W] in [0, 1]: black at 0 to bright at ``high``."""
+    return scalar_to_rgb(dolp, 0.0, high, "inferno")
+
+
+def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
+    """Angle of linear polarization as hue, which turns once in pi: 0 is red, pi/3 green, 2 pi/3 blue.
+
+    Args:
+        aolp: [H, W] radians, modulo pi.
+        dolp: [H, W] in [0, 1]; if given, it is the brightness, so that the noise of unpolarized pixels stays
+            dark.
+
+    Returns:
+        uint8 [H, W, 3]; black where a number is not finite.
+    """
+    angle = aolp.detach().to("cpu", torch.float64)
+    value = torch.ones_like(angle) if dolp is None else dolp.detach().to("cpu", torch.float64)
+    known = angle.isfinite() & value.isfinite()
+    third = 2 * math.pi / 3
+    hue = 2 * angle.nan_to_num(0.0, 0.0, 0.0)[..., None] - angle.new_tensor([0.0, third, 2 * third])
+    # Distance from each primary on the color circle: a full third on, a full third off, linear between.
+    distance = (torch.remainder(hue + math.pi, 2 * math.pi) - math.pi).abs()
+    color = (2 - distance / (math.pi / 3)).clamp(0, 1)
+    value = torch.where(known, value.nan_to_num(0.0).clamp(0, 1), 0.0)
+    return _to_uint8(color * value[..., None])
+
+
+def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = 0.25) -> Picture:
+    """Absolute difference of two shown pictures, averaged over channels: black at 0 to bright at ``high``."""
+    true = shown(true_linear.detach().cpu())
+    return scalar_to_rgb((shown(pred_linear.detach().cpu()) - true).abs().mean(-1), 0.0, high, "inferno")
+
+
+def write_png(path: str | Path, rgb8: Picture) -> None:
+    """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
+
+    Raises:
+        ValueError: not such a picture.
+        PolarguideError: the folder does not exist.
+    """
+    check_picture(rgb8, "picture")
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise PolarguideError(
+            path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
+        )
+    data = png_bytes(rgb8)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(data)
+    os.replace(partial, path)
+
+
+def png_bytes(rgb8: Picture) -> bytes:
+    """A uint8 RGB [H, W, 3] picture as a PNG file.
+
+    Raises:
+        ValueError: it cannot be encoded.
+    """
+    encoded, data = cv2.imencode(".png", rgb8[..., ::-1])
+    if not encoded:
+        raise ValueError("picture: it could not be encoded as PNG")
+    return data.tobytes()
+
+
+def _to_uint8(values: Tensor) -> Picture:
+    """[0, 1] to [0, 255], rounded half up, so that the middle is 128."""
+    scaled = torch.floor(values.to("cpu", torch.float64) * 255 + 0.5)
+    return scaled.clamp(0, 255).to(torch.uint8).numpy()
+
+
+def color_gradient(color_map: str) -> str:
+    """A color map of the figures as the stops of a CSS gradient."""
+    levels = np.linspace(0, 255, 9).round().astype(np.uint8)[None]
+    colors = cv2.applyColorMap(levels, COLOR_MAPS[color_map])[0, :, ::-1]
+    return ", ".join(f"rgb({r} {g} {b})" for r, g, b in colors.tolist())

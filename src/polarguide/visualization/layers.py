@@ -1,0 +1,69 @@
+"""Layers of a rendering, and what is known of them, as 8-bit pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.capture import View
+from polarguide.shading.result import RenderResult
+from polarguide.visualization import figures
+
+Picture = NDArray[np.uint8]
+
+
+def layer_picture(
+    result: RenderResult, name: str, camera: Camera, depths: tuple[float, float] | None = None
+) -> Picture | None:
+    """One layer as an 8-bit picture, or None where the recipe has no such layer; ``depths`` sets depth's colors."""
+    values: Tensor | None = getattr(result, name)
+    if values is None:
+        return None
+    near, far = depths or (0.0, 1.0)
+    if name == "depth" and depths is None:
+        near, far = depth_range(values, result.alpha > 0.5)
+    draw: dict[str, Callable[[Tensor], Picture]] = {
+        "normal": lambda v: figures.normal_to_rgb(v, camera),
+        "depth": lambda v: figures.scalar_to_rgb(v, near, far),
+        "strength": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
+        "alpha": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
+    }
+    return draw.get(name, figures.radiance_to_rgb)(values)
+
+
+def depth_range(depth: Tensor, seen: Tensor) -> tuple[float, float]:
+    """Nearest and farthest depth [H, W] worth a color where ``seen`` [H, W]."""
+    values = depth[seen]
+    if values.numel() == 0:
+        return 0.0, 1.0
+    near, far = float(values.quantile(0.02)), float(values.quantile(0.9))
+    return near, max(far, near + 1e-6)
+
+
+def true_depth_range(view: View) -> tuple[float, float] | None:
+    """The range of the true depths, so that rendered and true pictures share their colors; None without truth."""
+    ground_truth = view.ground_truth
+    if ground_truth is None or ground_truth.depth is None or ground_truth.mask is None:
+        return None
+    return depth_range(ground_truth.depth, ground_truth.mask)
+
+
+def ground_truth_pictures(view: View) -> dict[str, Picture]:
+    """The photograph as ``final``, and what is known of the other layers, as 8-bit pictures."""
+    pictures = {"final": figures.radiance_to_rgb(view.photograph())}
+    ground_truth = view.ground_truth
+    if ground_truth is None:
+        return pictures
+    if ground_truth.normal is not None:
+        pictures["normal"] = figures.normal_to_rgb(ground_truth.normal, view.camera)
+    for name, layer in (("specular", ground_truth.specular), ("diffuse", ground_truth.diffuse)):
+        if layer is not None:
+            pictures[name] = figures.radiance_to_rgb(layer / 2)
+    depths = true_depth_range(view)
+    if ground_truth.depth is not None and depths is not None:
+        pictures["depth"] = figures.scalar_to_rgb(ground_truth.depth, *depths)
+    return pictures

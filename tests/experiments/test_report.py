@@ -1,0 +1,149 @@
+"""The report: whole in one file, safe with any name, and within its size."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from comparison_records import results, run, unfinished
+
+from polarguide.experiments.curves import Curve, curves_svg, read_curve, smoothed, ticks
+from polarguide.experiments.report import report_html
+from polarguide.visualization.embedded import Tile, chosen_views, data_uri, embed
+
+EVIL = "</script><img src=x onerror=alert(1)>&\"'"
+
+
+def pictures(size: tuple[int, int] = (6, 8)) -> dict[str, np.ndarray]:
+    noise = np.random.default_rng(0).integers(0, 256, (*size, 3)).astype(np.uint8)
+    return {"final": noise, "normal": noise}
+
+
+def page(name: str = "cup") -> str:
+    view, _ = embed(name, name, [Tile(name, pictures(), {"final": name})], 10**6)
+    assert view is not None
+    curve = Curve(name, np.array([1.0, 2.0]), np.array([0.1, 0.2]), np.array([20.0, 21.0]))
+    record = results([run(name, name, 0, psnr=30.0), unfinished(name, "b", 0, name)], command=name)
+    return report_html(record, [view], {name: [curve]}, [name])
+
+
+class Reader(HTMLParser):
+    """Collects tags, attributes and the text of scripts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.scripts: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += attrs
+
+    def handle_data(self, data: str) -> None:
+        if self.tags and self.tags[-1] == "script":
+            self.scripts.append(data)
+
+
+def test_names_and_texts_are_escaped() -> None:
+    plain, evil = Reader(), Reader()
+    plain.feed(page())
+    evil.feed(page(EVIL))
+    assert evil.tags == plain.tags, "a name has become markup"
+    assert not any(key.startswith("on") for key, _ in evil.attributes)
+    assert EVIL not in page(EVIL)
+    data = json.loads(next(text for text in evil.scripts if text.startswith("[")))
+    assert data[0]["scene"] == data[0]["tiles"][0][0] == EVIL
+
+
+def test_nothing_comes_from_outside() -> None:
+    text = page()
+    assert not re.search(r"(?:https?:)?//[a-z]|@import|url\(", text, re.IGNORECASE)
+    reader = Reader()
+    reader.feed(text)
+    assert not {"link", "iframe", "object", "base"} & set(reader.tags)
+    assert not [value for key, value in reader.attributes if key in ("src", "href", "action")]
+
+
+def test_the_page_says_what_it_holds() -> None:
+    text = page()
+    assert "$" not in re.sub(r"(?s)<script.*?</script>", "", text), "a place that was not filled"
+    for words in ("cup, b, seed 0 failed: cup", "PSNR over steps", "PSNR over seconds", "<td>30.00</td>"):
+        assert words in text
+
+
+def test_a_report_without_pictures_hides_their_section() -> None:
+    text = report_html(results([run("cup", "a", 0, psnr=30.0)]), [], {"cup": []})
+    assert '<section id="pictures" hidden>' in text
+
+
+def test_normals_are_lossless_and_photographs_are_not() -> None:
+    picture = pictures()["final"]
+    for layer, kind in (("normal", "png"), ("final", "jpeg")):
+        head, data = data_uri(picture, layer, 100).split(",")
+        assert head == f"data:image/{kind};base64"
+        decoded = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        assert decoded is not None
+        assert np.array_equal(decoded[..., ::-1], picture) is (layer == "normal")
+
+
+def test_pictures_shrink_until_they_fit_and_are_left_out_if_nothing_helps() -> None:
+    tiles = [Tile("a", pictures((300, 400)), {})]
+    whole, note = embed("s", "v", tiles, 10**7)
+    assert whole is not None
+    assert note is None
+    size = sum(map(len, whole.tiles[0][1].values()))
+    less, note = embed("s", "v", tiles, size // 2)
+    assert less is not None
+    assert (less.width, less.height) == (400, 300)
+    assert sum(map(len, less.tiles[0][1].values())) <= size // 2
+    assert note == "s, v: pictures reduced from 400 to 200 pixels."
+    none, note = embed("s", "v", tiles, 1000)
+    assert none is None
+    assert "left out" in str(note)
+
+
+def test_chosen_views_are_spread() -> None:
+    assert chosen_views("abc", 5) == ["a", "b", "c"]
+    assert chosen_views("abcdef", 3) == ["a", "c", "e"]
+    assert chosen_views("abc", 0) == []
+
+
+def test_a_log_becomes_a_curve(tmp_path: Path) -> None:
+    rows = [{"step": 10 * i + 9, "seconds": i / 2, "psnr": 20.0 + i} for i in range(1000)]
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"step": 3')
+    curve = read_curve(tmp_path, "a")
+    assert curve is not None
+    assert (curve.steps[0], curve.steps[-1], curve.seconds[-1]) == (10, 10000, 499.5)
+    assert len(curve.psnr) <= 240
+    np.testing.assert_allclose(curve.psnr, 20 + (curve.steps - 10) / 10)  # a line stays one under smoothing
+    assert 'aria-label="PSNR over steps"' in curves_svg([curve], "steps")
+    assert read_curve(tmp_path / "none", "a") is None
+
+
+def test_smoothing_keeps_the_mean_of_noise_and_both_ends() -> None:
+    values = np.random.default_rng(0).normal(25.0, 1.0, 2000)
+    smooth = smoothed(values, 0.05)
+    assert smooth[100:-100].std() < 0.2
+    assert (smooth[0], smooth[-1]) == pytest.approx((values[0], values[-1]))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0, 60, [0, 10, 20, 30, 40, 50, 60]),
+        (18.3, 21.2, [18, 18.5, 19, 19.5, 20, 20.5, 21, 21.5]),
+        (5, 5, None),
+    ],
+)
+def test_ticks_are_round_and_enclose(low: float, high: float, expected: list[float] | None) -> None:
+    found = ticks(low, high)
+    assert found[0] <= low < found[-1] or found[0] <= low <= high <= found[-1]
+    assert found[-1] > found[0]
+    assert expected is None or found == expected

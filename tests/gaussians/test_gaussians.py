@@ -1,0 +1,169 @@
+"""Adam's moments follow their rows through every edit; the state survives its tensors bit by bit."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from polarguide.errors import PolarguideError
+from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
+
+COUNT = 9
+RATES = {name: 0.01 * (index + 1) for index, name in enumerate(CORE_SHAPES)} | {"side": 0.3}
+
+
+def tensors(count: int = COUNT, seed: int = 0) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {**CORE_SHAPES, "side": (2,), "untrained": (4,)}
+    return {name: torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()}
+
+
+def pull(rows: Gaussians, seed: int, index: Tensor | None = None) -> None:
+    """One Adam step with random gradients; ``index`` selects rows of the gradients drawn for all of them."""
+    generator = torch.Generator().manual_seed(seed)
+    for name in rows.names:
+        full = torch.randn(COUNT, *rows[name].shape[1:], generator=generator)
+        rows[name].grad = full if index is None else full[index]
+    rows.step()
+
+
+def trained(steps: int = 3) -> Gaussians:
+    rows = Gaussians(tensors(), RATES)
+    for seed in range(steps):
+        pull(rows, seed)
+    return rows
+
+
+def same(found: Tensor, expected: Tensor) -> None:
+    """Equal up to the last bits, in which torch's fused Adam depends on where in memory a number lies."""
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
+
+
+def moments(rows: Gaussians) -> dict[str, Tensor]:
+    return {
+        name: t for name, t in rows.state().items() if name.startswith("adam.") and not name.endswith(".step")
+    }
+
+
+def test_a_step_moves_what_has_a_rate_and_drops_the_gradients() -> None:
+    rows = Gaussians(tensors(), RATES)
+    pull(rows, 0)
+    for name, before in tensors().items():
+        assert torch.equal(rows[name].detach(), before) == (name == "untrained")
+    assert all(rows[name].grad is None for name in RATES)
+    # The first step of Adam is the rate, against the gradient's sign.
+    moved = (rows["side"].detach() - tensors()["side"]).abs()
+    torch.testing.assert_close(moved, torch.full_like(moved, RATES["side"]), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize(
+    "index",
+    [torch.arange(COUNT) % 3 != 1, torch.tensor([7, 2, 2, 0]), torch.zeros(COUNT, dtype=torch.bool)],
+    ids=["mask", "indices", "none"],
+)
+def test_moments_follow_keep(index: Tensor) -> None:
+    rows = trained()
+    before = rows.state()
+    rows.keep(index)
+    for name, values in rows.state().items():
+        expected = before[name] if name.endswith(".step") else before[name][index]
+        assert torch.equal(values, expected), name
+
+
+def test_a_step_after_keep_is_the_step_of_the_untouched_rows() -> None:
+    index = torch.arange(COUNT) % 3 != 1
+    kept, whole = trained(), trained()
+    kept.keep(index)
+    for seed in (10, 11):
+        pull(kept, seed, index)
+        pull(whole, seed)
+    for name in kept.names:
+        same(kept[name], whole[name][index])
+
+
+def test_moments_of_appended_rows_are_zero_and_of_old_ones_unchanged() -> None:
+    rows = trained()
+    before = moments(rows)
+    added = tensors(4, seed=5)
+    rows.append(added)
+    assert len(rows) == COUNT + 4
+    for name in rows.names:
+        assert torch.equal(rows[name].detach()[COUNT:], added[name])
+    assert len(before) == 2 * len(RATES)
+    for name, values in moments(rows).items():
+        assert torch.equal(values[:COUNT], before[name])
+        assert not values[COUNT:].any()
+
+
+def test_a_step_after_append_is_the_step_of_the_untouched_rows() -> None:
+    longer, whole = trained(), trained()
+    longer.append(tensors(2, seed=5))
+    index = torch.cat((torch.arange(COUNT), torch.tensor([0, 1])))
+    pull(longer, 10, index)
+    pull(whole, 10)
+    for name in RATES:
+        same(longer[name][:COUNT], whole[name])
+
+
+def test_overwrite_zeroes_the_moments_of_that_tensor_alone() -> None:
+    rows = trained()
+    before = rows.state()
+    values = torch.full((COUNT,), 2.5)
+    rows.overwrite("opacity_logits", values)
+    assert torch.equal(rows["opacity_logits"].detach(), values)
+    for name, tensor in rows.state().items():
+        if name in ("adam.opacity_logits.exp_avg", "adam.opacity_logits.exp_avg_sq"):
+            assert not tensor.any()
+        elif name != "rows.opacity_logits":
+            assert torch.equal(tensor, before[name]), name
+
+
+def test_overwrite_before_the_first_step() -> None:
+    rows = Gaussians(tensors(), RATES)
+    rows.overwrite("means", torch.zeros(COUNT, 3))
+    assert not rows["means"].any()
+
+
+def test_a_rate_of_zero_rests_a_tensor() -> None:
+    rows = trained()
+    rows.set_rate("means", 0.0)
+    before = rows["means"].detach().clone()
+    pull(rows, 5)
+    assert torch.equal(rows["means"].detach(), before)
+
+
+@pytest.mark.parametrize("steps", [0, 3])
+def test_state_round_trip_is_bitwise_and_goes_on_alike(steps: int) -> None:
+    rows = trained(steps)
+    loaded = Gaussians.from_state({k: t.clone() for k, t in rows.state().items()}, RATES)
+    pull(rows, 20)
+    pull(loaded, 20)
+    state, other = rows.state(), loaded.state()
+    assert list(state) == list(other)
+    assert all(torch.equal(state[name], other[name]) for name in state)
+
+
+def test_a_snapshot_does_not_follow_the_training() -> None:
+    rows = trained()
+    snapshot = rows.snapshot()
+    before = {name: t.clone() for name, t in snapshot.items()}
+    pull(rows, 6)
+    assert all(torch.equal(snapshot[name], before[name]) for name in before)
+    assert not any(t.requires_grad for t in snapshot.values())
+
+
+def test_rows_stay_leaves_that_train_after_every_edit() -> None:
+    rows = trained()
+    rows.keep(torch.arange(COUNT) < 5)
+    rows.append(tensors(2, seed=1))
+    for name in rows.names:
+        assert rows[name].is_leaf
+        assert rows[name].requires_grad
+        assert rows[name].is_contiguous()
+
+
+def test_tensors_of_different_length_are_refused() -> None:
+    uneven = {**tensors(), "side": torch.zeros(COUNT - 1, 2)}
+    with pytest.raises(PolarguideError, match="one row count"):
+        Gaussians(uneven, RATES)

@@ -1,0 +1,98 @@
+"""The Gaussians to begin with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from polarguide.gaussians.gaussians import CORE_SHAPES
+from polarguide.gaussians.harmonics import SH_C0
+from polarguide.gaussians.initialize import (
+    Initialization,
+    initial_parameters,
+    neighbor_distance,
+    scene_extent,
+)
+
+SETTINGS = Initialization(shell=40, shell_radii=(3.0, 12.0), opacity=0.2)
+
+
+def capture() -> tuple[Tensor, Tensor, Tensor]:
+    """Points, their colors, and camera centers on a circle of radius 4."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(30, 3, generator=generator)
+    colors = torch.rand(30, 3, generator=generator)
+    angles = torch.linspace(0, 6, 9)
+    centers = torch.stack((4 * torch.cos(angles), torch.zeros(9), 4 * torch.sin(angles)), dim=1)
+    return points, colors, centers
+
+
+def test_rows_have_the_shapes_of_the_core_and_are_finite() -> None:
+    rows = initial_parameters(*capture(), SETTINGS, seed=0)
+    assert {name: tuple(t.shape[1:]) for name, t in rows.items()} == CORE_SHAPES
+    for tensor in rows.values():
+        assert tensor.shape[0] == 30 + 40
+        assert tensor.dtype == torch.float32
+        assert bool(torch.isfinite(tensor).all())
+
+
+def test_points_keep_their_place_and_color_and_all_have_the_first_opacity() -> None:
+    points, colors, centers = capture()
+    rows = initial_parameters(points, colors, centers, SETTINGS, seed=0)
+    torch.testing.assert_close(rows["means"][:30], points)
+    torch.testing.assert_close(SH_C0 * rows["sh_dc"][:30] + 0.5, colors)
+    assert not rows["sh_rest"].any()
+    torch.testing.assert_close(torch.sigmoid(rows["opacity_logits"]), torch.full((70,), 0.2))
+
+
+def test_round_at_first_and_as_wide_as_the_spacing() -> None:
+    points, colors, centers = capture()
+    rows = initial_parameters(points, colors, centers, SETTINGS, seed=0)
+    scales = rows["log_scales"].exp()
+    assert torch.equal(scales[:, 0], scales[:, 1])
+    assert torch.equal(scales[:, 0], scales[:, 2])
+    distance = torch.cdist(points.double(), points.double()).sort(dim=1).values[:, 1:4]
+    expected = distance.square().mean(dim=1).sqrt().float()
+    torch.testing.assert_close(scales[:30, 0], expected)
+
+
+def test_added_ones_lie_in_the_shell() -> None:
+    points, colors, centers = capture()
+    rows = initial_parameters(points, colors, centers, SETTINGS, seed=0)
+    middle = torch.tensor(np.median(points.numpy(), axis=0))
+    radius = float((centers - middle).norm(dim=1).quantile(0.9))
+    distance = (rows["means"][30:] - middle).norm(dim=1) / radius
+    assert 2.99 < float(distance.min()) < float(distance.max()) < 12.01
+    assert float(rows["log_scales"][30:].mean()) > float(rows["log_scales"][:30].mean())
+
+
+def test_none_are_added_if_none_are_asked_for() -> None:
+    rows = initial_parameters(*capture(), replace(SETTINGS, shell=0), seed=0)
+    assert len(rows["means"]) == 30
+
+
+def test_the_seed_decides() -> None:
+    first, again, other = (initial_parameters(*capture(), SETTINGS, seed=seed) for seed in (0, 0, 1))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["means"], other["means"])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_few_points_have_a_spacing(count: int) -> None:
+    points = np.arange(3.0 * count).reshape(count, 3)
+    spacing = neighbor_distance(points)
+    assert spacing.shape == (count,)
+    assert (spacing > 0).all()
+
+
+def test_points_at_one_place_have_a_positive_spacing() -> None:
+    assert (neighbor_distance(np.zeros((8, 3))) > 0).all()
+
+
+def test_the_extent_is_a_tenth_more_than_the_farthest_camera() -> None:
+    centers = torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0], [2.0, -3.0, 0]])
+    assert scene_extent(centers) == pytest.approx(3.3)

@@ -1,0 +1,57 @@
+"""Hand-made records of comparisons, for tests of tables and reports."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from polarguide.evaluation.table import KEYS
+from polarguide.experiments.results import make_results
+
+
+def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:
+    """A finished run with these metrics; all others are null."""
+    values = {**dict.fromkeys(KEYS), **metrics}
+    return {
+        "scene": scene,
+        "recipe": recipe,
+        "seed": seed,
+        "folder": f"runs/{scene}/{recipe}/{seed}",
+        "state": "done",
+        "error": None,
+        "metrics": values,
+        "lpips_reason": None if values["lpips"] is not None else "no weights",
+        "views": {"v0": dict(values)},
+    }
+
+
+def unfinished(scene: str, recipe: str, seed: int, error: str | None = None) -> dict[str, Any]:
+    """A run that failed with an error, or that has not run."""
+    blank = {"metrics": None, "views": {}, "lpips_reason": None}
+    return run(scene, recipe, seed) | blank | {"state": "failed" if error else "missing", "error": error}
+
+
+def results(runs: list[dict[str, Any]], **provenance: Any) -> dict[str, Any]:
+    """A record of these runs."""
+    scenes, recipes = (list(dict.fromkeys(r[key] for r in runs)) for key in ("scene", "recipe"))
+    return make_results(
+        provenance={
+            "version": "1",
+            "commit": None,
+            "sources": "abc",
+            "command": "polarguide compare",
+            "date": "2026-01-01",
+            **provenance,
+        },
+        settings={
+            "steps": 10,
+            "seeds": len({r["seed"] for r in runs}),
+            "downscale": 1,
+            "transfer": "linear",
+            "refractive_index": 1.5,
+            "threads": 1,
+            "jobs": 1,
+        },
+        scenes=[{"name": name, "digest": "d" * 64, "views": 3, "test_views": ["v0"]} for name in scenes],
+        recipes=[{"name": name, "about": f"about {name}", "data": {}} for name in recipes],
+        runs=runs,
+    )

@@ -1,0 +1,64 @@
+"""Untrained states of every kind of shading, for tests: random Gaussians about the origin, and cameras around them."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.gaussians.densify import DensityStatistics
+from polarguide.gaussians.gaussians import Gaussians
+from polarguide.recipes import RECIPES
+from polarguide.shading.model import ShadingModel
+from polarguide.training.state import Environment, TrainingState
+from polarguide.trajectory import looking
+
+KINDS = {"3dgs": "plain", "3dgs-dr": "reflection", "polarguide-stokes": "local", "ref-gs": "directional"}
+"""A recipe for each kind of shading."""
+
+
+def random_state(name: str, count: int = 300) -> tuple[TrainingState, ShadingModel]:
+    """A state as the recipe's training would leave, and its shading."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    recipe = RECIPES[name]
+    rows = {
+        "means": 0.7 * normal(count, 3),
+        "quaternions": normal(count, 4),
+        "log_scales": 0.5 * normal(count, 3) - 2,
+        "opacity_logits": 2 * normal(count),
+        "sh_dc": 0.5 * normal(count, 3),
+        "sh_rest": 0.1 * normal(count, 15, 3),
+    }
+    light = None
+    if recipe.directional is not None:
+        rows |= recipe.directional.first_parameters(0.5 + 0.28 * rows["sh_dc"], generator)
+        light = recipe.directional.first_light_values(8, 0.5, generator)
+    elif recipe.reflects:
+        rows["strength_logits"] = normal(count)
+        light = {"texels": normal(6, 8, 8, 3)}
+    if recipe.local:
+        rows |= {"local_dc": 0.3 * normal(count, 3), "local_rest": 0.1 * normal(count, 15, 3)}
+        rows["outward"] = normal(count, 3)
+        rows["outward"][::5] = 0  # not seen by any view
+    environment = Environment(light, recipe.environment_rates) if light else None
+    state = TrainingState(0, Gaussians(rows, recipe.rates), environment, DensityStatistics(count))
+    return state, recipe.shading(1.5)
+
+
+def ring(count: int = 6, distance: float = 4.0, width: int = 64, height: int = 48) -> dict[str, Camera]:
+    """Cameras around the origin, a little above it; the world's up is -y, as structure from motion tends to have it."""
+    eye = torch.eye(3, dtype=torch.float64)
+    lens = Camera(width, height, 1.1 * width, 1.1 * width, 0.48 * width, 0.53 * height, eye, eye[0])
+    cameras = {}
+    for k in range(count):
+        angle = 2 * math.pi * k / count
+        place = [distance * math.cos(angle), -0.3 * distance, distance * math.sin(angle)]
+        place_ = torch.tensor(place, dtype=torch.float64)
+        cameras[f"v{k}"] = looking(lens, place_, torch.zeros(3, dtype=torch.float64), -eye[1])
+    return cameras

@@ -1,0 +1,273 @@
+"""``prepare`` on published datasets: light, masks, cameras and the sense of angles, from known ones."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from camera_files import behind, read_invalid, read_polar, smooth_light
+from dataset_files import (
+    DISTORTION,
+    HEIGHT,
+    WIDTH,
+    WRITERS,
+    disc,
+    idr_cameras,
+    light_of,
+    pisr_inner,
+    poses,
+    write_gnerp,
+    write_nersp,
+    write_pandora,
+    write_pisr,
+)
+
+from polarguide.capture import load_scene
+from polarguide.capture.calibration import Calibration
+from polarguide.capture.formats.pictures import decode_mask
+from polarguide.errors import PolarguideError
+from polarguide.preparation import PrepareSettings, Reporter, prepare_scene
+
+PLAIN = PrepareSettings(poses="none", gains="none")
+NAMES = {
+    "pandora": ["01", "02", "03", "04"],
+    "pisr": ["000", "001", "002", "003"],
+    "nersp": ["0000", "0001", "0002", "0003"],
+    "neisf": ["img_001", "img_002", "img_003", "img_004"],
+    "gnerp": ["0", "1", "2", "3"],
+}
+# PANDORA's files share an exponent between channels, GNeRP's pictures have 8 bits.
+TOLERANCE = {"pandora": 1e-2, "nersp": 2e-5, "neisf": 2e-5, "gnerp": 1e-2}
+
+
+class Heard(Reporter):
+    """Keeps what was said."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    warn = say
+
+
+def summary(scene: Path) -> dict:
+    return json.loads((scene / "scene.json").read_text())
+
+
+def written(name: str, root: Path) -> Path:
+    if name == "neisf":
+        pytest.importorskip("OpenEXR")
+    return WRITERS[name](root)
+
+
+def channels_of(name: str, stokes: np.ndarray) -> np.ndarray:
+    """What the dataset can hold: GNeRP's angle and degree of polarization are those of green."""
+    if name != "gnerp":
+        return stokes
+    ratio = stokes[1:, ..., 1:2] / stokes[:1, ..., 1:2]
+    return np.concatenate([stokes[:1], ratio * stokes[:1]])
+
+
+@pytest.mark.parametrize("name", sorted(TOLERANCE))
+def test_light_and_masks(tmp_path: Path, name: str) -> None:
+    source = written(name, tmp_path / "in")
+    heard = Heard()
+    done = prepare_scene(source, tmp_path / "out", PLAIN, heard)
+    found = summary(tmp_path / "out")
+    assert found["format"] == name  # detected
+    assert done.views == NAMES[name]
+    largest = max(behind(channels_of(name, light_of(index))).max() for index in range(4))
+    assert found["scale"] == pytest.approx(1 / largest, rel=0.01)
+    for index, view in enumerate(done.views):
+        expected = behind(channels_of(name, light_of(index))) * found["scale"]
+        np.testing.assert_allclose(read_polar(tmp_path / "out", view), expected, atol=TOLERANCE[name])
+        path = tmp_path / "out" / "masks" / f"{view}.png"
+        np.testing.assert_array_equal(decode_mask(path, path.read_bytes(), any_value=False), disc())
+        assert not read_invalid(tmp_path / "out", view).any()
+    assert found["pair_sums"].startswith("n/a")
+    assert any("Four-angle sum check: n/a" in text for text in heard.said)
+    assert found["calibration"]["sense"] == ("cw" if name == "nersp" else "ccw")
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_cameras(tmp_path: Path, name: str) -> None:
+    source = written(name, tmp_path / "in")
+    heard = Heard()
+    done = prepare_scene(source, tmp_path / "out", PrepareSettings(gains="none"), heard)
+    assert done.posed
+    assert done.views == NAMES[name]
+    scene = load_scene(tmp_path / "out")
+    for view, (rotation, translation) in zip(scene.views, poses(), strict=True):
+        camera = view.camera
+        np.testing.assert_allclose(camera.rotation, rotation, atol=1e-6)
+        np.testing.assert_allclose(camera.translation, translation, atol=1e-6)
+        inner = (camera.fx, camera.fy, camera.cx, camera.cy)
+        if name == "neisf":
+            assert inner == pytest.approx((90, 90, WIDTH / 2, HEIGHT / 2))
+        elif name != "pisr":
+            assert inner == pytest.approx((90, 92, 33, 23))
+        assert view.mask is not None
+    points = summary(tmp_path / "out")["points"]
+    assert points["from"] == "random samples in the hull of the masks"
+    assert points["count"] == len(scene.points)
+    assert any("sampled at random in the hull of the masks" in text for text in heard.said)
+    # The samples lie where the discs of all views meet: around the origin.
+    assert np.abs(scene.points.numpy().mean(axis=0)).max() < 0.5
+    assert np.linalg.norm(scene.points.numpy(), axis=1).max() < 2.5
+
+
+def test_pisr_is_developed_undistorted_and_made_linear(tmp_path: Path) -> None:
+    """Light that is a function of the ray, behind a distorted lens and a camera's gamma."""
+    inner = pisr_inner() / [[4], [4], [1]]  # of the sensor, a quarter of 1224x1024 times two
+    inner[:2, 2] += 0.5 * (1 / 4) - 0.0  # OpenCV's pixels -> COLMAP's, at a quarter
+    full = pycolmap.Camera(
+        model="FULL_OPENCV", width=306, height=256,
+        params=[inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2], *DISTORTION, 0, 0, 0],
+    )  # fmt: skip
+
+    def rays_of(camera: pycolmap.Camera) -> np.ndarray:
+        rows, columns = np.mgrid[: camera.height, : camera.width]
+        places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)
+        return camera.cam_from_img(places).T.reshape(2, camera.height, camera.width)
+
+    def light(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        s0 = (0.8 + 0.3 * np.sin(9 * x) * np.cos(7 * y))[..., None] * np.ones(3)
+        return np.stack([s0, s0 * 0.3 * np.cos(5 * x)[..., None], s0 * 0.3 * np.sin(5 * y)[..., None]])
+
+    write_pisr(tmp_path / "in", lambda _: light(*rays_of(full)), gamma=0.8)
+    heard = Heard()
+    prepare_scene(tmp_path / "in", tmp_path / "out", PrepareSettings(gains="none"), heard)
+    assert any("power of 0.8" in text for text in heard.said)
+    found = summary(tmp_path / "out")
+    assert found["levels"]["bits"] == 12
+    assert found["prepare"]["views"]["000"]["warp"]["model"] == "FULL_OPENCV"
+    camera = load_scene(tmp_path / "out").views[0].camera
+    straight = pycolmap.Camera(
+        model="PINHOLE", width=camera.width, height=camera.height,
+        params=[camera.fx, camera.fy, camera.cx, camera.cy],
+    )  # fmt: skip
+    invalid = read_invalid(tmp_path / "out", "000")
+    assert invalid.mean() < 0.05
+    expected = behind(light(*rays_of(straight))) * found["scale"]
+    error = np.abs(read_polar(tmp_path / "out", "000") - expected)[:, 2:-2, 2:-2][:, ~invalid[2:-2, 2:-2]]
+    assert error.max() < 0.01
+
+
+@pytest.mark.parametrize(("sense", "zero"), [("ccw", 0.0), ("cw", 0.0), ("cw", 90.0), ("ccw", 20.0)])
+def test_the_sense_can_be_overridden(tmp_path: Path, sense: str, zero: float) -> None:
+    """NeRSP's files hold S2 with the other sign; told that they count otherwise, they are taken so."""
+    write_nersp(tmp_path / "in")
+    settings = replace(PLAIN, calibration=Calibration(sense=sense, zero=zero))
+    prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    found = summary(tmp_path / "out")
+    s0, s1, s2 = light_of(0)
+    if sense == "ccw":
+        s2 = -s2
+    cosine, sine = np.cos(2 * np.radians(zero)), np.sin(2 * np.radians(zero))
+    turned = np.stack([s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine])
+    polar = read_polar(tmp_path / "out", "0000")
+    np.testing.assert_allclose(polar, behind(turned) * found["scale"], atol=3e-5)
+    assert found["calibration"] == {"order": [0, 45, 90, 135], "sense": sense, "zero_degrees": zero}
+
+
+def test_highlights_clip_and_negative_intensities_are_counted(tmp_path: Path) -> None:
+    def light(index: int) -> np.ndarray:
+        stokes = light_of(index)
+        if index == 0:
+            stokes[:, 3, 5] *= 100
+            stokes[0, 10, 10] *= 0.1  # more polarized than light can be
+            stokes[0, 20, 20] = np.nan
+        return stokes
+
+    write_nersp(tmp_path / "in", light)
+    heard = Heard()
+    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN, heard)
+    found = summary(tmp_path / "out")
+    assert np.argwhere(read_invalid(tmp_path / "out", "0000")).tolist() == [[3, 5], [20, 20]]
+    assert 0 < found["negative_share"] < 2e-3
+    assert found["clipped_share"] == pytest.approx(0.25 / (HEIGHT * WIDTH), abs=2e-6)
+    assert any("negative" in text for text in heard.said)
+    assert any("not finite" in text for text in heard.said)
+    bright = behind(light_of(0)).max()
+    assert found["full_scale"] == pytest.approx(2 * bright, rel=0.02)
+
+
+def test_gnerp_pictures_may_be_linear(tmp_path: Path) -> None:
+    write_gnerp(tmp_path / "in")
+    heard = Heard()
+    prepare_scene(tmp_path / "in", tmp_path / "srgb", PLAIN, heard)
+    assert any("taken as srgb and made linear" in text for text in heard.said)
+    assert any("shared by R, G and B" in text for text in heard.said)
+    prepare_scene(tmp_path / "in", tmp_path / "linear", replace(PLAIN, transfer="linear"))
+    assert read_polar(tmp_path / "linear", "0").mean() > 1.1 * read_polar(tmp_path / "srgb", "0").mean()
+
+
+def test_pandora_may_count_from_zero(tmp_path: Path) -> None:
+    write_pandora(tmp_path / "in")
+    for path in sorted((tmp_path / "in").glob("*/*")):
+        path.rename(path.with_name(f"{int(path.name[:2]) - 1:02d}{path.name[2:]}"))
+    prepare_scene(tmp_path / "in", tmp_path / "out", PrepareSettings())
+    cameras = [view.camera for view in load_scene(tmp_path / "out").views]
+    for camera, (rotation, _) in zip(cameras, poses(), strict=True):
+        np.testing.assert_allclose(camera.rotation, rotation, atol=1e-6)
+
+
+def test_polanalyser_agrees_on_the_written_pictures(tmp_path: Path) -> None:
+    """Degree and angle of polarization of the four written pictures, by an independent program."""
+    reference = pytest.importorskip("polanalyser")
+    analyzers = [reference.polarizer(np.radians(angle)) for angle in (0, 45, 90, 135)]
+    for name in ("pandora", "nersp"):
+        write = {"pandora": write_pandora, "nersp": write_nersp}[name]
+        prepare_scene(write(tmp_path / name), tmp_path / f"{name} out", PLAIN)
+        stokes = reference.calcStokes(
+            list(read_polar(tmp_path / f"{name} out", NAMES[name][0])[..., 1]), analyzers
+        )
+        s0, s1, s2 = light_of(0)[..., 1]
+        np.testing.assert_allclose(reference.cvtStokesToDoLP(stokes), np.hypot(s1, s2) / s0, atol=0.02)
+        turn = reference.cvtStokesToAoLP(stokes) - np.arctan2(s2, s1) / 2
+        assert np.abs(np.sin(turn)).max() < 0.03
+
+
+def test_polanalyser_agrees_on_pisr(tmp_path: Path) -> None:
+    """Stokes vectors of the raw file itself, demosaiced by an independent program."""
+    reference = pytest.importorskip("polanalyser")
+    write_pisr(tmp_path / "in")
+    prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, demosaic="full"))
+    raw = np.load(tmp_path / "in" / "raw" / "000.npy")
+    pictures = reference.demosaicing(raw, reference.COLOR_PolarRGB)
+    theirs = np.stack([picture.astype(float)[..., ::-1] for picture in pictures]) / 4095
+    ours = read_polar(tmp_path / "out", "000")
+    assert np.abs(ours - theirs)[:, 4:-4, 4:-4].max() < 2 / 4095
+
+
+def test_colmap_poses_and_sfm_may_be_asked_for_instead(tmp_path: Path) -> None:
+    write_nersp(tmp_path / "in")
+    with pytest.raises(PolarguideError, match="none there nor in sparse"):
+        prepare_scene(tmp_path / "in", tmp_path / "out", PrepareSettings(poses=str(tmp_path)))
+    with pytest.raises(PolarguideError, match=r"views registered|COLMAP"):
+        prepare_scene(tmp_path / "in", tmp_path / "out", PrepareSettings(poses="sfm"))
+
+
+def test_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("OpenEXR")
+    source = written("neisf", tmp_path / "in")
+    monkeypatch.setattr("polarguide.capture.formats.radiance.openexr", None)
+    with pytest.raises(PolarguideError, match=r"not installed. pip install 'polarguide\[exr\]'"):
+        prepare_scene(source, tmp_path / "out", PLAIN)
+
+
+def test_known_matrices_are_what_they_should_be() -> None:
+    """The writer's own arithmetic: a corner of the unit sphere lands where the camera says."""
+    arrays = idr_cameras()
+    rotation, translation = next(poses())
+    point = np.array([0.3, -0.2, 0.1, 1.0])
+    seen = (arrays["world_mat_0"] @ arrays["scale_mat_0"] @ point)[:3]
+    local = rotation @ point[:3] + translation
+    assert seen[:2] / seen[2] == pytest.approx(local[:2] / local[2] * [90, 92] + [33, 23])
+    assert smooth_light(4, 4).shape == (3, 4, 4, 3)

@@ -1,0 +1,221 @@
+"""``prepare --poses``: models matched by name, scaled, undistorted; and structure from motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from camera_files import (
+    COLOR,
+    MONO,
+    behind,
+    mosaic,
+    read_invalid,
+    read_mask,
+    read_polar,
+    smooth_light,
+    write_model,
+    write_mosaic,
+    write_mosaics,
+    write_picture,
+    write_shots,
+)
+from relief import write_relief
+
+from polarguide.capture import load_scene
+from polarguide.capture.colmap.sfm import tone_mapped
+from polarguide.errors import PolarguideError
+from polarguide.preparation import PrepareSettings, Reporter, prepare_scene
+
+MOSAIC = PrepareSettings(sensor="IMX250MYR", gains="none")
+FILTER = PrepareSettings(gains="none", align=False, transfer="linear")
+NAMES = ("v000", "v001", "v002")
+
+
+class Heard(Reporter):
+    """Keeps what was said."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    warn = say
+
+
+@pytest.mark.parametrize(
+    ("demosaic", "camera", "inner"),
+    [
+        ("half", "PINHOLE 64 48 80 82 33 25", (40, 41, 16.5, 12.5)),
+        ("half", "PINHOLE 32 24 40 41 16.5 12.5", (40, 41, 16.5, 12.5)),
+        ("half", "SIMPLE_PINHOLE 128 96 160 66 50", (40, 40, 16.5, 12.5)),
+        ("quarter", "PINHOLE 64 48 80 82 33 25", (20, 20.5, 8.25, 6.25)),
+        ("full", "SIMPLE_RADIAL 64 48 80 33 25 0", (80, 80, 33, 25)),
+    ],
+)
+def test_intrinsics_follow_the_size(
+    tmp_path: Path, demosaic: str, camera: str, inner: tuple[float, ...]
+) -> None:
+    write_mosaics(tmp_path / "in")
+    model = write_model(tmp_path / "sparse" / "0", NAMES, camera)
+    for number, place in enumerate((tmp_path, tmp_path / "sparse", model)):
+        out = tmp_path / f"out{number}"
+        prepare_scene(tmp_path / "in", out, replace(MOSAIC, demosaic=demosaic, poses=str(place)))
+        scene = load_scene(out)
+        assert [view.name for view in scene.views] == list(NAMES)
+        found = scene.views[1].camera
+        assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx(inner)
+        assert scene.points.shape == (4, 3)
+        np.testing.assert_allclose(found.translation, [0.1, -0.25, 2.5])
+
+
+def test_a_cut_cell_moves_the_principal_point(tmp_path: Path) -> None:
+    light = smooth_light(49, 65)
+    for name in NAMES:
+        write_mosaic(tmp_path / "in" / f"{name}.png", mosaic(behind(light), COLOR, (1, 3)))
+    model = write_model(tmp_path / "model", NAMES, "PINHOLE 65 49 80 82 33 25")
+    prepare_scene(
+        tmp_path / "in", tmp_path / "out", replace(MOSAIC, offset_x=1, offset_y=3, poses=str(model))
+    )
+    camera = load_scene(tmp_path / "out").views[0].camera
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (32, 24, 16.0, 12.0)
+
+
+def test_views_without_a_pose_are_left_out_and_named(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "in", 4)
+    model = write_model(tmp_path / "model", ("sub/v000", "v001", "v003"), "PINHOLE 64 48 80 82 32 24")
+    heard = Heard()
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(MOSAIC, poses=str(model)), heard)
+    assert done.left_out == ["v002"]
+    assert any("1 of 4 views have no pose and are left out (v002)" in text for text in heard.said)
+    assert len(load_scene(tmp_path / "out").views) == 3
+
+
+def test_one_map_undistorts_all_four_intensities(tmp_path: Path) -> None:
+    """Light that is a function of the ray: where a ray lands is known with and without distortion."""
+    distorted = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=128, height=96, params=[110.0, 64.0, 48.0, 0.12], camera_id=1
+    )
+
+    def light_of(camera: pycolmap.Camera) -> np.ndarray:
+        rows, columns = np.mgrid[: camera.height, : camera.width]
+        rays = camera.cam_from_img(np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1))
+        x, y = rays.T.reshape(2, camera.height, camera.width)
+        s0 = (0.8 + 0.3 * np.sin(9 * x) * np.cos(7 * y))[..., None] * np.ones(3)
+        return np.stack([s0, s0 * 0.4 * np.cos(5 * x)[..., None], s0 * 0.4 * np.sin(5 * y)[..., None]])
+
+    light = behind(light_of(distorted))
+    light[0, 40, 50] = 1.0
+    for name in NAMES:
+        write_shots(tmp_path / "in", name, light)
+    model = write_model(tmp_path / "model", NAMES, "SIMPLE_RADIAL 128 96 110 64 48 0.12")
+    prepare_scene(tmp_path / "in", tmp_path / "out", replace(FILTER, poses=str(model)))
+    scene = load_scene(tmp_path / "out")
+    camera = scene.views[0].camera
+    straight = pycolmap.Camera(
+        model="PINHOLE", width=camera.width, height=camera.height,
+        params=[camera.fx, camera.fy, camera.cx, camera.cy],
+    )  # fmt: skip
+    invalid = read_invalid(tmp_path / "out", "v000")
+    error = np.abs(read_polar(tmp_path / "out", "v000") - behind(light_of(straight)))[:, ~invalid]
+    assert error.max() < 2e-3
+    assert 1 <= invalid.sum() <= 4
+    place = distorted.cam_from_img(np.array([[50.5, 40.5]]))
+    x, y = straight.img_from_cam(np.column_stack([place, [1.0]]))[0]
+    assert np.abs(np.argwhere(invalid) + 0.5 - [y, x]).max() <= 1.5
+
+
+def test_sfm_on_a_textured_scene(tmp_path: Path) -> None:
+    """A textured, polarized relief seen by a camera on an arc: all views register, and training can read them."""
+    write_relief(tmp_path / "in")
+    heard = Heard()
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", FILTER, heard)
+    assert len(done.views) >= 5
+    assert any("views registered" in text for text in heard.said)
+    assert not (tmp_path / "out" / ".sfm").exists()
+    scene = load_scene(tmp_path / "out")
+    assert len(scene.points) > 100
+    assert scene.views[0].camera.fx == pytest.approx(260, rel=0.25)
+
+
+def test_sfm_with_known_intrinsics_looks_at_masks_alone(tmp_path: Path) -> None:
+    """Features are found inside the masks only, the camera stays as it was given, and the masks are kept."""
+    cameras = write_relief(tmp_path / "in")
+    mask = np.zeros((240, 320), np.uint8)
+    mask[:, :200] = 255
+    for view in list(cameras)[1:]:
+        write_picture(tmp_path / "masks" / f"{view}.png", mask / 255.0, bits=8)
+    asked = replace(
+        FILTER, masks=str(tmp_path / "masks"), intrinsics="260,260,160.5,120.5", sfm_pictures="minimum"
+    )
+    heard = Heard()
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", asked, heard)
+    assert len(done.views) >= 5
+    assert any(text.startswith("1 of 6 views have no mask") for text in heard.said)
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    for camera in model.cameras.values():
+        assert camera.model_name == "PINHOLE"
+        assert camera.params.tolist() == [260, 260, 160.5, 120.5]
+    seen = {view: [] for view in done.views}
+    for image in model.images.values():
+        seen[Path(image.name).stem] += [p.xy[0] for p in image.points2D]
+    assert len(seen["v2"]) > 50
+    assert max(max(columns) for view, columns in seen.items() if view != "v0") < 202
+    assert not (tmp_path / "out" / "masks" / "v0.png").exists()
+    assert (read_mask(tmp_path / "out", "v2") == (mask > 0)).all()
+
+
+def test_pictures_for_sfm_with_less_glare() -> None:
+    intensities = np.full((4, 6, 8, 3), 0.5, np.float32)
+    intensities[2, :, :4] = 0.1
+    darkest = tone_mapped(intensities, "minimum")
+    assert (darkest[:, 4:] == 255).all()
+    assert (darkest[:, :4] == round(255 * (1.055 * 0.2 ** (1 / 2.4) - 0.055))).all()
+    assert (tone_mapped(intensities)[:, :4] > darkest[:, :4]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"intrinsics": "260,260,160"}, "--intrinsics: expected fx,fy,cx,cy or"),
+        ({"intrinsics": "260,0,160,120"}, "--intrinsics: expected fx,fy,cx,cy or"),
+        ({"refine_intrinsics": True}, "--refine-intrinsics: expected intrinsics to begin with"),
+        ({"intrinsics": "9,9,9,9", "poses": "none"}, "expected poses by structure from motion"),
+        ({"masks": "nowhere"}, "--masks: expected a folder of masks"),
+    ],
+)
+def test_wrong_use_is_told(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    write_shots(tmp_path / "in", "v0", behind(smooth_light()))
+    with pytest.raises(PolarguideError, match=words):
+        prepare_scene(tmp_path / "in", tmp_path / "out", replace(FILTER, **changes))
+    assert not (tmp_path / "out").exists()
+
+
+def test_masks_have_to_fit(tmp_path: Path) -> None:
+    write_shots(tmp_path / "in", "v0", behind(smooth_light()))
+    settings = replace(FILTER, masks=str(tmp_path / "masks"), poses="none")
+    write_picture(tmp_path / "masks" / "other.png", np.ones((4, 4)), bits=8)
+    with pytest.raises(PolarguideError, match="expected masks called like the views"):
+        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    write_picture(tmp_path / "masks" / "v0.png", np.ones((4, 4)), bits=8)
+    with pytest.raises(PolarguideError, match=r"v0\.png: expected the size of the picture"):
+        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+
+
+def test_poses_may_follow_on_none(tmp_path: Path) -> None:
+    for name in NAMES:
+        write_mosaic(tmp_path / "in" / f"{name}.png", mosaic(behind(smooth_light(color=False)), MONO))
+    settings = replace(MOSAIC, sensor="IMX250MZR", poses="none")
+    prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    written = (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns
+    model = write_model(tmp_path / "model", NAMES[:2], "PINHOLE 64 48 80 82 32 24")
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(settings, poses=str(model)))
+    assert done.new
+    assert done.left_out == ["v002"]
+    assert (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns == written
+    assert len(load_scene(tmp_path / "out").views) == 2

@@ -1,0 +1,323 @@
+"""What ``prepare`` refuses: one message, no traceback, and nothing that looks like a whole scene."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from camera_files import ANGLES, behind, smooth_light, write_model, write_mosaics, write_shots
+
+from polarguide import files
+from polarguide.capture import load_scene
+from polarguide.capture.calibration import Calibration, read_calibration
+from polarguide.errors import PolarguideError
+from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation import folder as folder_module
+
+MOSAIC = PrepareSettings(sensor="IMX250MYR", poses="none")
+FILTER = PrepareSettings(poses="none", align=False)
+RAW = replace(MOSAIC, packing="12p", width=64, height=48)
+NAMES = ("v000", "v001", "v002")
+
+
+def refused(source: Path, out: Path, settings: PrepareSettings) -> str:
+    """The message of a refusal, after which there is no scene that could be trained on."""
+    with pytest.raises(PolarguideError) as error:
+        prepare_scene(source, out, settings)
+    assert not (out / "scene.json").exists()
+    assert not (out / "sparse").exists()
+    if (out / "polar").exists():
+        with pytest.raises(PolarguideError):
+            load_scene(out)
+    text = str(error.value)
+    assert "\n" not in text
+    assert text.endswith(".")
+    return text
+
+
+def cut(path: Path, size: int) -> None:
+    path.write_bytes(path.read_bytes()[:size])
+
+
+def save(path: Path, array: np.ndarray) -> None:
+    np.save(path, array)
+
+
+def picture(path: Path, array: np.ndarray) -> None:
+    assert cv2.imwrite(str(path), array)
+
+
+MOSAICS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
+    "truncated png": (lambda d: cut(d / "v001.png", 200), MOSAIC, "v001.png: .*cut short"),
+    "zero bytes": (lambda d: cut(d / "v001.png", 0), MOSAIC, "v001.png: .*an empty file"),
+    "empty npy": (lambda d: (d / "w.npy").touch(), MOSAIC, "w.npy: .*an empty file"),
+    "truncated npy": (
+        lambda d: (save(d / "w.npy", np.zeros((48, 64), np.uint16)), cut(d / "w.npy", 500)),
+        MOSAIC, "w.npy: expected a complete .npy file",
+    ),
+    "float npy": (lambda d: save(d / "w.npy", np.zeros((48, 64))), MOSAIC, "w.npy: .*64 of float64|float64"),
+    "nan npy": (lambda d: save(d / "w.npy", np.full((48, 64), np.nan)), MOSAIC, "float64"),
+    "object npy": (
+        lambda d: np.save(d / "w.npy", np.array([{}]), allow_pickle=True), MOSAIC, "expected a complete .npy file"
+    ),
+    "color png": (
+        lambda d: picture(d / "w.png", np.zeros((48, 64, 3), np.uint8)), MOSAIC, "w.png: .*48x64x3"
+    ),
+    "mixed sizes": (
+        lambda d: picture(d / "w.png", np.ones((32, 64), np.uint16)), MOSAIC, "w.png: expected 64x48.*found 64x32"
+    ),
+    "mixed depth": (
+        lambda d: picture(d / "w.png", np.ones((48, 64), np.uint8)), MOSAIC, "w.png: .*uint16.*uint8"
+    ),
+    "duplicate names": (
+        lambda d: picture(d / "v000.tif", np.ones((48, 64), np.uint16)), MOSAIC, "v000.png and v000.tif"
+    ),
+    "not a picture": (lambda d: (d / "v000.png").write_text("hello"), MOSAIC, "v000.png: .*none of these"),
+    "tiny": (
+        lambda d: [picture(d / f"v00{i}.png", np.ones((8, 8), np.uint16)) for i in range(3)],
+        MOSAIC, "at least 16x16",
+    ),
+    "raw without packing": (lambda d: (d / "w.raw").write_bytes(b"1"), MOSAIC, "no --width, --height, --packing"),
+    "raw of wrong size": (
+        lambda d: (d / "a.raw").write_bytes(b"1" * 100), RAW, "a.raw: expected 4608 bytes for 64x48.*found 100"
+    ),
+    "width of other files": (lambda d: None, replace(MOSAIC, width=32), "expected 32x48 .*found 64x48"),
+    "no sensor": (lambda d: None, replace(MOSAIC, sensor=None), "--sensor: expected the sensor"),
+    "unknown sensor": (lambda d: None, replace(MOSAIC, sensor="IMX1"), "--sensor: expected one of"),
+    "gray white balance": (
+        lambda d: None, replace(MOSAIC, sensor="IMX250MZR", white_balance="gray"), "--white-balance"
+    ),
+    "broken white balance": (lambda d: None, replace(MOSAIC, white_balance="1,2"), "--white-balance: .*'1,2'"),
+    "black level": (lambda d: None, replace(MOSAIC, black_level=70000.0), "--black-level"),
+    "nan black level": (lambda d: None, replace(MOSAIC, black_level=float("nan")), "--black-level: .*found nan"),
+    "saturation": (lambda d: None, replace(MOSAIC, saturation=70000), "--saturation"),
+    "bits": (lambda d: None, replace(MOSAIC, bits=12), "--bits: expected values below 4096"),
+    "bits out of range": (lambda d: None, replace(MOSAIC, bits=99), "--bits: expected 8 to 16"),
+    "negative offset": (lambda d: None, replace(MOSAIC, offset_x=-1), "--offset-x: expected 0 or more"),
+    "missing dark frame": (lambda d: None, replace(MOSAIC, dark_frame="none.png"), "none.png: .*readable file"),
+    "dark frame of another size": (
+        lambda d: picture(d.parent / "dark.png", np.ones((16, 16), np.uint16)),
+        replace(MOSAIC, dark_frame="DARK"), "dark frame of 64x48",
+    ),
+    "flag of the other format": (lambda d: None, replace(MOSAIC, transfer="srgb"), "--transfer: .*mosaic"),
+    "nan zero": (
+        lambda d: None, replace(MOSAIC, calibration=Calibration(zero=float("nan"))), r"calibration \(zero\)"
+    ),
+    "order": (
+        lambda d: None, replace(MOSAIC, calibration=Calibration(order=(0, 0, 90, 135))), r"calibration \(order\)"
+    ),
+    "empty folder": (lambda d: [p.unlink() for p in d.iterdir()], MOSAIC, "found an empty folder"),
+    "no folder": (lambda d: shutil.rmtree(d), MOSAIC, "expected a folder of camera files, found nothing"),
+    "no model": (lambda d: None, replace(MOSAIC, poses="nowhere"), "nowhere: expected a COLMAP model"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MOSAICS)
+def test_mosaics(tmp_path: Path, case: str) -> None:
+    damage, settings, message = MOSAICS[case]
+    source = tmp_path / "räume und zeit"  # with blanks and umlauts, for every message
+    write_mosaics(source)
+    damage(source)
+    if settings.dark_frame == "DARK":
+        settings = replace(settings, dark_frame=str(tmp_path / "dark.png"))
+    text = refused(source, tmp_path / "out", settings)
+    assert re.search(message, text), text
+    assert not (tmp_path / "out").exists()
+
+
+SHOTS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
+    "missing shot": (lambda d: (d / "90" / "b.png").unlink(), FILTER, "shots of view b .*found none at 90"),
+    "missing folder": (lambda d: shutil.rmtree(d / "135"), FILTER, "none for 135 degrees"),
+    "two folders for an angle": (lambda d: (d / "I-45").mkdir(), FILTER, "one folder for 45 degrees"),
+    "duplicate shot": (
+        lambda d: shutil.copy(d / "0" / "a.png", d / "0" / "a.tif"), FILTER, "one file called a"
+    ),
+    "truncated": (lambda d: cut(d / "45" / "b.png", 300), FILTER, "b.png: .*cut short"),
+    "mixed sizes": (
+        lambda d: picture(d / "45" / "b.png", np.ones((8, 8, 3), np.uint16)), FILTER, "b.png: .*64x48 with 16 bits"
+    ),
+    "mixed depth": (
+        lambda d: picture(d / "45" / "b.png", np.ones((48, 64, 3), np.uint8)), FILTER, "found 64x48 with 8 bits"
+    ),
+    "flag of the other format": (lambda d: None, replace(FILTER, bits=12), "--bits: .*filter"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SHOTS)
+def test_filter_shots(tmp_path: Path, case: str) -> None:
+    damage, settings, message = SHOTS[case]
+    source = tmp_path / "in"
+    for view in "ab":
+        write_shots(source, view, behind(smooth_light()))
+    damage(source)
+    text = refused(source, tmp_path / "out", settings)
+    assert re.search(message, text), text
+
+
+@pytest.mark.parametrize(
+    ("camera", "line", "message"),
+    [
+        ("PINHOLE 64 48 80 82 32 24", None, "images called like the views"),
+        (
+            "PINHOLE 64 40 80 82 32 24",
+            "1 1 0 0 0 0 0 2 1 v000.png",
+            "expected the size of the pictures, 32x24",
+        ),
+        ("PINHOLE 64 48 80 82 32 24", "1 nan 0 0 0 0 0 2 1 v000.png", "finite pose|refuses"),
+        ("PINHOLE 64 48 80 82 32 24", "1 1 0 0 0 nan 0 2 1 v000.png", "finite pose|refuses"),
+        ("PINHOLE 64 48 nan 82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", "finite pose|refuses|COLMAP"),
+        ("PINHOLE 64 48 -80 -82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", "positive focal"),
+    ],
+)
+def test_models(tmp_path: Path, camera: str, line: str | None, message: str) -> None:
+    write_mosaics(tmp_path / "in")
+    model = write_model(tmp_path / "model", ("strangers", "elsewhere"), camera)
+    if line is not None:
+        (model / "images.txt").write_text(line + "\n\n")
+    text = refused(tmp_path / "in", tmp_path / "out", replace(MOSAIC, poses=str(model)))
+    assert re.search(message, text), text
+
+
+def test_a_full_disk_and_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_mosaics(tmp_path / "in", 3)
+    replace_file, count = os.replace, [0]
+
+    def full(source: Path, target: Path) -> None:
+        count[0] += 1
+        if count[0] > 9:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace_file(source, target)
+
+    monkeypatch.setattr(files.os, "replace", full)
+    text = refused(tmp_path / "in", tmp_path / "out", MOSAIC)
+    assert "No space left on device" in text
+    assert "goes on where it stopped" in text
+    monkeypatch.undo()
+    assert not list(tmp_path.rglob("*.tmp"))
+    first = tmp_path / "out" / "polar" / "v000_000.png"
+    before = first.stat().st_mtime_ns
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC)
+    assert done.views == list(NAMES)
+    assert first.stat().st_mtime_ns == before
+    assert not prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC).new
+
+
+def test_a_stopped_preparation_gives_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_mosaics(tmp_path / "in", 3)
+    prepare_scene(tmp_path / "in", tmp_path / "whole", MOSAIC)
+    write, count = folder_module.SceneFolder.write_view, [0]
+
+    def stop(self: object, *arguments: object) -> None:
+        count[0] += 1
+        if count[0] == 2:
+            raise KeyboardInterrupt
+        write(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(folder_module.SceneFolder, "write_view", stop)
+    with pytest.raises(KeyboardInterrupt):
+        prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC)
+    assert not (tmp_path / "out" / "scene.json").exists()
+    monkeypatch.undo()
+    prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC)
+    for path in sorted((tmp_path / "whole").rglob("*.*")):
+        assert path.read_bytes() == (tmp_path / "out" / path.relative_to(tmp_path / "whole")).read_bytes(), (
+            path
+        )
+
+
+def other_setting(source: Path, out: Path) -> PrepareSettings:
+    return replace(MOSAIC, demosaic="quarter")
+
+
+def changed_source(source: Path, out: Path) -> PrepareSettings:
+    os.utime(source / "v001.png", ns=(1, 1))
+    return MOSAIC
+
+
+def more_views(source: Path, out: Path) -> PrepareSettings:
+    shutil.copy(source / "v001.png", source / "v009.png")
+    return MOSAIC
+
+
+def foreign_scene(source: Path, out: Path) -> PrepareSettings:
+    (out / "scene.json").write_text('{"refractive_index": 1.5}')
+    return MOSAIC
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (other_setting, "a preparation with demosaic half, found demosaic quarter"),
+        (changed_source, "v001.png as it was, found .*changed, added or removed"),
+        (more_views, "v009.png"),
+        (foreign_scene, "scene.json of another origin"),
+    ],
+)
+def test_nothing_is_overwritten(tmp_path: Path, change: Callable, message: str) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    write_mosaics(source)
+    prepare_scene(source, out, MOSAIC)
+    settings = change(source, out)
+    before = {path: path.read_bytes() for path in out.rglob("*.*")}
+    with pytest.raises(PolarguideError, match=message):
+        prepare_scene(source, out, settings)
+    assert {path: path.read_bytes() for path in out.rglob("*.*")} == before
+
+
+def test_out_with_other_files_or_a_file_is_left_alone(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "in")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "letters.txt").write_text("mine")
+    assert "found other files" in refused(tmp_path / "in", tmp_path / "out", MOSAIC)
+    assert "found a file" in refused(tmp_path / "in", tmp_path / "out" / "letters.txt", MOSAIC)
+
+
+def test_views_with_blanks_and_umlauts(tmp_path: Path) -> None:
+    for view in ("große tasse", "b", "c"):
+        write_shots(tmp_path / "täglich neu", view, behind(smooth_light()))
+    model = write_model(tmp_path / "model", ("große_tasse", "b", "c"), "PINHOLE 64 48 80 82 32 24")
+    for angle in ANGLES:
+        folder = tmp_path / "täglich neu" / str(angle)
+        (folder / "große tasse.png").rename(folder / "große_tasse.png")
+    settings = replace(FILTER, poses=str(model))
+    done = prepare_scene(tmp_path / "täglich neu", tmp_path / "die szene", settings)
+    assert done.views == ["b", "c", "große_tasse"]
+    assert len(load_scene(tmp_path / "die szene").views) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "expected a JSON file"),
+        ("[]", "a JSON list"),
+        ('{"gain": 1}', "the key 'gain'"),
+        ('{"gains": {"0": 1}}', "the gains"),
+        ('{"gains": {"0": 1, "45": 1, "90": "x", "135": 1}}', "could not convert"),
+        ('{"gains": {"0": 1, "45": 1, "90": 0, "135": 1}}', "from 0.5 to 2"),
+        ('{"order": [0, 45]}', "not enough values"),
+        ('{"sense": "left"}', "cw or ccw"),
+        ('{"zero": null}', "NoneType"),
+    ],
+)
+def test_calibration_files(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(text)
+    with pytest.raises(PolarguideError, match=message):
+        read_calibration(path)
+
+
+def test_a_calibration_file(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(
+        '{"gains": {"0": 1.01, "45": 0.99, "90": 1, "135": 1}, "order": [90, 45, 0, 135], "zero": 3}'
+    )
+    expected = Calibration(gains=(1.01, 0.99, 1.0, 1.0), order=(90, 45, 0, 135), zero=3.0)
+    assert read_calibration(path) == expected

@@ -1,0 +1,168 @@
+"""Figures: colors of known values, and the geometry of a contact sheet."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from polarguide.camera import Camera
+from polarguide.errors import PolarguideError
+from polarguide.visualization import figures
+
+# A camera that looks along world +x, with world +z up: its right is world -y.
+ROTATION = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+CAMERA = Camera(4, 2, 4.0, 4.0, 2.0, 1.0, ROTATION, torch.zeros(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("world", "color"),
+    [
+        ((-1.0, 0.0, 0.0), (128, 128, 255)),  # toward the camera: blue
+        ((0.0, -1.0, 0.0), (255, 128, 128)),  # right: red
+        ((0.0, 0.0, 1.0), (128, 255, 128)),  # up: green
+        ((0.0, 0.0, -0.2), (128, 0, 128)),  # down, not of unit length
+        ((0.0, 0.0, 0.0), (128, 128, 128)),
+        ((math.nan, 0.0, 0.0), (128, 128, 128)),
+    ],
+)
+def test_normal_colors(world, color):
+    picture = figures.normal_to_rgb(torch.tensor(world).expand(2, 4, 3), CAMERA)
+    assert picture.shape == (2, 4, 3)
+    assert picture.dtype == np.uint8
+    assert tuple(picture[1, 2]) == color
+
+
+def test_radiance_colors():
+    linear = torch.tensor([[[0.0, 0.2158605, 1.0], [-3.0, 7.0, math.nan]]])
+    assert figures.radiance_to_rgb(linear).tolist() == [[[0, 128, 255], [0, 255, 0]]]
+
+
+def test_scalar_colors():
+    viridis = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_VIRIDIS)[0, :, ::-1]
+    values = torch.tensor([[2.0, 3.0, 4.0, 1.0, 9.0, math.nan, math.inf]])
+    row = figures.scalar_to_rgb(values, 2.0, 4.0)[0]
+    assert row.tolist() == [*viridis[[0, 128, 255, 0, 255]].tolist(), [0, 0, 0], [0, 0, 0]]
+    inverted = figures.scalar_to_rgb(values, 2.0, 4.0, invert=True)[0]
+    assert inverted.tolist() == [*viridis[[255, 128, 0, 255, 0]].tolist(), [0, 0, 0], [0, 0, 0]]
+    assert (figures.scalar_to_rgb(values, 2.0, 4.0, "turbo")[0, 0] != row[0]).any()
+
+
+def test_scalar_refuses_what_it_cannot_draw():
+    with pytest.raises(ValueError, match=r"expected low < high, found 1.0 and 1.0"):
+        figures.scalar_to_rgb(torch.zeros(2, 2), 1.0, 1.0)
+    with pytest.raises(PolarguideError, match=r"expected one of viridis, .*, found 'jet'"):
+        figures.scalar_to_rgb(torch.zeros(2, 2), 0.0, 1.0, "jet")
+
+
+@pytest.mark.parametrize(
+    ("degrees", "color"),
+    [(0, (255, 0, 0)), (30, (255, 255, 0)), (60, (0, 255, 0)), (120, (0, 0, 255)), (150, (255, 0, 255))],
+)
+@pytest.mark.parametrize("turns", [-1, 0, 1])
+def test_aolp_hue_turns_once_in_pi(degrees, color, turns):
+    angle = torch.full((1, 1), math.radians(degrees) + turns * math.pi, dtype=torch.float64)
+    assert tuple(figures.aolp_to_rgb(angle)[0, 0]) == color
+
+
+def test_aolp_brightness():
+    angle = torch.tensor([[0.0, 0.0, math.nan, 0.0]])
+    dolp = torch.tensor([[1.0, 0.0, 1.0, math.nan]])
+    assert figures.aolp_to_rgb(angle, dolp)[0, :, 0].tolist() == [255, 0, 0, 0]
+
+
+def test_dolp_and_error_grow_brighter():
+    dolp = figures.dolp_to_rgb(torch.tensor([[0.0, 0.3, 0.6, 1.0]]))[0].astype(int).sum(-1)
+    assert dolp[0] < 10
+    assert (np.diff(dolp) > 0).all()
+    true = torch.full((1, 3, 3), 0.2)
+    pred = true + torch.tensor([0.0, 0.05, -0.15])[None, :, None]
+    error = figures.error_to_rgb(pred, true)[0].astype(int).sum(-1)
+    assert error[0] == dolp[0]
+    assert error[0] < error[1] < error[2]
+
+
+def test_png_round_trip_keeps_the_order_of_channels(tmp_path):
+    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+    figures.write_png(tmp_path / "p.png", picture)
+    assert (cv2.imread(str(tmp_path / "p.png"))[..., ::-1] == picture).all()
+    assert [p.name for p in tmp_path.iterdir()] == ["p.png"]
+
+
+def test_png_refuses_what_is_not_a_picture(tmp_path):
+    with pytest.raises(ValueError, match=r"expected uint8 \[H, W, 3\], found float64"):
+        figures.write_png(tmp_path / "p.png", np.zeros((2, 2, 3)))
+    with pytest.raises(PolarguideError, match="expected a folder, found none"):
+        figures.write_png(tmp_path / "no" / "p.png", np.zeros((2, 2, 3), np.uint8))
+
+
+def flat(color, height, width):
+    return np.full((height, width, 3), color, np.uint8)
+
+
+RED, GREEN, BLUE = (200, 0, 0), (0, 200, 0), (0, 0, 200)
+
+
+def boxes(sheet, color):
+    """(top, left, height, width) of the only rectangle of a color."""
+    y, x = np.nonzero((sheet == color).all(-1))
+    top, left, height, width = y.min(), x.min(), np.ptp(y) + 1, np.ptp(x) + 1
+    assert len(y) == height * width
+    return int(top), int(left), int(height), int(width)
+
+
+def test_sheet_enlarges_small_tiles_by_a_whole_factor():
+    fine = np.random.default_rng(1).integers(0, 256, (60, 100, 3)).astype(np.uint8)
+    sheet = figures.contact_sheet([[fine]], [""], [""], gutter=8)
+    assert sheet.shape == (180 + 16, 300 + 16, 3)
+    assert (sheet[8:-8, 8:-8] == fine.repeat(3, 0).repeat(3, 1)).all()
+
+
+def test_sheet_places_rows_and_columns():
+    rows = [[flat(RED, 96, 128), flat(GREEN, 96, 128)], [None, flat(BLUE, 96, 128)]]
+    sheet = figures.contact_sheet(rows, ["first", "second"], ["a", "b"])
+    red, green, blue = (boxes(sheet, color) for color in (RED, GREEN, BLUE))
+    assert red[2:] == green[2:] == blue[2:] == (192, 256)
+    assert (green[0], green[1]) == (red[0], red[1] + 256 + 8)
+    assert (blue[0], blue[1]) == (green[0] + 192 + 8, green[1])
+    assert sheet.shape == (blue[0] + 192 + 8, blue[1] + 256 + 8, 3)
+    blank = sheet[blue[0] : blue[0] + 192, red[1] : red[1] + 256]
+    assert (blank == 255).all()
+    assert (figures.contact_sheet([rows[0], []], ["first", "second"], ["a", "b"]).shape) == sheet.shape
+
+
+def test_sheet_reduces_large_pictures_and_fits_odd_ones():
+    rows = [[flat(RED, 500, 1000), flat(GREEN, 100, 100)]]
+    sheet = figures.contact_sheet(rows, [""], ["", ""], maximum_width=400)
+    assert boxes(sheet, RED)[2:] == (200, 400)
+    top, left, height, width = boxes(sheet, GREEN)
+    assert (height, width) == (400, 400)
+    assert boxes(sheet, RED)[0] == top + 100  # centered in the height of the tallest
+    assert left == boxes(sheet, RED)[1] + 400 + 8
+
+
+def test_labels_are_drawn_beside_the_tiles_they_name():
+    def sheet(row, column):
+        return figures.contact_sheet([[flat(RED, 96, 128)]], [row], [column]).astype(int)
+
+    plain, other = sheet("view", "normal"), sheet("view", "depth")
+    _, left, _, _ = boxes(plain, RED)
+    changed = np.nonzero((plain != other).any(-1))
+    assert len(changed[0]) > 20
+    assert changed[0].max() < boxes(plain, RED)[0]
+    assert changed[1].min() >= left
+    assert (sheet("view", "normal")[:, : left - 8] < 128).any()
+    wide = sheet("", "a label that is far too long for a tile of 256 pixels")
+    ink = np.nonzero((wide[: boxes(wide, RED)[0]] < 128).any(-1).any(0))[0]
+    assert ink.max() - ink.min() <= 300
+
+
+def test_sheet_refuses_labels_that_do_not_fit():
+    tile = flat(RED, 4, 4)
+    with pytest.raises(ValueError, match=r"expected 1 rows of at most 1 pictures, found rows of \[2\]"):
+        figures.contact_sheet([[tile, tile]], ["a"], ["b"])
+    with pytest.raises(ValueError, match="expected at least one picture"):
+        figures.contact_sheet([[None]], ["a"], ["b"])
+    with pytest.raises(ValueError, match=r"found float32 \[4, 4, 3\]"):
+        figures.contact_sheet([[tile.astype(np.float32)]], ["a"], ["b"])
