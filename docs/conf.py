@@ -37,6 +37,9 @@ bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 
 autodoc_member_order = "bysource"
+add_module_names = False
+toc_object_entries_show_parents = "hide"
+highlight_language = "none"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True

@@ -28,7 +28,9 @@ def drawn(node: nodes.Node, *, inline: bool) -> str:
         logger.warning("formula %r cannot be drawn: %r", source, error, location=node)
         return f"<code>{html.escape(source)}</code>"
     label = html.escape(source, quote=True)
-    return picture.replace("<svg ", f'<svg role="img" aria-label="{label}" style="vertical-align:{below:.1f}px" ', 1)
+    return picture.replace(
+        "<svg ", f'<svg role="img" aria-label="{label}" style="vertical-align:{below:.1f}px" ', 1
+    )
 
 
 def visit_inline(self: Any, node: nodes.math) -> None:
@@ -39,7 +41,9 @@ def visit_inline(self: Any, node: nodes.math) -> None:
 def visit_block(self: Any, node: nodes.math_block) -> None:
     anchors = "".join(f' id="{name}"' for name in node.get("ids", [])[:1])
     number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
-    self.body.append(f'<div class="equation"{anchors}><span>{drawn(node, inline=False)}</span>{number}</div>\n')
+    self.body.append(
+        f'<div class="equation"{anchors}><span>{drawn(node, inline=False)}</span>{number}</div>\n'
+    )
     raise nodes.SkipNode
 
 

@@ -3,11 +3,14 @@
 reference/api/*.md           a page for each room of the package, with all its public modules
 generated/command-line.md    every verb and option, as the program's own help states them
 generated/rooms.md           the order of the rooms, as tests/test_imports.py enforces it
+generated/python.md          the names of ``import polarguide``
 """
 
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
 import os
 import pkgutil
 import re
@@ -43,6 +46,12 @@ def source_of(name: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
+def exists(name: str) -> bool:
+    """Whether there is such a module or package."""
+    path = source_of(name)
+    return path.exists() or path.name == "__init__.py"
+
+
 def summary(name: str) -> str:
     """First sentence of a module's docstring, without a full stop; empty where it has none."""
     path = source_of(name)
@@ -64,7 +73,8 @@ def module_section(name: str, level: int) -> str:
     """A heading and everything public that a module defines itself."""
     is_package = source_of(name).name == "__init__.py"
     members = "" if is_package else "\n   :members:\n   :ignore-module-all:"
-    return f"{'#' * level} `{name}`\n\n```{{eval-rst}}\n.. automodule:: {name}{members}\n```\n"
+    title = name if level == 1 else name.removeprefix(f"{PACKAGE}.")
+    return f"{'#' * level} `{title}`\n\n```{{eval-rst}}\n.. automodule:: {name}{members}\n```\n"
 
 
 def api_pages(docs: Path) -> dict[str, str]:
@@ -72,7 +82,7 @@ def api_pages(docs: Path) -> dict[str, str]:
     pages, alone = {}, []
     for room in rooms(docs):
         name = f"{PACKAGE}.{room}"
-        if room in NOT_LIBRARY:
+        if room in NOT_LIBRARY or not exists(name):
             continue
         if source_of(name).name != "__init__.py":
             alone.append(name)
@@ -83,9 +93,13 @@ def api_pages(docs: Path) -> dict[str, str]:
     ground = "\n".join(module_section(name, 2) for name in alone)
     pages["ground-floor"] = f"# Ground floor\n\nModules that every room may use.\n\n{ground}"
     order = ["ground-floor", *(room for room in rooms(docs) if room in pages)]
-    lines = [f"| [`{PACKAGE}.{room}`]({room}.md) | {escaped(summary(f'{PACKAGE}.{room}'))} |" for room in order[1:]]
+    lines = [
+        f"| [`{PACKAGE}.{room}`]({room}.md) | {escaped(summary(f'{PACKAGE}.{room}'))} |" for room in order[1:]
+    ]
     index = ["# The library, room by room", "", "| room | what is in it |", "|---|---|"]
-    index += ["| [ground floor](ground-floor.md) | Errors, cameras, vectors and other things that every room may use |"]
+    index += [
+        "| [ground floor](ground-floor.md) | Errors, cameras, vectors and other things that every room may use |"
+    ]
     contents = ["```{toctree}", ":hidden:", "", *order, "```"]
     pages["index"] = "\n".join([*index, *lines, "", *contents]) + "\n"
     return pages
@@ -105,6 +119,23 @@ def rooms_table(docs: Path) -> str:
     for number, room in enumerate(rooms(docs), 1):
         lines.append(f"| {number} | `{room}` | {escaped(summary(f'{PACKAGE}.{room}'))} |")
     return "\n".join(lines) + "\n"
+
+
+def public_names() -> str:
+    """Every name of ``import polarguide``, described where it stands."""
+    package = importlib.import_module(PACKAGE)
+    directives = []
+    for name in package.__all__:
+        found = getattr(package, name)
+        if name.startswith("_") or inspect.ismodule(found):
+            continue
+        if inspect.isclass(found):
+            directives.append(f".. autoclass:: {PACKAGE}.{name}\n   :members:\n")
+        elif callable(found):
+            directives.append(f".. autofunction:: {PACKAGE}.{name}\n")
+        else:
+            directives.append(f".. autodata:: {PACKAGE}.{name}\n")
+    return "```{eval-rst}\n" + "\n".join(directives) + "```\n"
 
 
 def help_of(*verb: str) -> str:
@@ -136,8 +167,8 @@ def entries(lines: list[str]) -> list[tuple[str, str]]:
     found: list[tuple[str, str]] = []
     for line in lines:
         if line[:1].strip():
-            name, _, text = (part.strip() for part in re.split(r"(\s{2,})", line, maxsplit=1)) if "  " in line else (line.strip(), "", "")
-            found.append((name, text))
+            name, *text = re.split(r"\s{2,}", line.rstrip(), maxsplit=1)
+            found.append((name, "".join(text)))
         elif found and line.strip():
             name, text = found[-1]
             found[-1] = name, f"{text} {line.strip()}".strip()
@@ -189,6 +220,7 @@ def generate(app: Sphinx) -> None:
     for name, text in pages.items():
         write(api / f"{name}.md", text)
     write(docs / "generated" / "rooms.md", rooms_table(docs))
+    write(docs / "generated" / "python.md", public_names())
     write(docs / "generated" / "command-line.md", command_line())
 
 

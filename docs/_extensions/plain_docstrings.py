@@ -48,7 +48,13 @@ def process(app: Sphinx, what: str, name: str, found: Any, options: Any, lines: 
     lines[:] = plain(lines)
 
 
+def skip(app: Sphinx, what: str, name: str, found: Any, skipped: bool, options: Any) -> bool | None:
+    """Fields of named tuples have no text of their own: the class describes them."""
+    return True if (getattr(found, "__doc__", None) or "").startswith("Alias for field number") else None
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     # Before napoleon, which turns the sections of a docstring into reStructuredText.
     app.connect("autodoc-process-docstring", process, priority=400)
+    app.connect("autodoc-skip-member", skip)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
