@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import re
-from typing import Any
+import sys
+from typing import Any, TypeVar
 
 from sphinx.application import Sphinx
 
@@ -21,6 +23,33 @@ def escaped(line: str) -> str:
 def indentation(line: str) -> int:
     """Spaces before the text."""
     return len(line) - len(line.lstrip())
+
+
+def names_of(found: Any) -> set[str]:
+    """What a docstring may describe entry by entry: parameters of a function, fields of a class."""
+    try:
+        parameters = set(inspect.signature(found).parameters)
+    except (TypeError, ValueError):
+        parameters = set()
+    return parameters | set(getattr(found, "__annotations__", {}))
+
+
+def one_each(lines: list[str], names: set[str]) -> list[str]:
+    """Entries that share a line, ``width: pixels. height: pixels.``, each on a line of its own."""
+    if not names:
+        return lines
+    name = "(?:" + "|".join(map(re.escape, sorted(names))) + ")"
+    boundary = re.compile(rf"(?<=[.;,]) (?={name}(?:, {name})*: )")
+    result: list[str] = []
+    entry = ""  # indentation of the entries of the section that is being read
+    for number, line in enumerate(lines):
+        if line.strip() in ("Args:", "Attributes:") and number + 1 < len(lines):
+            entry = " " * indentation(lines[number + 1])
+        elif line.strip() and indentation(line) < len(entry):
+            entry = ""
+        first, *others = boundary.split(line) if entry else [line]
+        result += [first, *(entry + other for other in others)]
+    return result
 
 
 def plain(lines: list[str]) -> list[str]:
@@ -45,7 +74,7 @@ def plain(lines: list[str]) -> list[str]:
 
 
 def process(app: Sphinx, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
-    lines[:] = plain(lines)
+    lines[:] = one_each(plain(lines), names_of(found))
 
 
 def skip(app: Sphinx, what: str, name: str, found: Any, skipped: bool, options: Any) -> bool | None:
@@ -53,8 +82,15 @@ def skip(app: Sphinx, what: str, name: str, found: Any, skipped: bool, options: 
     return True if (getattr(found, "__doc__", None) or "").startswith("Alias for field number") else None
 
 
+def leave_type_variables(app: Sphinx, environment: Any, node: Any, text: Any) -> Any:
+    """A type variable has no page: it is shown as it is."""
+    module, _, name = node.get("reftarget", "").rpartition(".")
+    return text if isinstance(getattr(sys.modules.get(module), name, None), TypeVar) else None
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     # Before napoleon, which turns the sections of a docstring into reStructuredText.
     app.connect("autodoc-process-docstring", process, priority=400)
     app.connect("autodoc-skip-member", skip)
+    app.connect("missing-reference", leave_type_variables)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
