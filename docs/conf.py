@@ -50,8 +50,8 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False
-# One entry may describe several names ("width, height: ..."), which Sphinx' own field lists do not know; and a public class
-# stands both in the interface and in its room, so that its bare name leads nowhere.
+# One entry may describe several names ("width, height: ..."), which Sphinx' own field lists do not know. And a public
+# class stands both in the interface and in its room, so that its bare name leads nowhere.
 napoleon_custom_sections = [("Attributes", "params_style"), ("Raises", "params_style")]
 
 html_theme = "furo"
