@@ -17,6 +17,7 @@ from polarguide.cli.common import open_run
 from polarguide.color import srgb_encode
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.gaussians.ply import read_ply
+from polarguide.raster import Splats
 from polarguide.runs.folder import PLY
 
 
@@ -35,14 +36,14 @@ def main() -> None:
         colors = evaluate_sh(
             file["means"], view.camera.center, file["sh_dc"][:, 0].contiguous(), file["sh_rest"], 3
         )
-        baked = opened.backend.rasterize(
+        splats = Splats(
             file["means"],
             file["quaternions"],
             file["log_scales"].exp(),
             torch.sigmoid(file["opacity_logits"]),
             (colors + 0.5).clamp(min=0),
-            view.camera,
-        ).features.clamp(0, 1)
+        )
+        baked = opened.backend.rasterize(splats, view.camera).features.clamp(0, 1)
         diffuse = result.base if result.diffuse is None else result.diffuse
         final = srgb_encode(result.final.clamp(0, 1))
         scores.append((psnr(baked, final), psnr(srgb_encode(diffuse.clamp(0, 1)), final)))

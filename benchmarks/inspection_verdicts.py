@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.inspection.angle_checks import order_check, weigh, zero_check
+from polarguide.inspection.capture import Capture, read_capture
 from polarguide.inspection.orders import ORDERS
 from polarguide.inspection.picture_checks import pairing_of, picture_checks
-from polarguide.inspection.pictures import Capture, read_capture
 from polarguide.inspection.points import point_evidence
 from polarguide.inspection.readings import read_view_figures
+from polarguide.polarizer import ANGLES
 
 Change = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -53,7 +54,7 @@ def turned(degrees: float) -> Change:
 
 def misnamed(files: tuple[int, int, int, int]) -> Change:
     """Pictures called 0, 45, 90, 135 that were taken at ``files``."""
-    return lambda values: values[[(0, 45, 90, 135).index(angle) for angle in files]]
+    return lambda values: values[[ANGLES.index(angle) for angle in files]]
 
 
 def encoded(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -97,7 +98,7 @@ def main() -> None:
         plants: dict[str, Change] = {
             "untouched": lambda values: values,
             "gamma": encoded,
-            **{f"5 % at {(0, 45, 90, 135)[k]}": exposed(k) for k in range(4)},
+            **{f"5 % at {ANGLES[k]}": exposed(k) for k in range(4)},
             "overexposed x3": lambda values: values * 3,
         }
         for name, change in plants.items():

@@ -15,14 +15,12 @@ import torch
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.raster.cpu import native_rasterizer
-from polarguide.raster.interface import ScreenStatistic
+from polarguide.raster.interface import ScreenStatistic, Splats
 
 FLOP_PER_PAIR = 150
 
 
-def scene(
-    count: int, width: int, height: int, channels: int, sigma: float
-) -> tuple[list[torch.Tensor], Camera]:
+def scene(count: int, width: int, height: int, channels: int, sigma: float) -> tuple[Splats, Camera]:
     """Gaussians of about ``sigma`` pixels, spread over the picture, of mixed shape and opacity."""
     generator = torch.Generator().manual_seed(0)
     camera = Camera(
@@ -32,10 +30,10 @@ def scene(
     x = (torch.rand(count, generator=generator) - 0.5) * depth
     y = (torch.rand(count, generator=generator) - 0.5) * depth * height / width
     scales = sigma / width * depth[:, None] * torch.exp(0.4 * torch.randn(count, 3, generator=generator))
-    quats = torch.randn(count, 4, generator=generator)
+    rotations = torch.randn(count, 4, generator=generator)
     opacities = 0.05 + 0.6 * torch.rand(count, generator=generator)
     features = torch.rand(count, channels, generator=generator)
-    return [torch.stack((x, y, depth), dim=1), quats, scales, opacities, features], camera
+    return Splats(torch.stack((x, y, depth), dim=1), rotations, scales, opacities, features), camera
 
 
 def main() -> None:
@@ -50,21 +48,21 @@ def main() -> None:
     print(f"{_native.simd()}, {_native.thread_count()} threads, peak {peak / 1e9:.0f} GFLOP/s")
     print("| D | pairs | forward ms | backward ms | Mpairs/s | of peak |\n|---|---|---|---|---|---|")
     for channels in (3, 7, 8, 12):
-        inputs, camera = scene(arguments.gaussians, width, height, channels, arguments.sigma)
+        splats, camera = scene(arguments.gaussians, width, height, channels, arguments.sigma)
         statistic = ScreenStatistic((0, 1, 2))
         rasterizer = native_rasterizer(camera, channels, statistic)
         out, alpha = torch.empty(height, width, channels), torch.empty(height, width)
         radii, screen = torch.empty(arguments.gaussians), torch.empty(arguments.gaussians, 2)
         grad_out, grad_alpha = torch.randn_like(out), torch.randn_like(alpha)
-        gradients = [torch.empty_like(t) for t in inputs]
-        rasterizer.forward(*inputs, out, alpha, radii, count_pairs=True)
+        gradients = [torch.empty_like(t) for t in splats]
+        rasterizer.forward(*splats, out, alpha, radii, count_pairs=True)
         pairs = rasterizer.pairs
         forward, backward = [], []
         for _ in range(arguments.repeats):
             start = time.perf_counter()
-            rasterizer.forward(*inputs, out, alpha, radii)
+            rasterizer.forward(*splats, out, alpha, radii)
             middle = time.perf_counter()
-            rasterizer.backward(*inputs, out, grad_out, grad_alpha, *gradients, screen)
+            rasterizer.backward(*splats, out, grad_out, grad_alpha, *gradients, screen)
             forward.append(middle - start)
             backward.append(time.perf_counter() - middle)
         f, b = statistics.median(forward[5:]), statistics.median(backward[5:])

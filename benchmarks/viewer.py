@@ -25,8 +25,8 @@ from polarguide.shading.result import LAYERS
 from polarguide.trajectory import orbit
 from polarguide.viewer import shown_run
 from polarguide.viewer.appearance import Appearance, Painter
-from polarguide.viewer.lens import fit
-from polarguide.viewer.visitor import JPEG_QUALITY
+from polarguide.viewer.session import JPEG_QUALITY
+from polarguide.viewer.viewport import fit
 
 SKIPPED = 3
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from polarguide.capture import Scene
 from polarguide.color import srgb_encode
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
-from polarguide.raster import Backend
+from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
 from polarguide.shading.deferred import render
 from polarguide.training.photometric import photometric_loss
@@ -99,24 +99,20 @@ class Ours:
         """The rasterizer, SSIM and the optimizer of a step by themselves, as calls."""
         trainer, rows = self.trainer, self.trainer.state.gaussians
         view = trainer._view_of(trainer.state.step)
-        leaves = [
+        inputs = Splats(
             rows["means"],
             rows["quaternions"],
             rows["log_scales"].exp(),
             torch.sigmoid(rows["opacity_logits"]),
-        ]
-        leaves = [t.detach().requires_grad_() for t in leaves]
-        features = torch.rand(len(rows), 8, device=leaves[0].device).requires_grad_()
+            torch.rand(len(rows), 8, device=rows["means"].device),
+        )
+        splats = Splats(*(t.detach().requires_grad_() for t in inputs))
         shown = trainer._shown_photograph(view).picture
         prediction = shown.clone().requires_grad_()
 
         def raster() -> None:
-            from polarguide.raster import ScreenStatistic
-
-            picture = trainer.backend.rasterize(
-                *leaves, features, view.camera, statistic=ScreenStatistic((0, 1, 2))
-            )
-            torch.autograd.grad((picture.features.sum() + picture.alpha.sum()), (*leaves, features))
+            picture = trainer.backend.rasterize(splats, view.camera, statistic=ScreenStatistic((0, 1, 2)))
+            torch.autograd.grad((picture.features.sum() + picture.alpha.sum()), splats)
 
         def ssim() -> None:
             weights = self.stage.weights

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Mapping
 from functools import cached_property
@@ -14,7 +13,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.record import validate_metrics
+from polarguide.evaluation.record import read_metrics
 from polarguide.raster import DeviceName
 from polarguide.runs.opened import TrainedRun, open_trained
 from polarguide.shading.result import LAYERS, RenderResult
@@ -134,16 +133,7 @@ class Model:
         Raises:
             PolarguideError: the run has not been scored, or the file is not such a record.
         """
-        path = self.folder / "metrics.json"
-        try:
-            record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            found = "none" if isinstance(error, FileNotFoundError) else f"something else ({error})"
-            raise PolarguideError(
-                path, expected="the scores of a run", found=found, remedy="Run polarguide eval."
-            ) from None
-        validate_metrics(record, where=path)
-        return record
+        return read_metrics(self.folder)
 
 
 def load(

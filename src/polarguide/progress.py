@@ -1,13 +1,25 @@
-"""How long work says what it does; silent unless the command line puts a console behind it."""
+"""How long work says what it does; silent unless somebody listens, as the command line does."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from typing import Protocol
+
+
+class Advance(Protocol):
+    """Takes how far a piece of work is."""
+
+    def __call__(self, done: int, *, total: int | None = None, note: str = "") -> None:
+        """``done`` so far, of ``total`` if that has become known, and a few words about it."""
+
+
+def _ignore(done: int, *, total: int | None = None, note: str = "") -> None:
+    pass
 
 
 class Reporter:
-    """Where messages and progress go."""
+    """Where messages and progress go. This one drops them; derive from it to show them."""
 
     def say(self, text: str) -> None:
         """A finding, as a plain sentence."""
@@ -16,6 +28,13 @@ class Reporter:
         """Something the user should know before going on."""
 
     @contextlib.contextmanager
-    def track(self, label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-        """Progress of one piece of work; yields a function that takes what has been done so far."""
-        yield lambda done: None
+    def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
+        """Progress of one piece of work; yields a function that takes what has been done so far.
+
+        Args:
+            label: what is done. total: how much there is to do; None where that is not known yet.
+        """
+        yield _ignore
+
+
+SILENT = Reporter()

@@ -11,7 +11,6 @@ import pytest
 
 from polarguide.cli.app import run
 
-ANGLES = (0, 45, 90, 135)
 CELL = ((90, 45), (135, 0))
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polarguide.inspection.pictures import Capture, read_capture
-
-ANGLES = (0, 45, 90, 135)
+from polarguide.inspection.capture import Capture, read_capture
+from polarguide.polarizer import ANGLES
 
 
 def soft_intensities(seed: int, size: tuple[int, int] = (60, 80)) -> np.ndarray:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import Scene, View
-from polarguide.raster import rasterize_reference
+from polarguide.raster import Splats, rasterize_reference
 from polarguide.recipes import RECIPES
 from polarguide.training.recipe import Recipe, Repeat, Stage, Weights
 
@@ -48,17 +48,18 @@ def make_scene() -> Scene:
 
     means = torch.randn(GAUSSIANS, 3, generator=generator) * 0.5
     features = torch.cat((uniform(GAUSSIANS, 3), 0.8 * (uniform(GAUSSIANS, 2) - 0.5)), dim=1)
-    gaussians = (
+    splats = Splats(
         means,
         uniform(GAUSSIANS, 4) - 0.5,
         0.15 + 0.4 * uniform(GAUSSIANS, 3),
         0.5 + 0.4 * uniform(GAUSSIANS),
+        features,
     )
     nowhere = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     views = []
     for index in range(VIEWS):
         camera = circling(2 * math.pi * index / VIEWS)
-        picture = rasterize_reference(*gaussians, features, camera)
+        picture = rasterize_reference(splats, camera)
         codes = polarized_codes(picture.features, picture.alpha)
         views.append(View(f"v{index}", camera, codes, nowhere, nowhere))
     return Scene(

@@ -14,9 +14,10 @@ from polarguide.capture.calibration import Calibration, oriented
 from polarguide.errors import PolarguideError
 from polarguide.inspection import fix
 from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.capture import read_capture
 from polarguide.inspection.likelihood import Odds
 from polarguide.inspection.orders import ORDERS, PAIRINGS
-from polarguide.inspection.pictures import read_capture
+from polarguide.polarizer import ANGLES
 
 
 def decided(order: int, offset: float = 0.0, error: float = 0.1, p: float = 0.99, pairing: int = 0) -> Angles:
@@ -37,7 +38,7 @@ def hashes(root: Path) -> dict[str, str]:
 def test_misnamed_files_get_their_names_back_byte_by_byte(tmp_path, order: int, pairing: int) -> None:
     right = write_scene(tmp_path / "right")
     files = ORDERS[order].files(PAIRINGS[pairing])
-    places = [(0, 45, 90, 135).index(angle) for angle in files]
+    places = [ANGLES.index(angle) for angle in files]
     root = write_scene(tmp_path / "wrong", lambda values: values[places])
     (root / "split.json").write_text('{"test": ["v0"]}')
     (root / "masks").mkdir()

@@ -297,7 +297,7 @@ def test_views_with_blanks_and_umlauts(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("{", "expected a JSON file"),
-        ("[]", "a JSON list"),
+        ("[]", r"a JSON object .* found \[\]"),
         ('{"gain": 1}', "the key 'gain'"),
         ('{"gains": {"0": 1}}', "the gains"),
         ('{"gains": {"0": 1, "45": 1, "90": "x", "135": 1}}', "could not convert"),

@@ -1,4 +1,4 @@
-"""What a visitor sees, against the renderer itself."""
+"""What the viewer shows, against the renderer itself."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 from random_runs import KINDS, ring
-from sights import around, photograph, shown
+from viewer_scenes import frame_of_scene, photograph, shown
 
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.appearance import MEASURED, Appearance, Crop, Painter
-from polarguide.viewer.lens import fit
+from polarguide.viewer.viewport import letterbox
 from polarguide.visualization import figures
 
 CAMERAS = ring()
@@ -24,7 +24,7 @@ PLAIN = Appearance()
 
 
 def paint(seen, appearance=PLAIN, view=None, camera=CAMERA, **named):
-    return Painter(around()).paint(seen, camera, appearance, view, **named)
+    return Painter(frame_of_scene()).paint(seen, camera, appearance, view, **named)
 
 
 @pytest.mark.parametrize("recipe", KINDS)
@@ -90,11 +90,11 @@ def test_a_crop_shows_what_is_inside():
 
 
 def test_a_crops_corners_are_inside_and_a_bit_more_is_not():
-    place, crop = around(), Crop((-0.5, -0.25, -1), (0.5, 0.75, 0.1))
-    corners = crop.corners(place)
+    placement, crop = frame_of_scene(), Crop((-0.5, -0.25, -1), (0.5, 0.75, 0.1))
+    corners = crop.corners(placement)
     middle = corners.mean(dim=0)
-    assert crop.inside(middle + 0.999 * (corners - middle), place).all()
-    assert not crop.inside(middle + 1.001 * (corners - middle), place).any()
+    assert crop.inside(middle + 0.999 * (corners - middle), placement).all()
+    assert not crop.inside(middle + 1.001 * (corners - middle), placement).any()
 
 
 def test_at_a_photograph_the_pose_is_the_photographs():
@@ -102,7 +102,7 @@ def test_at_a_photograph_the_pose_is_the_photographs():
     view = photograph("v2", CAMERAS["v2"], seen).view
     window = replace(CAMERA, width=200, height=90)
     picture = paint(seen, view=view, camera=window)
-    expected = fit(view.camera, (200, 90)).camera(view.camera)
+    expected = letterbox(view.camera, (200, 90)).camera(view.camera)
     assert np.array_equal(picture, paint(seen, camera=expected))
 
 
@@ -125,7 +125,7 @@ def test_what_was_measured_there():
 
 
 def test_colors_of_depths_stay_while_the_camera_moves():
-    seen, painter, depth = shown(), Painter(around()), Appearance(layer="depth")
+    seen, painter, depth = shown(), Painter(frame_of_scene()), Appearance(layer="depth")
     first = painter.paint(seen, CAMERA, depth)
     nearer = replace(CAMERA, translation=0.7 * CAMERA.translation)
     moving = painter.paint(seen, nearer, depth, settled=False)

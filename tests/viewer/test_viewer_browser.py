@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from browsers import PATIENCE, chromium
 from random_runs import ring
-from sights import photograph, shown
+from viewer_scenes import photograph, shown
 
 from polarguide.viewer import Viewer
 from polarguide.visualization import figures
@@ -123,8 +123,8 @@ def test_dragging_turns_the_scene(opened):
 
 
 def test_a_path_and_a_picture_are_downloaded(opened):
-    opened.page.get_by_text("Picture and path", exact=True).click()
-    opened.page.get_by_role("button", name="Add this pose").click()
+    opened.page.get_by_text("Picture and camera path", exact=True).click()
+    opened.page.get_by_role("button", name="Add keyframe").click()
     with opened.page.expect_download() as path:
         opened.page.get_by_role("button", name="Save path").click()
     assert path.value.suggested_filename == "camera_path.json"

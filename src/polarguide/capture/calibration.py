@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.pictures import read_file
-from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
-from polarguide.records import parse_json
+from polarguide.polarizer import ANGLES, four_intensities, stokes_of_four
+from polarguide.records import read_record
 
 Gains = tuple[float, float, float, float]
 UNIT_GAINS: Gains = (1.0, 1.0, 1.0, 1.0)
@@ -92,7 +91,7 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         PolarguideError: the file cannot be read, has unknown keys or values that make no sense.
     """
-    content = parse_json(path, read_file(path))
+    content = read_record(path, dict[str, Any])
     unknown = sorted(content.keys() - {"gains", "order", "sense", "zero"})
     try:
         if unknown:
@@ -163,9 +162,7 @@ def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDAr
     placed = intensities[[targets.index(angle) for angle in ANGLES]]
     if calibration.permutes:
         return placed
-    i0, i45, i90, i135 = placed
-    s0, s1, s2 = placed.sum(axis=0) / 2, i0 - i90, i45 - i135
+    s0, s1, s2 = stokes_of_four(placed)
     cosine, sine = (f(2.0 * math.radians(calibration.zero)) for f in (math.cos, math.sin))
-    turned1, turned2 = s1 * cosine - s2 * sine, s1 * sine + s2 * cosine
-    out = np.stack([s0 + turned1, s0 + turned2, s0 - turned1, s0 - turned2]) / 2
-    return np.maximum(out, 0.0).astype(np.float32)
+    turned = four_intensities((s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine))
+    return np.maximum(np.stack(turned), 0.0).astype(np.float32)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -20,6 +20,7 @@ from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
 from polarguide.experiments.jobs import STDERR, Job, run_jobs
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
 from polarguide.experiments.report_views import REPORT, write_report
+from polarguide.experiments.results import Results
 from polarguide.experiments.study import read_study, study_svg
 from polarguide.raster import DeviceName, choose_backend
 from polarguide.recipes import recipe_named
@@ -128,7 +129,7 @@ def run_comparison(comparison: Comparison) -> None:
         )
 
 
-def _write_study(comparison: Comparison, scenes: Sequence[SceneEntry], results: Mapping[str, Any]) -> None:
+def _write_study(comparison: Comparison, scenes: Sequence[SceneEntry], results: Results) -> None:
     """Where the scenes are a family of ``polarguide synth --sweep``: the scores over the number under study."""
     drawn = study_svg(results, {scene.name: read_study(scene.path) for scene in scenes})
     if drawn is not None:

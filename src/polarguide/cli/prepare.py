@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import cv2
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from polarguide.capture.calibration import Calibration, read_calibration
 from polarguide.cli.common import console, use_threads
+from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
-from polarguide.preparation import ORIGINS, PrepareSettings, Reporter, prepare_scene
+from polarguide.preparation import ORIGINS, PrepareSettings, prepare_scene
 
 
 def prepare(
@@ -113,27 +111,6 @@ def prepare(
         console.print(f"next: polarguide train {done.folder} --out runs/{done.folder.name}", markup=False)
     else:
         console.print("it has no poses: repeat the command with --poses sfm or --poses PATH", markup=False)
-
-
-class ConsoleReporter(Reporter):
-    """Messages and progress bars on the console."""
-
-    def say(self, text: str) -> None:
-        """A finding, as a plain sentence."""
-        console.print(text, markup=False)
-
-    def warn(self, text: str) -> None:
-        """Something the user should know before going on."""
-        console.print("[yellow]warning:[/] ", end="")
-        console.print(text, markup=False)
-
-    @contextlib.contextmanager
-    def track(self, label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-        """A progress bar."""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console, transient=True) as progress:
-            task = progress.add_task(label, total=total)
-            yield lambda done: progress.update(task, completed=done)
 
 
 def _calibration(path: Path | None, order: str | None, sense: str | None, zero: float | None) -> Calibration:

@@ -16,9 +16,8 @@ from typing import Any, Literal
 
 from polarguide import __version__
 from polarguide.cli.common import Transfer, read_scene
-from polarguide.cli.evaluate import METRICS
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import validate_metrics
+from polarguide.evaluation import read_metrics
 from polarguide.evaluation.sources import scoring_digest, training_digest
 from polarguide.raster import DeviceName
 from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration, recipe_data
@@ -115,9 +114,8 @@ class PlannedRun:
     def metrics(self) -> dict[str, Any] | None:
         """The record of its scores, or None where there is no valid one by this version."""
         try:
-            record = json.loads((self.folder / METRICS).read_text(encoding="utf-8"))
-            validate_metrics(record)
-        except (OSError, ValueError, KeyError, PolarguideError):
+            record = read_metrics(self.folder)
+        except (OSError, PolarguideError):
             return None
         whole = record["steps"] == self.settings.steps
         return record if whole and record["provenance"].get("sources") == scoring_digest() else None

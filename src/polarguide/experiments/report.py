@@ -10,6 +10,7 @@ from string import Template
 from typing import Any
 
 from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash
+from polarguide.experiments.results import Results
 from polarguide.experiments.tables import Block, ShownCell, blocks, notes, shown_columns
 from polarguide.visualization.embedded import LAYERS, EmbeddedView
 from polarguide.visualization.figures import color_gradient
@@ -26,7 +27,7 @@ LEGEND = {
 
 
 def report_html(
-    results: Mapping[str, Any],
+    results: Results,
     views: Sequence[EmbeddedView],
     curves: Mapping[str, Sequence[Curve]],
     remarks: Sequence[str] = (),
@@ -66,7 +67,7 @@ def _page(name: str) -> str:
     return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")
 
 
-def _summary(results: Mapping[str, Any]) -> str:
+def _summary(results: Results) -> str:
     settings, counts = results["settings"], {k: len(results[k]) for k in ("scenes", "recipes", "runs")}
 
     def plural(count: int, word: str) -> str:
@@ -91,7 +92,7 @@ def _list(texts: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{html.escape(text)}</li>" for text in texts) + "</ul>" if texts else ""
 
 
-def _tables(results: Mapping[str, Any]) -> str:
+def _tables(results: Results) -> str:
     headings = "".join(
         f"<th>{html.escape(column.label)}<br>{html.escape(' '.join((column.unit, column.arrow)))}</th>"
         for column in shown_columns(results)
@@ -115,7 +116,7 @@ def _cell(cell: ShownCell) -> str:
     return f"<td>{value}{f' <small>± {spread}</small>' if spread else ''}</td>"
 
 
-def _curves(results: Mapping[str, Any], curves: Mapping[str, Sequence[Curve]]) -> str:
+def _curves(results: Results, curves: Mapping[str, Sequence[Curve]]) -> str:
     parts = []
     for scene, drawn in curves.items():
         if not drawn:
@@ -135,7 +136,7 @@ def _curves(results: Mapping[str, Any], curves: Mapping[str, Sequence[Curve]]) -
     return "".join(parts)
 
 
-def _recipes(results: Mapping[str, Any]) -> str:
+def _recipes(results: Results) -> str:
     return "".join(
         f"<details><summary><code>{html.escape(recipe['name'])}</code> {html.escape(recipe['about'])}</summary>"
         f"<pre>{html.escape(json.dumps(recipe['data'], indent=1))}</pre></details>"
@@ -143,7 +144,7 @@ def _recipes(results: Mapping[str, Any]) -> str:
     )
 
 
-def _provenance(results: Mapping[str, Any]) -> str:
+def _provenance(results: Results) -> str:
     facts = {**results["provenance"], **results["settings"]}
     rows = [
         (key.replace("_", " "), "unknown" if value is None else str(value)) for key, value in facts.items()

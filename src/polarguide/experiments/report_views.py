@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,9 +10,12 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.cli.common import OpenRun, console, open_run, read_scene
 from polarguide.evaluation.metrics import normal_angles_deg
+from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import Curve, read_curve
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
 from polarguide.experiments.report import ERROR_HIGH, NORMAL_ERROR_HIGH, report_html
+from polarguide.experiments.results import Results
+from polarguide.experiments.tables import formatted
 from polarguide.files import atomic
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import EmbeddedView, Tile, chosen_views, embed
@@ -24,13 +26,13 @@ PICTURE_BYTES = 28_000_000
 """What all pictures of a report may take, so that the file stays one that can be mailed and opened."""
 GROUND_TRUTH = "ground truth"
 PHOTOGRAPH = "photograph"
-SCORES = {
-    "final": ("psnr", "{:.2f} dB"),
-    "diffuse": ("diffuse_psnr", "{:.2f} dB"),
-    "specular": ("specular_psnr", "{:.2f} dB"),
-    "normal": ("normal_mae_deg", "{:.1f}°"),
-    "error": ("psnr", "{:.2f} dB"),
-    "normal_error": ("normal_mae_deg", "{:.1f}°"),
+LAYER_METRICS = {
+    "final": "psnr",
+    "diffuse": "diffuse_psnr",
+    "specular": "specular_psnr",
+    "normal": "normal_mae_deg",
+    "error": "psnr",
+    "normal_error": "normal_mae_deg",
 }
 """Which score stands beside which layer."""
 
@@ -39,7 +41,7 @@ def write_report(
     comparison: Comparison,
     scenes: Sequence[SceneEntry],
     plan: Sequence[PlannedRun],
-    results: Mapping[str, Any],
+    results: Results,
 ) -> None:
     """Render the pictures of the finished runs and write ``report.html`` in one step."""
     views: list[EmbeddedView] = []
@@ -94,7 +96,7 @@ def _embed_scene(
 
 def _truth_tile(scene: Scene, name: str) -> Tile:
     view = scene.view(name)
-    pictures = {key: value for key, value in ground_truth_pictures(view).items() if key in SCORES}
+    pictures = {key: value for key, value in ground_truth_pictures(view).items() if key in LAYER_METRICS}
     return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
 
 
@@ -111,9 +113,10 @@ def _tile(opened: OpenRun, view: View, scores: Mapping[str, float | None]) -> Ti
     if ground_truth is not None and ground_truth.normal is not None and result.normal is not None:
         angles = normal_angles_deg(result.normal.cpu(), ground_truth.normal)
         pictures["normal_error"] = _angles_picture(angles, ground_truth.mask)
+    by_key = {metric.key: metric for metric in COLUMNS}
     lines = {
-        layer: form.format(value)
-        for layer, (key, form) in SCORES.items()
+        layer: f"{formatted(value, by_key[key])} {by_key[key].unit}"
+        for layer, key in LAYER_METRICS.items()
         if layer in pictures and (value := scores.get(key)) is not None
     }
     return Tile(opened.recipe.name, pictures, lines)

@@ -6,11 +6,12 @@ import html
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import ticks
+from polarguide.experiments.results import Results
 
-SCORES = (("psnr", "PSNR (dB) ↑"), ("normal_mae_deg", "normal error (degrees) ↓"))
+DRAWN = tuple(metric for metric in COLUMNS if metric.key in ("psnr", "normal_mae_deg"))
 NAMES = {
     "views": "training views",
     "noise": "noise (1: exposed to full scale, 2: a quarter of that light)",
@@ -33,7 +34,7 @@ def read_study(scene: Path) -> tuple[str, float] | None:
         return None
 
 
-def study_svg(results: Mapping[str, Any], studies: Mapping[str, tuple[str, float] | None]) -> str | None:
+def study_svg(results: Results, studies: Mapping[str, tuple[str, float] | None]) -> str | None:
     """Every recipe's scores over the number under study, as an SVG file.
 
     Args:
@@ -50,10 +51,10 @@ def study_svg(results: Mapping[str, Any], studies: Mapping[str, tuple[str, float
         return None
     recipes = [recipe["name"] for recipe in results["recipes"]]
     panels: list[str] = []
-    for key, label in SCORES:
-        lines = {recipe: _line(results, recipe, key, values) for recipe in recipes}
+    for metric in DRAWN:
+        lines = {recipe: _line(results, recipe, metric.key, values) for recipe in recipes}
         if any(lines.values()):
-            panels.append(_panel(lines, recipes, label, next(iter(parameters)), len(panels) * WIDTH))
+            panels.append(_panel(lines, recipes, metric.heading, next(iter(parameters)), len(panels) * WIDTH))
     if not panels:
         return None
     legend = [
@@ -67,12 +68,12 @@ def study_svg(results: Mapping[str, Any], studies: Mapping[str, tuple[str, float
     return "".join([head, '<rect class="frame" width="100%" height="100%"/>', *panels, *legend, "</svg>\n"])
 
 
-def _line(results: Mapping[str, Any], recipe: str, key: str, values: Mapping[str, float]) -> list[Point]:
+def _line(results: Results, recipe: str, key: str, values: Mapping[str, float]) -> list[Point]:
     points = []
     for row in results["table"]:
-        mean = row["cells"][key]["mean"]
-        if row["recipe"] == recipe and row["scene"] in values and mean is not None:
-            points.append((values[row["scene"]], float(mean)))
+        mean, value = row["cells"][key]["mean"], values.get(row["scene"] or "")
+        if row["recipe"] == recipe and value is not None and mean is not None:
+            points.append((value, float(mean)))
     return sorted(points)
 
 

@@ -31,15 +31,15 @@ def dielectric_check(readings: Sequence[Readings], pixels: Pixels | None, index:
         "light: leave such areas out with masks, and trust normals there less."
     )
     if pixels is None or len(pixels.aolp) == 0:
-        verdict: Verdict = "look" if above > NOT_DIELECTRIC else "ok"
+        verdict: Verdict = "warning" if above > NOT_DIELECTRIC else "ok"
         said += " Without normals, reflections of a smooth dielectric cannot be told from metal or sky."
-        return Check(key, title, verdict, said, remedy if verdict == "look" else "", figures=figures)
+        return Check(key, title, verdict, said, remedy if verdict == "warning" else "", figures=figures)
     strange = float(unexplained(pixels, index).float().mean())
     figures["unexplained"] = strange
     said += f" Of the pixels with a normal, {strange:.0%} are polarized more than either lobe can be at their zenith."
     if strange <= NOT_DIELECTRIC:
         return Check(key, title, "ok", said, figures=figures)
-    return Check(key, title, "look", said, remedy, figures=figures)
+    return Check(key, title, "warning", said, remedy, figures=figures)
 
 
 def unexplained(pixels: Pixels, index: float) -> torch.Tensor:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera
-from polarguide.inspection.pictures import Capture, Pictures
+from polarguide.inspection.capture import Capture, InspectedView
 
-NEIGHBOURS = 4
+NEIGHBORS = 4
 FEATURES = 3000
 FEWEST_MATCHES = 15
 RATIO = 0.75
@@ -52,7 +52,7 @@ def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
     return {name: float(np.quantile(values, 0.25)) for name, values in sorted(by_view.items())}
 
 
-def _features(view: Pictures) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
     gray = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
     top = max(float(np.percentile(gray, 99.5)), 1.0)
     shown = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
@@ -72,13 +72,13 @@ def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     apart = apart / max(float(np.median(apart)), 1e-12) + 2 * (1 - axes @ axes.T)
     np.fill_diagonal(apart, np.inf)
-    near = np.argsort(apart, axis=1)[:, : min(NEIGHBOURS, len(cameras) - 1)]
+    near = np.argsort(apart, axis=1)[:, : min(NEIGHBORS, len(cameras) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row})
 
 
 def _pair_error(
-    first: Pictures,
-    second: Pictures,
+    first: InspectedView,
+    second: InspectedView,
     features1: tuple[NDArray[np.float64], NDArray[np.float32] | None],
     features2: tuple[NDArray[np.float64], NDArray[np.float32] | None],
     factor: int,

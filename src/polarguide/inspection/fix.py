@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +11,17 @@ import numpy as np
 
 from polarguide import __version__
 from polarguide.capture.calibration import Calibration, oriented
-from polarguide.capture.formats.pictures import read_file
 from polarguide.capture.layout import contents
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
-from polarguide.capture.write import encoded_png, picture_codes
+from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
+from polarguide.files import write_whole, writing
 from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import FileOrder, swaps
-from polarguide.inspection.pictures import Capture
-from polarguide.records import parse_json
+from polarguide.progress import SILENT, Reporter
+from polarguide.records import read_record, to_json
 
 SIDES = ("sparse", "masks", "invalid", "gt", "split.json")
 """What is copied as it is, beside the pictures."""
@@ -48,9 +46,7 @@ def correction(capture: Capture, angles: Angles) -> Calibration | None:
     return None if files == ANGLES and zero == 0.0 else Calibration(order=files, zero=zero)
 
 
-def fix_scene(
-    capture: Capture, change: Calibration, out: Path, advance: Callable[[int], None] = lambda done: None
-) -> str:
+def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Reporter = SILENT) -> str:
     """Write a corrected copy of the scene; the scene itself is left as it is.
 
     A pure exchange copies the files under their right names, byte by byte. A turned zero forms the four
@@ -59,7 +55,7 @@ def fix_scene(
 
     Args:
         capture: as read. change: from ``correction``. out: a folder that does not exist.
-        advance: called with the number of views written.
+        reporter: receives the progress.
 
     Returns:
         What was done, a sentence.
@@ -78,10 +74,11 @@ def fix_scene(
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        guarded(lambda: _write(capture, change, partial, advance), out)
-        if out.is_dir():
-            out.rmdir()
-        guarded(lambda: os.replace(partial, out), out)
+        with writing(out):
+            _write(capture, change, partial, reporter)
+            if out.is_dir():
+                out.rmdir()
+            os.replace(partial, out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return described(change)
@@ -97,7 +94,7 @@ def described(change: Calibration) -> str:
     return " and ".join(parts)
 
 
-def _write(capture: Capture, change: Calibration, folder: Path, advance: Callable[[int], None]) -> None:
+def _write(capture: Capture, change: Calibration, folder: Path, reporter: Reporter) -> None:
     (folder / "polar").mkdir(parents=True)
     for name in SIDES:
         source = capture.root / name
@@ -105,12 +102,13 @@ def _write(capture: Capture, change: Calibration, folder: Path, advance: Callabl
             shutil.copytree(source, folder / name)
         elif source.exists():
             shutil.copy2(source, folder / name)
-    for done, view in enumerate(capture.layout.names):
-        if change.zero:
-            _turn_view(capture, change, folder, view)
-        else:
-            _rename_view(capture, change.order, folder, view)
-        advance(done + 1)
+    with reporter.track("fixing", len(capture.layout.names)) as advance:
+        for done, view in enumerate(capture.layout.names, 1):
+            if change.zero:
+                _turn_view(capture, change, folder, view)
+            else:
+                _rename_view(capture, change.order, folder, view)
+            advance(done)
     write_whole(folder / SCENE, _sidecar(capture, change))
 
 
@@ -125,18 +123,15 @@ def _turn_view(capture: Capture, change: Calibration, folder: Path, view: str) -
     full = int(np.iinfo(data.peak.dtype).max)
     lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
     turned = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
-    for angle, codes in zip(ANGLES, picture_codes(turned, lost), strict=True):
-        write_whole(folder / "polar" / f"{view}_{angle:03d}.png", encoded_png(codes[..., ::-1]))
-    (folder / "invalid").mkdir(exist_ok=True)
     for old in (folder / "invalid").glob(f"{view}.*"):
         old.unlink()
-    write_whole(folder / "invalid" / f"{view}.png", encoded_png(lost.astype(np.uint8) * 255))
+    write_view(folder, view, intensity_codes(turned, lost), lost)
 
 
 def _sidecar(capture: Capture, change: Calibration) -> bytes:
     """``scene.json`` of the copy: that of the scene, and a note on what was changed."""
     path = capture.root / SCENE
-    content: dict[str, Any] = parse_json(path, read_file(path)) if path.exists() else {}
+    content: dict[str, Any] = read_record(path, dict[str, Any]) if path.exists() else {}
     note = {
         "program": f"polarguide {__version__}",
         "from": capture.name,
@@ -146,4 +141,4 @@ def _sidecar(capture: Capture, change: Calibration) -> bytes:
         "scale": 1.0 / change.peak,
     }
     content["corrections"] = [*content.get("corrections", []), note]
-    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
+    return to_json(content)

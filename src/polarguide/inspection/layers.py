@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.inspection.pictures import Pictures
+from polarguide.inspection.capture import InspectedView
 from polarguide.inspection.readings import Readings
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import data_uri
@@ -55,7 +55,7 @@ LAYERS: tuple[Layer, ...] = (
 )  # fmt: skip
 
 
-def layer_uris(view: Pictures) -> dict[str, str]:
+def layer_uris(view: InspectedView) -> dict[str, str]:
     """All layers of a view by key."""
     intensities = view.intensities()
     gray = intensities.mean(dim=-1)
@@ -77,7 +77,7 @@ def layer_uris(view: Pictures) -> dict[str, str]:
     return {key: data_uri(picture, key, SIDE) for key, picture in pictures.items()}
 
 
-def _marked(shown: Picture, view: Pictures) -> Picture:
+def _marked(shown: Picture, view: InspectedView) -> Picture:
     """The photograph in dim gray with its lost pixels in color."""
     dim = (shown.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
     for mask, color in ((view.saturated, SATURATED_COLOR), (view.invalid, INVALID_COLOR)):

@@ -8,8 +8,8 @@ import numpy as np
 
 from polarguide.capture import checks
 from polarguide.capture.view import FULL_CODE, listed
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import PAIRINGS, swaps
-from polarguide.inspection.pictures import Capture
 from polarguide.inspection.readings import POLARIZED, Readings
 from polarguide.inspection.verdict import Check, Verdict
 
@@ -65,7 +65,7 @@ def _pairs(capture: Capture, readings: Sequence[Readings], pairing: int | None) 
         )  # fmt: skip
     off = tuple(r.view for r in readings if r.sum_error > PAIR_ERROR)
     if off:
-        verdict: Verdict = "wrong" if 2 * len(off) > len(readings) else "look"
+        verdict: Verdict = "wrong" if 2 * len(off) > len(readings) else "warning"
         return Check(
             key, title, verdict,
             f"I0 + I90 and I45 + I135 differ by more than {PAIR_ERROR:.0%} of S0 in {len(off)} views "
@@ -93,7 +93,7 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
         if slope < 0
         else "The files look linear but are decoded (or have a curve of their own): try --transfer linear."
     )
-    return Check(key, title, "wrong" if high else "look", said, remedy, figures=figures)
+    return Check(key, title, "wrong" if high else "warning", said, remedy, figures=figures)
 
 
 def _exposure(readings: Sequence[Readings], pairing: int | None) -> Check:
@@ -108,14 +108,14 @@ def _exposure(readings: Sequence[Readings], pairing: int | None) -> Check:
     verdict: Verdict = "ok"
     remedy = ""
     if abs(ratio - 1) > UNEQUAL:
-        verdict = "wrong" if abs(ratio - 1) > VERY_UNEQUAL else "look"
+        verdict = "wrong" if abs(ratio - 1) > VERY_UNEQUAL else "warning"
         said += f" If one picture alone is off, it is by {2 * abs(ratio - 1):.0%}."
         remedy = (
             "Let prepare estimate the gains (it does by default), or measure them on unpolarized light and give "
             "--calibration. Which of the four is off the pair sums cannot tell."
         )
     if off:
-        verdict = "look" if verdict == "ok" else verdict
+        verdict = "warning" if verdict == "ok" else verdict
         said += f" It differs by more than {UNSTEADY:.0%} in {len(off)} views ({listed(list(off))})."
         remedy = remedy or "Look for automatic exposure, flicker, or something that moved between the shots."
     return Check(key, title, verdict, said, remedy, off, figures)
@@ -143,7 +143,7 @@ def _saturation(capture: Capture, readings: Sequence[Readings]) -> Check:
     )
     if not off:
         return Check(key, title, "ok", said, figures=figures)
-    verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "look"
+    verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "warning"
     return Check(
         key, title, verdict, f"{said} Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))}).",
         "Polarization is lost there, and these pixels are left out: expose shorter, keep lamps out of the picture.",
@@ -163,7 +163,7 @@ def _noise(readings: Sequence[Readings]) -> Check:
     figures = {"noise_share": share, "bright": bright}
     if not off:
         return Check(key, title, "ok", said, figures=figures)
-    verdict: Verdict = "wrong" if 2 * len(off) > len(readings) and bright < 0.01 else "look"
+    verdict: Verdict = "wrong" if 2 * len(off) > len(readings) and bright < 0.01 else "warning"
     return Check(
         key, title, verdict, f"{said} Dark or noisy: {len(off)} views ({listed(list(off))}).",
         "Expose longer, with the lowest gain; average several shots.", off, figures,
@@ -180,7 +180,7 @@ def _polarization(readings: Sequence[Readings]) -> Check:
     if share >= LITTLE:
         return Check(key, title, "ok", said, figures=figures)
     return Check(
-        key, title, "wrong" if share < ALMOST_NONE else "look", said,
+        key, title, "wrong" if share < ALMOST_NONE else "warning", said,
         "Polarization says little here. Look at surfaces at a slant (50 to 65 degrees), from lower views; check that "
         "the filter is a linear polarizer the right way round and that exposure was fixed.", figures=figures,
     )  # fmt: skip

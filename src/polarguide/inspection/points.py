@@ -16,10 +16,10 @@ from torch.nn.functional import grid_sample
 
 from polarguide import optics
 from polarguide.capture.colmap.model import ColmapModel
+from polarguide.inspection.capture import InspectedView
 from polarguide.inspection.clusters import cells, cluster_sums
 from polarguide.inspection.likelihood import DEGREES, Evidence
 from polarguide.inspection.orders import PAIRINGS, SENSES
-from polarguide.inspection.pictures import Pictures
 from polarguide.inspection.surfaces import Pixels
 from polarguide.vectors import dot, unit
 
@@ -32,7 +32,7 @@ _LEAST_SCALE = 2e-4
 
 
 def point_evidence(
-    views: tuple[Pictures, ...], model: ColmapModel, index: float, pairing: int = 0
+    views: tuple[InspectedView, ...], model: ColmapModel, index: float, pairing: int = 0
 ) -> tuple[Evidence, Pixels | None]:
     """Score all zeros and both senses by the points of the model.
 
@@ -102,7 +102,7 @@ def _too_few(found: int, index: float) -> str:
 
 
 def _sightings(
-    views: tuple[Pictures, ...], points: Tensor, seen: Tensor, index: float, pairing: int
+    views: tuple[InspectedView, ...], points: Tensor, seen: Tensor, index: float, pairing: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fields in the world and the axes across them, [2, P, V, 2, 3]; weights [P, V]; DoLP and its noise [P, V, 2]."""
     limit = float(optics.diffuse_dolp_limit(index))

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.view import listed
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.epipolar import epipolar_errors, view_errors
-from polarguide.inspection.pictures import Capture
 from polarguide.inspection.verdict import Check, Verdict
 
 TYPICAL_PX, VIEW_PX = 2.0, 2.0
@@ -33,7 +33,7 @@ def pose_check(capture: Capture) -> Check:
     errors = view_errors(epipolar_errors(capture))
     if len(errors) < 3:
         return Check(
-            key, title, "n/a" if not missing else "look",
+            key, title, "n/a" if not missing else "warning",
             f"Too few features match between neighboring views to judge the poses. {len(missing)} views have none.",
             "Structure from motion needs texture that stays put." if missing else "", missing,
             {"views": {}, "without_pose": len(missing)},
@@ -45,15 +45,15 @@ def pose_check(capture: Capture) -> Check:
     verdict: Verdict = "ok"
     remedies = []
     if bad:
-        verdict = "look"
+        verdict = "warning"
         said += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
         remedies.append("Leave these views out, or register them again.")
     if missing:
-        verdict = "look"
+        verdict = "warning"
         said += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
         remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
     if typical > TYPICAL_PX:
-        verdict = "wrong" if typical > 2 * TYPICAL_PX else "look"
+        verdict = "wrong" if typical > 2 * TYPICAL_PX else "warning"
         remedies.append("Refine the model (bundle adjustment), and check that it belongs to these pictures.")
     return Check(key, title, verdict, said, " ".join(remedies), (*bad, *missing), figures)
 
@@ -81,7 +81,7 @@ def coverage_check(capture: Capture) -> Check:
     lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
     if lonely or len(seen) < FEW_VIEWS:
         return Check(
-            key, title, "look", said,
+            key, title, "warning", said,
             "Reconstruction is unsure across gaps: add views, neighbors 15 degrees or less apart.", lonely, figures,
         )  # fmt: skip
     return Check(key, title, "ok", said, figures=figures)

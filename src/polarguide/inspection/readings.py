@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.inspection.pictures import Pictures
+from polarguide.inspection.capture import InspectedView
 
 DARK = 1.0 / 256.0
 """Mean intensity below which a pixel is too dark to say something."""
@@ -54,7 +54,7 @@ class Readings:
         return {**vars(self), "dolp": {"median": self.dolp[0], "p99": self.dolp[1]}}
 
 
-def read_view_figures(view: Pictures, index: float) -> Readings:
+def read_view_figures(view: InspectedView, index: float) -> Readings:
     """Measure one view.
 
     Args:

@@ -17,10 +17,10 @@ from torch.nn.functional import interpolate
 
 from polarguide import optics
 from polarguide.camera import Camera
+from polarguide.inspection.capture import InspectedView
 from polarguide.inspection.clusters import cells, cluster_sums
 from polarguide.inspection.likelihood import DEGREES, Evidence
 from polarguide.inspection.orders import PAIRINGS, SENSES
-from polarguide.inspection.pictures import Pictures
 
 SOURCE = "normals of a short training"
 SAMPLES = 400
@@ -74,7 +74,7 @@ class Pixels:
         return self.dolp > most + 2 * self.noise
 
 
-def surface_pixels(pairs: Iterable[tuple[Pictures, Surface]], pairing: int = 0, seed: int = 0) -> Pixels:
+def surface_pixels(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0, seed: int = 0) -> Pixels:
     """Pixels of all views that have a good normal and certain polarization; at most 400 a view.
 
     Args:

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-Verdict = Literal["ok", "look", "wrong", "n/a"]
-ORDER: tuple[Verdict, ...] = ("n/a", "ok", "look", "wrong")
+Verdict = Literal["ok", "warning", "wrong", "n/a"]
+ORDER: tuple[Verdict, ...] = ("n/a", "ok", "warning", "wrong")
 """From what says nothing to what is worst."""
 
 
@@ -19,7 +19,7 @@ class Check:
     Attributes:
         key: its name in ``inspection.json``.
         title: its name for people.
-        verdict: "ok"; "look" where a person should decide; "wrong"; "n/a" where the capture cannot carry the check.
+        verdict: "ok"; "warning" where a person should decide; "wrong"; "n/a" where the capture cannot carry the check.
         finding: what was found, a sentence or two.
         remedy: what to do; empty where there is nothing to do.
         views: the views it is about, where it is not about all.

@@ -14,7 +14,7 @@ from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded
+from polarguide.files import make_folder, writing
 from polarguide.preparation.folder import SFM, SceneFolder
 from polarguide.preparation.settings import PrepareSettings, check_settings
 from polarguide.preparation.source import Source
@@ -167,12 +167,13 @@ def _write_model(folder: SceneFolder, poses: Poses) -> None:
     partial, final = folder.root / _PARTIAL, folder.root / "sparse"
     for old in (partial, final):
         shutil.rmtree(old, ignore_errors=True)
-    guarded(lambda: (partial / "sparse" / "0").mkdir(parents=True), partial)
+    make_folder(partial / "sparse" / "0")
     poses.write(partial / "sparse" / "0")
     model = read_model(partial)
     for view in poses.views:
         model.camera(view)
-    guarded(lambda: (partial / "sparse").rename(final), final)
+    with writing(final):
+        (partial / "sparse").rename(final)
     shutil.rmtree(partial, ignore_errors=True)
 
 

@@ -13,7 +13,7 @@ from polarguide.camera import Camera
 from polarguide.gaussians.geometry import mirrored_directions, shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.optics import reflectances_from_cosine
-from polarguide.raster.interface import Rasterize, ScreenStatistic
+from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, Parameters, ShadingModel, mirrored
 from polarguide.shading.native import reflect_native
@@ -210,15 +210,14 @@ def render(
         channels.insert(1, axes)
     if depth:
         channels.append(((gaussians["means"] - center) @ pose.rotation[2])[:, None])
-    picture = rasterize(
+    splats = Splats(
         gaussians["means"],
         gaussians["quaternions"],
         gaussians["log_scales"].exp(),
         torch.sigmoid(gaussians["opacity_logits"]),
         torch.cat(channels, dim=1),
-        camera,
-        statistic=statistic,
     )
+    picture = rasterize(splats, camera, statistic=statistic)
     base = picture.features[..., :3]
     normal = picture.features[..., 3:6] if normals or environment is not None else None
     layers = {"final": base}

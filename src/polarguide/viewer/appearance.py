@@ -17,8 +17,8 @@ from polarguide.scene_frame import SceneFrame
 from polarguide.shading.deferred import Shading
 from polarguide.shading.model import Parameters
 from polarguide.shading.result import RenderResult
-from polarguide.viewer.lens import fit
 from polarguide.viewer.shown import Shown
+from polarguide.viewer.viewport import letterbox
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import depth_range, layer_picture
@@ -113,9 +113,9 @@ class Painter:
         if view is None:
             result = self._result(shown, camera, appearance)
             return self._layer(result, camera, appearance, settled=settled)
-        place = fit(view.camera, size)
+        place = letterbox(view.camera, size)
         if layer in MEASURED:
-            return place.placed(self._measured(shown, view, appearance))
+            return place.apply(self._measured(shown, view, appearance))
         camera = place.camera(view.camera)
         return self._layer(self._result(shown, camera, appearance), camera, appearance, settled=settled)
 

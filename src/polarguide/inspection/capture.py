@@ -1,37 +1,32 @@
-"""A capture as the inspection reads it: also one without poses, or with poses for some of its views."""
+"""Read a capture for inspection; it may have no poses, or poses for some of its views only."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import checks
-from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model
-from polarguide.capture.formats.pictures import TRANSFERS, decode_picture, read_file
+from polarguide.capture.colmap.model import ColmapModel, read_model
+from polarguide.capture.formats.pictures import decode_picture, read_file
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import refractive_index_of
+from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
-from polarguide.capture.view_reader import ViewData, read_view
-from polarguide.errors import PolarguideError
-from polarguide.records import parse_json
+from polarguide.progress import SILENT, Reporter
 
 LONGEST = 640
 """Pixels of the longer side that pictures are averaged down to (by whole factors)."""
-_THREADS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class InspectedView:
     """The four pictures of a view, and its pose if it has one.
 
     Attributes:
@@ -78,7 +73,7 @@ class Capture:
     root: Path
     name: str
     layout: Layout
-    views: tuple[Pictures, ...]
+    views: tuple[InspectedView, ...]
     model: ColmapModel | None
     refractive_index: float | None
     factor: int
@@ -88,7 +83,7 @@ class Capture:
     digest: str
 
     @property
-    def posed(self) -> tuple[Pictures, ...]:
+    def posed(self) -> tuple[InspectedView, ...]:
         """The views with a pose."""
         return tuple(view for view in self.views if view.camera is not None)
 
@@ -98,7 +93,7 @@ def read_capture(
     *,
     downscale: int = 0,
     transfer: str = "linear",
-    progress: Callable[[int, int], None] | None = None,
+    reporter: Reporter = SILENT,
 ) -> Capture:
     """Read a scene folder for inspection.
 
@@ -106,49 +101,32 @@ def read_capture(
         path: a folder in a layout that ``load_scene`` reads; a COLMAP model may be missing.
         downscale: side of the pixel boxes to average; 0: until the longer side is at most 640.
         transfer: "linear" or "srgb".
-        progress: called with the number of views read and the number to read.
+        reporter: receives the progress.
 
     Raises:
         PolarguideError: a file cannot be used.
     """
-    if transfer not in TRANSFERS:
-        raise PolarguideError(
-            "transfer", expected="linear or srgb", found=repr(transfer), remedy="Name one of them."
-        )
+    check_transfer(transfer)
     root = Path(path)
     layout = find_layout(root)
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
-    sidecar = root / "scene.json"
-    index = refractive_index_of(
-        sidecar, parse_json(sidecar, read_file(sidecar)) if sidecar.exists() else None
-    )
+    metadata = root / "scene.json"
+    index = refractive_index_of(metadata, read_file(metadata) if metadata.exists() else None)
     factor = downscale or _fitting_factor(layout, names[0])
-    data: list[ViewData] = []
-
-    def read(name: str) -> ViewData:
-        return read_view(layout, name, factor=factor, transfer=transfer)
-
-    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-        for item in pool.map(read, names):
-            data.append(item)
-            if progress is not None:
-                progress(len(data), len(names))
-    full = int(np.iinfo(data[0].peak.dtype).max)
-    _require_one_depth(data)
-    scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), full)
-    lines = sorted(f"{p.relative_to(root)} {digest}" for item in data for p, digest in item.digests.items())
+    stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
+    lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())
     return Capture(
         root=root,
         name=root.resolve().name,
         layout=layout,
-        views=tuple(_pictures(item, model, scale, factor) for item in data),
+        views=tuple(_inspected(stored, number) for number in range(len(names))),
         model=model,
         refractive_index=index,
         factor=factor,
         transfer=transfer,
-        bits=8 if full == 255 else 16,
-        size=data[0].size,
+        bits=8 if stored.largest_value == 255 else 16,
+        size=stored.data[0].size,
         digest=hashlib.sha256("\n".join(lines).encode()).hexdigest(),
     )
 
@@ -159,29 +137,14 @@ def _fitting_factor(layout: Layout, name: str) -> int:
     return max(1, math.ceil(max(height, width) / LONGEST))
 
 
-def _require_one_depth(data: Sequence[ViewData]) -> None:
-    other = [item.name for item in data if item.peak.dtype != data[0].peak.dtype]
-    if other:
-        raise PolarguideError(
-            "pictures",
-            expected=f"one number of bits for all views, that of {data[0].name}",
-            found=f"another in view {other[0]}",
-            remedy="Export all pictures alike.",
-        )
-
-
-def _pictures(item: ViewData, model: ColmapModel | None, scale: int | None, factor: int) -> Pictures:
-    camera = None
-    if model is not None and item.name in model.names:
-        camera = fit_camera(model.camera(item.name), *item.size, folder=model.folder, view=item.name)
-        camera = camera.downscaled(factor) if factor > 1 else camera
-    saturated = item.saturated(scale)
-    return Pictures(
+def _inspected(stored: StoredViews, number: int) -> InspectedView:
+    item = stored.data[number]
+    return InspectedView(
         name=item.name,
         codes=torch.from_numpy(item.codes),
         invalid=torch.from_numpy(item.invalid),
-        saturated=torch.from_numpy(saturated),
-        camera=camera,
-        measures=checks.measure(item.codes, ~(item.invalid | saturated)),
+        saturated=torch.from_numpy(item.saturated(stored.full_scale)),
+        camera=stored.cameras[number],
+        measures=stored.measures[number],
         peak=int(item.peak.max()),
     )

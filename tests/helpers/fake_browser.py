@@ -1,4 +1,4 @@
-"""A browser that is none: what the viewer asks of viser's client, kept in memory."""
+"""A fake of viser's client: what the viewer uses of it, kept in memory."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Gui:
         return self._add(label, value)
 
     def add_markdown(self, content: str) -> Control:
-        return self._add("told", content)
+        return self._add("status", content)
 
     def add_checkbox(self, label: str, value: bool, **_: Any) -> Control:
         return self._add(label, value)
@@ -107,7 +107,7 @@ class SceneTree:
         return Control()
 
 
-class Lens:
+class FakeCamera:
     """The browser's camera: turned by looking at a point, as viser's is."""
 
     def __init__(self) -> None:
@@ -134,18 +134,18 @@ class Lens:
     def drag(self, to: tuple[float, float, float]) -> None:
         """What a user does with a mouse."""
         self.position = np.array(to)
-        self.tell()
+        self.report()
 
-    def tell(self) -> None:
+    def report(self) -> None:
         for callback in self.callbacks:
             callback(self)
 
 
-class StandIn(SimpleNamespace):
+class FakeClient(SimpleNamespace):
     """The client."""
 
     def __init__(self) -> None:
-        super().__init__(gui=Gui(), scene=SceneTree(), camera=Lens(), files={}, client_id=1)
+        super().__init__(gui=Gui(), scene=SceneTree(), camera=FakeCamera(), files={}, client_id=1)
 
     @contextmanager
     def atomic(self):

@@ -1,4 +1,4 @@
-"""A camera path that a visitor sets down pose by pose."""
+"""Camera keyframes and the path through them."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from polarguide.trajectory import camera_record, interpolated
 FRAMES_PER_SECOND = 30
 
 
-class Keys:
-    """Poses in the order in which they were set, and the smooth path through them.
+class Keyframes:
+    """Keyframes in the order in which they were added, and the smooth path through them.
 
     Args:
-        size: of the pictures of the path, width and height.
+        frame_size: width and height of the pictures of the path.
     """
 
-    def __init__(self, size: tuple[int, int]) -> None:
-        self._size = size
+    def __init__(self, frame_size: tuple[int, int]) -> None:
+        self._size = frame_size
         self.cameras: list[Camera] = []
 
     def add(self, camera: Camera) -> None:
-        """Set one more pose; the picture keeps what it shows from top to bottom."""
+        """Append a keyframe; its vertical field of view is kept."""
         width, height = self._size
         focal = camera.fy * height / camera.height
         self.cameras.append(
@@ -31,13 +31,13 @@ class Keys:
         )
 
     def path(self, seconds: float) -> list[Camera]:
-        """The path with ``seconds`` from each pose to the next; the poses themselves where there are fewer than two."""
+        """The path with ``seconds`` between keyframes; fewer than two keyframes are returned as they are."""
         if len(self.cameras) < 2:
             return list(self.cameras)
         frames = 1 + round((len(self.cameras) - 1) * seconds * FRAMES_PER_SECOND)
         return interpolated(self.cameras, frames)
 
-    def file(self, seconds: float) -> str:
-        """The path as ``polarguide render --path`` reads it."""
+    def to_json(self, seconds: float) -> str:
+        """The path as JSON that ``polarguide render --path`` reads."""
         records = [camera_record(camera) for camera in self.path(seconds)]
         return json.dumps({"frames_per_second": FRAMES_PER_SECOND, "cameras": records})

@@ -7,15 +7,15 @@ import torch
 from random_runs import ring
 
 from polarguide.trajectory import read_path
-from polarguide.viewer.keys import FRAMES_PER_SECOND, Keys
+from polarguide.viewer.keyframes import FRAMES_PER_SECOND, Keyframes
 
 
 def test_a_path_goes_through_its_poses(tmp_path):
-    keys, poses = Keys((80, 50)), list(ring().values())[:3]
+    keyframes, poses = Keyframes((80, 50)), list(ring().values())[:3]
     for camera in poses:
-        keys.add(camera)
+        keyframes.add(camera)
     file = tmp_path / "path.json"
-    file.write_text(keys.file(1.5))
+    file.write_text(keyframes.to_json(1.5))
     cameras, speed = read_path(file)
     step = round(1.5 * FRAMES_PER_SECOND)
     assert (speed, len(cameras)) == (FRAMES_PER_SECOND, 1 + 2 * step)
@@ -28,7 +28,7 @@ def test_a_path_goes_through_its_poses(tmp_path):
 
 
 def test_one_pose_is_a_path_of_one_and_none_is_none():
-    keys = Keys((80, 50))
-    assert keys.path(2.0) == []
-    keys.add(ring()["v0"])
-    assert len(keys.path(2.0)) == 1
+    keyframes = Keyframes((80, 50))
+    assert keyframes.path(2.0) == []
+    keyframes.add(ring()["v0"])
+    assert len(keyframes.path(2.0)) == 1

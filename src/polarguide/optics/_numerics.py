@@ -1,14 +1,16 @@
-"""Arithmetic whose value and gradient stay finite at the points where the plain operation is singular.
+"""What the modules of this package share: safe arithmetic, means over windows, checks of arguments.
 
-Polarization is full of them: the angle of an unpolarized pixel, the azimuth of a normal that looks at the
-camera, the square root in a zenith at zero degree of polarization. At such a point the value is the limit (or
-zero where there is none) and the gradient is zero, so that one pixel cannot poison a whole optimization step.
+The safe functions stay finite, value and gradient, where the plain operation is singular: at the angle of an
+unpolarized pixel, the azimuth of a normal that points at the camera, the square root in a zenith at zero degree
+of polarization. There the value is the limit (or zero where there is none) and the gradient is zero, so that
+one pixel cannot spoil an optimization step.
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
 
 from polarguide.vectors import dot
 
@@ -40,13 +42,25 @@ def safe_normalize(vectors: Tensor) -> Tensor:
     return vectors * torch.where(live, inverse, torch.zeros_like(inverse))
 
 
+def window_mean(planes: Tensor, window: int) -> Tensor:
+    """Means over square windows of planes [K, H, W]; the border's pixels are repeated beyond it.
+
+    Raises:
+        ValueError: ``window`` is not a positive odd number.
+    """
+    if window < 1 or window % 2 == 0:
+        raise ValueError(f"window: expected an odd number of pixels, found {window}")
+    margin = window // 2
+    return avg_pool2d(pad(planes[None], (margin,) * 4, mode="replicate"), window, stride=1)[0]
+
+
 def check_leading(tensor: Tensor, count: int, name: str) -> None:
     """Raise ValueError unless the first axis of ``tensor`` has ``count`` entries."""
     if tensor.ndim == 0 or tensor.shape[0] != count:
         raise ValueError(f"{name}: expected shape [{count}, ...], found {list(tensor.shape)}")
 
 
-def check_index(index: float | Tensor) -> None:
+def check_refractive_index(refractive_index: float | Tensor) -> None:
     """Raise ValueError unless a refractive index given as a number exceeds 1 (tensors are not read)."""
-    if not isinstance(index, Tensor) and not index > 1.0:
-        raise ValueError(f"refractive index: expected more than 1, found {index}")
+    if not isinstance(refractive_index, Tensor) and not refractive_index > 1.0:
+        raise ValueError(f"refractive index: expected more than 1, found {refractive_index}")

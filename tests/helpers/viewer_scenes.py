@@ -1,4 +1,4 @@
-"""A small scene to look at: random Gaussians, with photographs taken of them."""
+"""A small scene for the viewer: random Gaussians, and photographs rendered from them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from polarguide.capture import View
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.viewer import Shown
-from polarguide.viewer.photographs import Photograph
+from polarguide.viewer.frusta import Photograph
 
 
 def shown(recipe: str = "polarguide-stokes") -> Shown:
@@ -19,7 +19,7 @@ def shown(recipe: str = "polarguide-stokes") -> Shown:
     return Shown(state.gaussians, light, shading, rasterize_cpu, 3, f"{recipe}, a test")
 
 
-def around() -> SceneFrame:
+def frame_of_scene() -> SceneFrame:
     return scene_frame(list(ring().values()))
 
 
@@ -33,5 +33,5 @@ def photograph(name: str, camera: Camera, seen: Shown) -> Photograph:
     return Photograph(View(name, camera, codes, nowhere, nowhere), small, held_out=name == "v0")
 
 
-def photographs_of(seen: Shown) -> dict[str, Photograph]:
+def photographs(seen: Shown) -> dict[str, Photograph]:
     return {name: photograph(name, camera, seen) for name, camera in ring().items()}

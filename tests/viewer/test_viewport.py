@@ -9,7 +9,7 @@ import pytest
 import torch
 from random_runs import ring
 
-from polarguide.viewer.lens import fit, free_camera, quaternion, window_fov
+from polarguide.viewer.viewport import free_camera, letterbox, quaternion, window_fov
 
 CAMERA = next(iter(ring().values()))
 
@@ -30,28 +30,28 @@ def test_a_free_camera_takes_the_pose_of_its_quaternion_and_the_fov_from_top_to_
 
 @pytest.mark.parametrize("size", [(640, 480), (1000, 300), (200, 900), (64, 48), (31, 17)])
 def test_a_photograph_fits_into_a_window_and_its_camera_with_it(size):
-    place = fit(CAMERA, size)
-    camera = place.camera(CAMERA)
+    placement = letterbox(CAMERA, size)
+    camera = placement.camera(CAMERA)
     assert (camera.width, camera.height) == size
     corners = np.array([(0, 0), (CAMERA.width, CAMERA.height)])
-    inside = corners * place.scale + (place.left, place.top)
+    inside = corners * placement.scale + (placement.left, placement.top)
     assert (inside >= -1e-9).all()
     assert (inside <= np.array(size) + 1e-9).all()
     assert np.isclose(inside, [(0, 0), size]).all(axis=0).any()  # it touches two borders
     point = CAMERA.center + CAMERA.rotation.T @ torch.tensor([0.3, -0.2, 2.0], dtype=torch.float64)
     before, after = np.array(project(CAMERA, point)), np.array(project(camera, point))
-    assert after == pytest.approx(before * place.scale + (place.left, place.top))
+    assert after == pytest.approx(before * placement.scale + (placement.left, placement.top))
 
 
 @pytest.mark.parametrize("scale", [1, 3])
 def test_a_placed_picture_lies_where_the_camera_sees_it(scale):
     size = (scale * CAMERA.width + 20, scale * CAMERA.height)
     picture = np.random.default_rng(0).integers(0, 255, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
-    placed = fit(CAMERA, size).placed(picture)
-    assert placed.shape == (size[1], size[0], 3)
-    middles = placed[scale // 2 :: scale, 10 + scale // 2 : -10 : scale]
+    apply = letterbox(CAMERA, size).apply(picture)
+    assert apply.shape == (size[1], size[0], 3)
+    middles = apply[scale // 2 :: scale, 10 + scale // 2 : -10 : scale]
     assert np.array_equal(middles, picture)
-    assert (placed[:, :9] == 64).all()
+    assert (apply[:, :9] == 64).all()
 
 
 @pytest.mark.parametrize("aspect", [0.5, 4 / 3, 3.0])

@@ -1,4 +1,4 @@
-"""From a browser's window to cameras: free ones, and those of photographs."""
+"""Cameras for a browser window: free ones, and those of photographs with borders around them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from polarguide.visualization.figures import Picture
 
 
 def free_camera(
-    wxyz: Sequence[float], position: Sequence[float], fov: float, size: tuple[int, int]
+    wxyz: Sequence[float], position: Sequence[float], fov: float, frame_size: tuple[int, int]
 ) -> Camera:
-    """A camera with square pixels and its axis in the middle.
+    """A camera with square pixels and a centered principal point.
 
     Args:
         wxyz: quaternion of the camera-to-world rotation, OpenCV's axes. position: in the world.
-        fov: vertical, radians. size: width and height, pixels.
+        fov: vertical field of view in radians. frame_size: width and height in pixels.
     """
-    width, height = size
+    width, height = frame_size
     w, x, y, z = (float(v) for v in wxyz)
     rotation = torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix().T.copy())
     center = torch.tensor([float(v) for v in position], dtype=torch.float64)
@@ -39,22 +39,22 @@ def quaternion(camera: Camera) -> tuple[float, float, float, float]:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """Where a photograph lies in a window of another shape: as big as it fits, in the middle.
+class Letterbox:
+    """The placement of a photograph in a window of another aspect ratio: as large as possible, centered.
 
     Attributes:
-        scale: window pixels per pixel of the photograph. left, top: of its corner, window pixels.
-        size: of the window, width and height.
+        scale: window pixels per pixel of the photograph. left, top: its corner in window pixels.
+        frame_size: width and height of the window.
     """
 
     scale: float
     left: float
     top: float
-    size: tuple[int, int]
+    frame_size: tuple[int, int]
 
     def camera(self, photograph: Camera) -> Camera:
-        """The photograph's camera with the window's borders."""
-        s, (width, height) = self.scale, self.size
+        """The photograph's camera, extended to the window."""
+        s, (width, height) = self.scale, self.frame_size
         return replace(
             photograph,
             width=width,
@@ -65,25 +65,28 @@ class Fit:
             cy=s * photograph.cy + self.top,
         )
 
-    def placed(self, picture: Picture) -> Picture:
-        """A picture of the photograph's size in a window that is gray around it."""
+    def apply(self, picture: Picture) -> Picture:
+        """A picture of the photograph's size, resampled into the window with gray borders."""
         matrix = np.array([[self.scale, 0, self.left], [0, self.scale, self.top]])
-        # warpAffine counts from the middle of the corner pixel, our cameras from its corner.
+        # The origin of warpAffine is the center of the corner pixel, that of our cameras its corner.
         matrix[:, 2] += 0.5 * self.scale - 0.5
         blend = cv2.INTER_LINEAR if self.scale >= 1 else cv2.INTER_AREA
-        placed = cv2.warpAffine(picture, matrix, self.size, flags=blend, borderValue=(64, 64, 64))
+        placed = cv2.warpAffine(picture, matrix, self.frame_size, flags=blend, borderValue=(64, 64, 64))
         return np.ascontiguousarray(placed, dtype=np.uint8)
 
 
-def fit(photograph: Camera, size: tuple[int, int]) -> Fit:
-    """How a photograph fits into a window of ``size``, width and height."""
-    scale = min(size[0] / photograph.width, size[1] / photograph.height)
-    left, top = 0.5 * (size[0] - scale * photograph.width), 0.5 * (size[1] - scale * photograph.height)
-    return Fit(scale, left, top, size)
+def letterbox(photograph: Camera, frame_size: tuple[int, int]) -> Letterbox:
+    """The placement of a photograph in a window of ``frame_size``, width and height."""
+    scale = min(frame_size[0] / photograph.width, frame_size[1] / photograph.height)
+    left, top = (
+        0.5 * (frame_size[0] - scale * photograph.width),
+        0.5 * (frame_size[1] - scale * photograph.height),
+    )
+    return Letterbox(scale, left, top, frame_size)
 
 
 def window_fov(photograph: Camera, aspect: float) -> float:
-    """Vertical field of view, radians, with which a window of ``aspect`` (width over height) holds a photograph."""
+    """Vertical field of view in radians with which a window of ``aspect`` (width / height) contains a photograph."""
     high, wide = (
         0.5 * photograph.height / photograph.fy,
         0.5 * photograph.width / photograph.fx,

@@ -1,4 +1,4 @@
-"""Which part of space the cameras look at together."""
+"""Sample 3D points in the visual hull: where most cameras see them, inside their object masks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BATCHES = 40
 Points = NDArray[np.float64]
 
 
-def region_samples(
+def sample_visual_hull(
     cameras: Mapping[str, PosedCamera],
     masks: Mapping[str, NDArray[np.bool_]],
     count: int,
@@ -28,8 +28,8 @@ def region_samples(
     """Random points that most cameras see, inside the object masks where there are any.
 
     A point counts if 80 % of the cameras (those with masks, where there are any) see it, and 95 % of these see
-    it inside their mask. The box to draw from starts around the place nearest to all optical axes, as wide as
-    the cameras are far from it, and shrinks to what was found.
+    it inside their mask. The box to sample from starts around the point nearest to all optical axes, with the
+    cameras' median distance from it as half its side, and shrinks to the points found.
 
     Args:
         cameras: by view; distortion is respected.
@@ -38,16 +38,16 @@ def region_samples(
         rng: for the draws.
 
     Returns:
-        [N, 3] with N up to ``count``; N is 0 where no place is seen by enough cameras.
+        [N, 3] with N up to ``count``; N is 0 if enough cameras see no common point.
     """
     used = {view: camera for view, camera in cameras.items() if not masks or view in masks}
-    pixels = {view: _colmap_camera(camera) for view, camera in used.items()}
-    center, reach = _focus(list(used.values()))
+    pixels = {view: colmap_camera(camera) for view, camera in used.items()}
+    center, reach = _nearest_to_axes(list(used.values()))
     low, high = center - reach, center + reach
 
     def kept(batch: int) -> Points:
         places = rng.uniform(low, high, (batch, 3))
-        return places[_seen(places, used, pixels, masks)]
+        return places[_seen_by_most(places, used, pixels, masks)]
 
     for _ in range(_ROUNDS):
         found = kept(_BATCH)
@@ -64,8 +64,8 @@ def region_samples(
     return np.concatenate(parts)[:count]
 
 
-def _focus(cameras: list[PosedCamera]) -> tuple[Points, float]:
-    """The place nearest to all optical axes, and how far the cameras are from it (their median)."""
+def _nearest_to_axes(cameras: list[PosedCamera]) -> tuple[Points, float]:
+    """The point nearest to all optical axes (least squares), and the cameras' median distance from it."""
     centers = np.stack([camera.center for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -77,13 +77,13 @@ def _focus(cameras: list[PosedCamera]) -> tuple[Points, float]:
     return center, max(reach, 1e-6)
 
 
-def _seen(
+def _seen_by_most(
     places: Points,
     cameras: Mapping[str, PosedCamera],
     pixels: Mapping[str, pycolmap.Camera],
     masks: Mapping[str, NDArray[np.bool_]],
 ) -> NDArray[np.bool_]:
-    """Which points [N, 3] enough cameras see, inside their masks."""
+    """Which points [N, 3] enough cameras see, inside their masks: [N]."""
     seen, inside = np.zeros(len(places)), np.zeros(len(places))
     for view, camera in cameras.items():
         local = places @ camera.rotation.T + camera.translation
@@ -99,7 +99,8 @@ def _seen(
     return np.asarray(enough & (inside >= _SHARE_IN_MASKS * seen)) if masks else np.asarray(enough)
 
 
-def _colmap_camera(camera: PosedCamera) -> pycolmap.Camera:
+def colmap_camera(camera: PosedCamera) -> pycolmap.Camera:
+    """The intrinsics of a camera as pycolmap's type."""
     return pycolmap.Camera(
         model=camera.model, width=camera.width, height=camera.height, params=list(camera.parameters)
     )

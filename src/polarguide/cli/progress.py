@@ -1,0 +1,42 @@
+"""Messages and progress bars on the console."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from polarguide.cli.console import console
+from polarguide.progress import Advance, Reporter
+
+
+class ConsoleReporter(Reporter):
+    """What work reports, printed; bars disappear when they are full."""
+
+    def say(self, text: str) -> None:
+        """Print a finding; brackets in it are shown as they are."""
+        console.print(text, markup=False)
+
+    def warn(self, text: str) -> None:
+        """Print a warning."""
+        console.print("[yellow]warning:[/] ", end="")
+        console.print(text, markup=False)
+
+    @contextlib.contextmanager
+    def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
+        """A progress bar."""
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}", markup=False),
+        )
+        with Progress(*columns, console=console, transient=True) as progress:
+            task = progress.add_task(label, total=total, note="")
+
+            def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+                progress.update(task, completed=done, total=total, note=note)
+
+            yield advance
