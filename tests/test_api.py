@@ -133,6 +133,11 @@ def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
     settings, reading = polarguide.TrainSettings(40), SceneOptions(downscale=4)
     session = SessionOptions(threads=1, checkpoint_every=10)
 
+    def train(*, resume: bool) -> None:
+        polarguide.train(
+            demo_scene, tmp_path / "run", settings=settings, reading=reading, session=session, resume=resume
+        )
+
     def interrupted_in(name: str, at: int) -> None:
         inner = getattr(Trainer, name)
 
@@ -141,26 +146,15 @@ def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
                 raise KeyboardInterrupt
             return inner(self, *arguments, **more)
 
-        resume = (tmp_path / "run" / CONFIGURATION).exists()
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(Trainer, name, stopped)
-            polarguide.train(
-                demo_scene,
-                tmp_path / "run",
-                settings=settings,
-                reading=reading,
-                session=session,
-                resume=resume,
-            )
+            train(resume=(tmp_path / "run" / CONFIGURATION).exists())
 
-    interrupted_in("_look", 17)
+    interrupted_in("_backpropagate", 17)
     assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 17
     assert not (tmp_path / "run" / PLY).exists()
     interrupted_in("_optimize", 25)
     assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 20
-    polarguide.train(
-        demo_scene, tmp_path / "run", settings=settings, reading=reading, session=session, resume=True
-    )
+    train(resume=True)
     first, second = load_file(tmp_path / "run" / CHECKPOINT), load_file(trained / CHECKPOINT)
     assert [name for name in second if not torch.equal(first[name], second[name])] == []
 

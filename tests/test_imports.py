@@ -20,6 +20,7 @@ ROOMS = (
     "system",
     "progress",
     "color",
+    "polarizer",
     "vectors",
     "camera",
     "scene_frame",

@@ -22,19 +22,24 @@ if TYPE_CHECKING:
     )
     from polarguide.capture import Scene, load_scene
     from polarguide.errors import PolarguideError, PolarguideWarning
+    from polarguide.experiments.ablate import ablate
+    from polarguide.experiments.compare import compare
+    from polarguide.experiments.options import CompareOptions
+    from polarguide.inspection.settings import InspectSettings
     from polarguide.options import SceneOptions, SessionOptions
+    from polarguide.preparation.settings import PrepareSettings
     from polarguide.progress import Reporter
-    from polarguide.raster import use_threads
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
 
-    ablate: Any
-    compare: Any
     __version__: str
 
 _MODULES = {
+    "CompareOptions": "experiments.options",
+    "InspectSettings": "inspection.settings",
     "PolarguideError": "errors",
     "PolarguideWarning": "errors",
+    "PrepareSettings": "preparation.settings",
     "Recipe": "training.recipe",
     "Reporter": "progress",
     "Run": "api",
@@ -51,13 +56,15 @@ _MODULES = {
     "prepare": "api",
     "priors": "api",
     "train": "api",
-    "use_threads": "raster",
 }
 """Where each public name is defined, below the package."""
 
 __all__ = [
+    "CompareOptions",
+    "InspectSettings",
     "PolarguideError",
     "PolarguideWarning",
+    "PrepareSettings",
     "Recipe",
     "Reporter",
     "Run",
@@ -76,7 +83,6 @@ __all__ = [
     "prepare",
     "priors",
     "train",
-    "use_threads",
 ]
 
 

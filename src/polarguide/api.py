@@ -14,15 +14,15 @@ from typing import Any
 
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.evaluate import evaluate, read_metrics
+from polarguide.evaluation import read_metrics
+from polarguide.evaluation.evaluate import evaluate
 from polarguide.export.formats import export, share
-from polarguide.files import make_folder, write_text
-from polarguide.inspection.inspect import Inspection, InspectSettings, inspect_scene
-from polarguide.inspection.page_html import FILE as INSPECTION_PAGE
-from polarguide.inspection.page_html import inspection_html
-from polarguide.inspection.record import write_record
+from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
+from polarguide.inspection.record import write_inspection
+from polarguide.inspection.settings import InspectSettings
 from polarguide.options import LOOPBACK, DeviceName, ExportFormat, SceneOptions, SessionOptions
-from polarguide.preparation import Prepared, PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import Prepared, prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.rendering.film import write_film
@@ -222,24 +222,11 @@ def inspect(
     Raises:
         PolarguideError: the scene cannot be read.
     """
-    folder = inspection_folder(scene) if out is None else Path(out)
-    if folder.exists() and not folder.is_dir():
-        raise PolarguideError(
-            folder, expected="a folder to write", found="a file", remedy="Give another --out."
-        )
+    folder = inspection_folder(Path(scene), _path(out))
     backend = choose_backend(device, say=reporter.say)
-    found = inspect_scene(Path(scene), folder, settings, backend, track=_tracked(reporter))
-    make_folder(folder)
-    write_record(found, folder)
-    with reporter.track("drawing", len(found.capture.views)) as advance:
-        write_text(folder / INSPECTION_PAGE, inspection_html(found, advance))
+    found = inspect_scene(Path(scene), folder, settings, backend, reporter)
+    write_inspection(found, folder, reporter)
     return found
-
-
-def inspection_folder(scene: PathLike) -> Path:
-    """Where ``inspect`` writes by default."""
-    folder = Path(scene).resolve()
-    return folder.with_name(folder.name + "-inspection")
 
 
 def priors(
@@ -283,8 +270,3 @@ def demo_scene() -> Iterator[Path]:
 
 def _path(path: PathLike | None) -> Path | None:
     return None if path is None else Path(path)
-
-
-def _tracked(reporter: Reporter) -> Callable[[str, int], AbstractContextManager[Callable[[int], None]]]:
-    """Progress as the inspection gives it: a total of 0 is one not known yet."""
-    return lambda label, total: reporter.track(label, total or None)

@@ -1,33 +1,58 @@
-"""Writing files: what is read is either the old file or the whole new one, and a failure says how to go on."""
+"""Reading and writing files: what is read is either the old file or the whole new one; failures are explained."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 from polarguide.errors import PolarguideError
+
+_LARGEST_FILE = 1 << 31
 
 
 @contextlib.contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Write to a temporary file that takes the place of ``path`` only when it is complete and on disk."""
+    """Write to a temporary file that takes the place of ``path`` only when it is complete and on disk.
+
+    Yields:
+        The temporary file's path, in the same folder.
+
+    Raises:
+        PolarguideError: it cannot be written, for example because the disk is full.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with writing(path):
+        try:
+            yield temporary
+            with open(temporary, "rb") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+            _sync_folder(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, data: bytes) -> int:
+    """Write a file completely or not at all; returns its size.
+
+    Raises:
+        PolarguideError: it cannot be written.
+    """
+    with atomic(path) as temporary:
+        temporary.write_bytes(data)
+    return len(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8, completely or not at all."""
-    with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    """Write a text file in UTF-8, completely or not at all.
+
+    Raises:
+        PolarguideError: it cannot be written.
+    """
+    write_whole(path, text.encode())
 
 
 def make_folder(path: Path) -> None:
@@ -36,32 +61,19 @@ def make_folder(path: Path) -> None:
     Raises:
         PolarguideError: it cannot be created.
     """
-    guarded(lambda: path.mkdir(parents=True, exist_ok=True), path)
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
 
 
-def write_whole(path: Path, data: bytes) -> int:
-    """Write a file that is there completely or not at all; returns its size.
-
-    Raises:
-        PolarguideError: it cannot be written, for example because the disk is full.
-    """
-
-    def write() -> None:
-        with atomic(path) as temporary:
-            temporary.write_bytes(data)
-
-    guarded(write, path)
-    return len(data)
-
-
-def guarded(action: Callable[[], Any], path: Path) -> None:
-    """Run what writes; an OSError becomes a message that says how to go on.
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an OSError of what writes ``path`` into a message that says how to go on.
 
     Raises:
-        PolarguideError: it failed.
+        PolarguideError: there was one.
     """
     try:
-        action()
+        yield
     except OSError as error:
         raise PolarguideError(
             path,
@@ -69,3 +81,41 @@ def guarded(action: Callable[[], Any], path: Path) -> None:
             found=error.strerror or str(error),
             remedy="Make room or give rights, and repeat the command: it goes on where it stopped.",
         ) from error
+
+
+def guarded(action: Callable[[], object], path: Path) -> None:
+    """Run what writes ``path``, under ``writing``."""
+    with writing(path):
+        action()
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a file of up to 2 GiB.
+
+    Raises:
+        PolarguideError: the file cannot be read.
+    """
+    try:
+        about = path.stat()
+        if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):  # reading may never end
+            raise OSError("a pipe or device")
+        if about.st_size > _LARGEST_FILE:
+            raise OSError(f"one of {about.st_size} bytes, more than 2 GiB")
+        return path.read_bytes()
+    except OSError as error:
+        raise PolarguideError(
+            path,
+            expected="a readable file",
+            found=error.strerror or str(error),
+            remedy="Check that the file exists and may be read.",
+        ) from error
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in a folder durable, on systems that can."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

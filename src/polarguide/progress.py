@@ -28,8 +28,12 @@ class Reporter:
         """Something the user should know before going on."""
 
     @contextlib.contextmanager
-    def track(self, label: str, total: int | None) -> Iterator[Advance]:
-        """Progress of one piece of work; yields a function that takes what has been done so far."""
+    def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
+        """Progress of one piece of work; yields a function that takes what has been done so far.
+
+        Args:
+            label: what is done. total: how much there is to do; None where that is not known yet.
+        """
         yield _ignore
 
 

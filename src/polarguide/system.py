@@ -1,4 +1,4 @@
-"""What only some operating systems offer; elsewhere each function says that it does not know, or does nothing."""
+"""Signals, and what only some operating systems offer: elsewhere a function returns None, or does nothing."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 MEBIBYTE = 1 << 20
+LAST_WORDS_SECONDS = 5.0
 
 
 def _posix(module: str) -> Any | None:
@@ -22,10 +24,55 @@ def _posix(module: str) -> Any | None:
         return None
 
 
-def termination_signals() -> tuple[signal.Signals, ...]:
-    """Signals beside Ctrl-C by which a process is asked to end: SIGTERM, and SIGHUP where there is one."""
-    names = ("SIGTERM", "SIGHUP")
-    return tuple(getattr(signal, name) for name in names if hasattr(signal, name))
+class StopSignals:
+    """A context in which Ctrl-C and SIGTERM ask work to stop; the object is what ``should_stop`` of a training is.
+
+    Before it is called for the first time, and at a second Ctrl-C, they interrupt at once.
+    """
+
+    def __init__(self) -> None:
+        self._asked = self._works = False
+
+    def __enter__(self) -> StopSignals:
+        self._old = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        self._works = True
+        return self._asked
+
+    def _stop(self, number: int, _: FrameType | None) -> None:
+        if self._works:
+            if self._asked and number == signal.SIGINT:
+                raise KeyboardInterrupt
+            self._asked = True
+        elif number == signal.SIGTERM and process_count() > 1:
+            # torchrun ends the others when one process is lost: first one of them has to say what happened.
+            timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
+            timer.daemon = True
+            timer.start()
+        else:
+            raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def signals_as_interrupts() -> Iterator[None]:
+    """SIGTERM, and SIGHUP where there is one, act like Ctrl-C."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    old = {number: signal.signal(number, interrupt) for number in (getattr(signal, name) for name in names)}
+    try:
+        yield
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

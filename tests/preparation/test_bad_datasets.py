@@ -17,7 +17,7 @@ from test_bad_input import PLAIN, refused
 from tiny_capture import write_picture
 
 from polarguide.capture.calibration import Calibration
-from polarguide.preparation import PrepareSettings
+from polarguide.preparation.settings import PrepareSettings
 
 
 def npz(name: str, **changes: object) -> Callable[[Path], None]:
@@ -157,7 +157,7 @@ CELLS: dict[str, tuple[str, Callable[[Path], object], str]] = {
     # GNeRP
     "gnerp: broken json": ("gnerp", lambda d: (d / "cameras.json").write_text("{"), "JSON file, found broken"),
     "gnerp: bottomless json": ("gnerp", lambda d: (d / "cameras.json").write_text("[" * 100_000), "a JSON file"),
-    "gnerp: a list": ("gnerp", lambda d: (d / "cameras.json").write_text("[]"), "found a JSON list"),
+    "gnerp: a list": ("gnerp", lambda d: (d / "cameras.json").write_text("[]"), r"found \[\]"),
     "gnerp: no intrinsics": ("gnerp", cameras(lambda c: c.pop("intrinsic")), "expected the entry intrinsic"),
     "gnerp: no cameras": ("gnerp", cameras(lambda c: c.clear()), "expected the entry w2c_mat_<i>, found no entry"),
     "gnerp: a camera too few": ("gnerp", cameras(lambda c: c.pop("w2c_mat_2")), "the entry w2c_mat_2 for view 2"),
@@ -231,7 +231,7 @@ def test_datasets(tmp_path: Path, case: str) -> None:
         ("gnerp", {"bits": 12}, "--bits: .*format gnerp"),
         ("gnerp", {"calibration": Calibration(gains=(1, 1, 1, 1.1))}, r"calibration \(gains\): .*Stokes"),
         ("nersp", {"calibration": Calibration(sense="left")}, r"calibration \(sense\)"),
-        ("nersp", {"format": "other"}, "--format: expected auto, mosaic, filter, pandora"),
+        ("nersp", {"format": "other"}, r"--format: expected .*mosaic.*pandora.*\"other\""),
         ("nersp", {"format": "pisr"}, "intrinsics.npz: expected a readable file"),
     ],
 )

@@ -9,7 +9,8 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import REPORTER
+from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.threads import use_threads
 from polarguide.options import ExportFormat, ThreadOptions
 
 
@@ -34,8 +35,9 @@ def export(
         out: Folder to write; RUN/export by default.
         resolution: Voxels of the mesh along its longest side.
     """
-    polarguide.use_threads(machine.threads)
-    opened = polarguide.open_run(run, device="cpu", reporter=REPORTER)
-    for path in opened.export(format, out, resolution=resolution, reporter=REPORTER):
+    use_threads(machine.threads)
+    reporter = ConsoleReporter()
+    opened = polarguide.open_run(run, device="cpu", reporter=reporter)
+    for path in opened.export(format, out, resolution=resolution, reporter=reporter):
         size = f" ({path.stat().st_size / 1e6:.1f} MB)" if path.is_file() else ""
         console.print(f"{format}: {path}{size}", markup=False)

@@ -9,7 +9,8 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import REPORTER
+from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.threads import use_threads
 from polarguide.options import SceneOptions, ThreadOptions
 
 
@@ -40,8 +41,9 @@ def priors(
         refractive_index: Of the surfaces.
         threshold: DoLP above which a pixel's normal is used.
     """
-    polarguide.use_threads(machine.threads)
-    opened = None if run is None else polarguide.open_run(run, reporter=REPORTER)
+    use_threads(machine.threads)
+    reporter = ConsoleReporter()
+    opened = None if run is None else polarguide.open_run(run, reporter=reporter)
     sheet = polarguide.priors(
         scene,
         out,
@@ -50,6 +52,6 @@ def priors(
         refractive_index=refractive_index,
         threshold=threshold,
         reading=reading,
-        reporter=REPORTER,
+        reporter=reporter,
     )
     console.print(f"pictures: {out}   contact sheet: {sheet}")

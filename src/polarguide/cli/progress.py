@@ -1,4 +1,4 @@
-"""Messages and progress bars of the library on the console."""
+"""Messages and progress bars on the console."""
 
 from __future__ import annotations
 
@@ -12,36 +12,31 @@ from polarguide.progress import Advance, Reporter
 
 
 class ConsoleReporter(Reporter):
-    """Messages and progress bars on the console."""
+    """What work reports, printed. Bars disappear at the end, but for those with a note."""
 
     def say(self, text: str) -> None:
-        """A finding, as a plain sentence."""
+        """Print a finding; brackets in it are shown as they are."""
         console.print(text, markup=False)
 
     def warn(self, text: str) -> None:
-        """Something the user should know before going on."""
+        """Print a warning."""
         warn(text)
 
     @contextlib.contextmanager
-    def track(self, label: str, total: int | None) -> Iterator[Advance]:
-        """A progress bar. One with notes stays on the console at the end."""
+    def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
+        """A progress bar."""
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}", markup=False),
             TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}", markup=False),
         )
         with Progress(*columns, console=console, transient=True) as progress:
             task = progress.add_task(label, total=total, note="")
 
             def advance(done: int, *, total: int | None = None, note: str = "") -> None:
-                if note:
-                    progress.live.transient = False
-                    progress.update(task, note=note)
-                progress.update(task, completed=done, total=total)
+                progress.live.transient = not note
+                progress.update(task, completed=done, total=total, note=note)
 
             yield advance
-
-
-REPORTER = ConsoleReporter()

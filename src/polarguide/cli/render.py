@@ -9,7 +9,8 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import REPORTER
+from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.threads import use_threads
 from polarguide.errors import PolarguideError
 from polarguide.options import ComputeOptions
 
@@ -52,12 +53,13 @@ def render(
             remedy="Write for example --path orbit --video film.mp4.",
         )
     names = [name.strip() for name in layers.split(",") if name.strip()]
-    polarguide.use_threads(compute.threads)
-    opened = polarguide.open_run(run, device=compute.device, reporter=REPORTER)
-    opened.relight(environment, rotate_environment, reporter=REPORTER)
+    use_threads(compute.threads)
+    reporter = ConsoleReporter()
+    opened = polarguide.open_run(run, device=compute.device, reporter=reporter)
+    opened.relight(environment, rotate_environment, reporter=reporter)
     folder = out or run / "render"
     if path:
-        opened.write_film(video or folder, path=path, layers=names, frames=frames, reporter=REPORTER)
+        opened.write_film(video or folder, path=path, layers=names, frames=frames, reporter=reporter)
         return
-    sheet = opened.write_pictures(folder, views=views, layers=names, reporter=REPORTER)
+    sheet = opened.write_pictures(folder, views=views, layers=names, reporter=reporter)
     console.print(f"pictures: {folder}   contact sheet: {sheet}")

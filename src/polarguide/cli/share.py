@@ -9,7 +9,8 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import REPORTER
+from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.threads import use_threads
 from polarguide.options import ThreadOptions
 
 
@@ -30,8 +31,9 @@ def share(
         title: Heading of the page; the scene's name by default.
         caption: Text below it; the recipe and its steps by default.
     """
-    polarguide.use_threads(machine.threads)
-    opened = polarguide.open_run(run, device="cpu", reporter=REPORTER)
+    use_threads(machine.threads)
+    reporter = ConsoleReporter()
+    opened = polarguide.open_run(run, device="cpu", reporter=reporter)
     path = opened.share(out, title=title, caption=caption)
     size = f"{path.stat().st_size / 1e6:.1f} MB, {len(opened.model):,} Gaussians"
     console.print(f"page: {path} ({size})", markup=False)

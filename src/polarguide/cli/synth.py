@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import REPORTER
+from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.threads import use_threads
 from polarguide.errors import PolarguideError
 from polarguide.options import ThreadOptions
 
@@ -56,7 +56,8 @@ def synth(
         ground_truth: Views that get ground truth.
     """
     threads = machine.threads
-    polarguide.use_threads(threads)
+    use_threads(threads)
+    reporter = ConsoleReporter()
     asked = import_module("polarguide.synth.settings")
     width, height = _size(size)
     overrides = asked.Overrides(views=views, spacing=spacing, roughness=roughness, index=index)
@@ -74,11 +75,11 @@ def synth(
     if sweep is not None:
         sweeps = import_module("polarguide.synth.sweep")
         family = sweeps.parse_sweep(sweep)
-        folders = sweeps.sweep_scenes(spec, out, settings, overrides, family, REPORTER, threads=threads)
+        folders = sweeps.sweep_scenes(spec, out, settings, overrides, family, reporter, threads=threads)
         console.print(f"scenes: {' '.join(str(folder) for folder in folders)}", markup=False)
         return
     render = import_module("polarguide.synth.render")
-    done = render.synthesise(overrides.apply(spec), out, settings, REPORTER, threads=threads)
+    done = render.synthesize(overrides.apply(spec), out, settings, reporter, threads=threads)
     manifest = import_module("polarguide.synth.manifest")
     console.print(
         f"scene: {done}   SHA-256 of its {manifest.MANIFEST}: {manifest.scene_digest(done)}", markup=False

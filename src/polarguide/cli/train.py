@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import threading
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import tyro
 
 import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import REPORTER
+from polarguide.cli.progress import ConsoleReporter
 from polarguide.options import SceneOptions, SessionOptions
-from polarguide.system import process_count
+from polarguide.system import StopSignals
 from polarguide.training.settings import TrainSettings
-
-# torchrun ends the others when one process is lost. Outside the loop, which stops by itself, they live this much
-# longer, so that one of them can say what happened.
-LAST_WORDS_SECONDS = 5.0
 
 
 def train(
@@ -48,7 +40,7 @@ def train(
             ablation of one, such as polarguide:without-normals.
         resume: Go on with the run in --out.
     """
-    with _StopSignals() as should_stop:
+    with StopSignals() as should_stop:
         try:
             polarguide.train(
                 scene,
@@ -58,7 +50,7 @@ def train(
                 session=session,
                 reading=reading,
                 resume=resume,
-                reporter=REPORTER,
+                reporter=ConsoleReporter(),
                 should_stop=should_stop,
             )
         except KeyboardInterrupt as stopped:
@@ -66,37 +58,3 @@ def train(
                 console.print(f"{stopped}; go on with the same command and --resume")
             raise
     console.print(f"trained: {out}   next: polarguide eval {out}   polarguide view {out}")
-
-
-class _StopSignals:
-    """Turns the first Ctrl-C (or SIGTERM) into the answer to whether training should stop.
-
-    Before that has been asked for the first time, they interrupt at once.
-    """
-
-    def __init__(self) -> None:
-        self.asked = self._trains = False
-
-    def __enter__(self) -> _StopSignals:
-        self._old = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-    def __call__(self) -> bool:
-        self._trains = True
-        return self.asked
-
-    def _ask(self, number: int, _: FrameType | None) -> None:
-        if self._trains:
-            if self.asked and number == signal.SIGINT:
-                raise KeyboardInterrupt
-            self.asked = True
-        elif number == signal.SIGTERM and process_count() > 1:
-            timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
-            timer.daemon = True
-            timer.start()
-        else:
-            raise KeyboardInterrupt

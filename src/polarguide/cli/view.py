@@ -8,7 +8,8 @@ from typing import Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.progress import REPORTER
+from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.threads import use_threads
 from polarguide.options import LOOPBACK, ComputeOptions
 
 
@@ -27,6 +28,7 @@ def view(
         host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
         port: To listen at; the next free one is taken if it is in use.
     """
-    polarguide.use_threads(compute.threads)
-    opened = polarguide.open_run(run, device=compute.device, reporter=REPORTER)
-    opened.view(host=host, port=port, reporter=REPORTER)
+    use_threads(compute.threads)
+    reporter = ConsoleReporter()
+    opened = polarguide.open_run(run, device=compute.device, reporter=reporter)
+    opened.view(host=host, port=port, reporter=reporter)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import platform
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,30 +10,14 @@ import torch
 import polarguide
 from polarguide import _native
 from polarguide.capture import View
-from polarguide.errors import PolarguideError
 from polarguide.evaluation import ViewTarget, score_view, write_metrics
-from polarguide.evaluation.record import RUN_KEYS, validate_metrics
+from polarguide.evaluation.record import METRICS_FILE
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.speed import frames_per_second
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.folder import RunLog
 from polarguide.runs.opened import OpenedRun
 from polarguide.system import peak_memory_mib
-
-METRICS = "metrics.json"
-SHOWN_KEYS = (
-    ("psnr", "PSNR", "dB"),
-    ("psnr_foreground", "PSNR, foreground", "dB"),
-    ("psnr_reflective", "PSNR, reflective", "dB"),
-    ("ssim", "SSIM", ""),
-    ("normal_mae_deg", "normal error", "degrees"),
-    ("normal_within_11", "normals within 11.25 degrees", ""),
-    ("specular_psnr", "specular layer PSNR", "dB"),
-    ("diffuse_psnr", "diffuse layer PSNR", "dB"),
-    ("fps", "frames a second", ""),
-    ("gaussians", "Gaussians", ""),
-    ("train_seconds", "training", "s"),
-)
 
 
 def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT) -> dict[str, Any]:
@@ -62,7 +44,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
             advance(len(views))
     seconds, alone = RunLog(run.folder).elapsed()
     return write_metrics(
-        run.folder / METRICS,
+        run.folder / METRICS_FILE,
         views=views,
         run={
             "fps": _speed(run, normals=False) if speed else None,
@@ -74,40 +56,6 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
         },
         provenance=_provenance(run),
     )
-
-
-def read_metrics(folder: Path) -> dict[str, Any]:
-    """The record that ``evaluate`` wrote into a run's folder.
-
-    Raises:
-        PolarguideError: the run has not been scored, or the file is not such a record.
-    """
-    path = folder / METRICS
-    try:
-        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        found = "none" if isinstance(error, FileNotFoundError) else f"no JSON ({error})"
-        raise PolarguideError(
-            path, expected="the scores of a run", found=found, remedy="Run polarguide eval."
-        ) from None
-    validate_metrics(record, where=path)
-    return record
-
-
-def shown_metrics(folder: Path) -> list[tuple[str, str]]:
-    """Labels and values of a run's scores, for people; nothing where it has not been scored.
-
-    Raises:
-        PolarguideError: ``metrics.json`` is not what ``evaluate`` writes.
-    """
-    if not (folder / METRICS).exists():
-        return []
-    record = read_metrics(folder)
-    return [
-        (f"{label}, test views", f"{record[key]:.3f} {unit}".rstrip())
-        for key, label, unit in SHOWN_KEYS
-        if key not in RUN_KEYS and record[key] is not None
-    ]
 
 
 def _speed(run: OpenedRun, **layers: bool) -> float | None:

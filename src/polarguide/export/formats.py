@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.evaluate import shown_metrics
+from polarguide.evaluation.record import METRICS_FILE, read_metrics
+from polarguide.evaluation.table import shown_metrics
 from polarguide.export.cameras import write_colmap, write_transforms
 from polarguide.export.mesh import scene_mesh, write_mesh
 from polarguide.export.points import surface_points, write_points
@@ -98,6 +99,8 @@ def share(run: OpenedRun, path: Path | None = None, *, title: str = "", caption:
             "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
         )
     views = run.scene.test_views + run.scene.train_views
+    scored = (run.folder / METRICS_FILE).exists()
+    scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
     page = share_page(
         run.model.state.gaussians,
         run.model.light,
@@ -106,7 +109,10 @@ def share(run: OpenedRun, path: Path | None = None, *, title: str = "", caption:
         first=views[0].name,
         title=title or run.scene.name,
         caption=caption or f"{run.recipe.name}, {run.steps:,} steps",
-        metrics=[*shown_metrics(run.folder), ("Gaussians", f"{len(run.model):,}")],
+        metrics=[
+            *((f"{label}, test views", text) for label, text in scores),
+            ("Gaussians", f"{len(run.model):,}"),
+        ],
     )
     make_folder(path.parent)
     write_page(path, page)
@@ -137,16 +143,15 @@ def _mesh(run: OpenedRun, folder: Path, resolution: int, reporter: Reporter) -> 
 
 def _points(run: OpenedRun, folder: Path) -> list[Path]:
     path, model = folder / "points.ply", run.model
-    write_points(path, *surface_points(model.state.gaussians, run.scene.views, model.backend.rasterize))
+    views, rasterize = run.scene.views, model.backend.rasterize
+    write_points(path, *surface_points(model.state.gaussians, model.shading, views, rasterize))
     return [path]
 
 
 def _environment(run: OpenedRun, folder: Path) -> list[Path]:
-    light = run.light
-    shading = needs_radiance(run.model.shading, lit=light is not None, what="format")
-    assert light is not None
+    cubemap = needs_radiance(run.model.shading, what="format")
     around = scene_frame(list(run.cameras.values()))
-    picture = panorama(light["texels"], shading, around, PANORAMA_HEIGHT)
+    picture = panorama(run.light[cubemap.name], cubemap, around, PANORAMA_HEIGHT)
     paths = [folder / "environment.exr", folder / "environment.png"]
     write_exr(paths[0], picture)
     figures.write_png(paths[1], figures.radiance_to_rgb(picture))

@@ -9,7 +9,6 @@ reads records of a fixed size and opens only files without extra fields.
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -23,6 +22,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from torch import Tensor
 
 from polarguide.errors import PolarguideError
+from polarguide.files import atomic
 from polarguide.gaussians.harmonics import sh_basis
 
 REST_COUNT = 15
@@ -95,10 +95,8 @@ def write_ply(
     vertices = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
     # The comments belong to the element: a reader that expects its line third, as SIBR does, finds it there.
     element = PlyElement.describe(vertices, "vertex", comments=comments)
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    PlyData([element], byte_order="<").write(partial)
-    os.replace(partial, path)
+    with atomic(Path(path)) as temporary:
+        PlyData([element], byte_order="<").write(temporary)
 
 
 def read_ply(path: str | Path) -> dict[str, Any]:

@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.pictures import read_file
-from polarguide.capture.view import ANGLES
-from polarguide.capture.write import encoded_png, picture_codes
+from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
-from polarguide.records import parse_json
+from polarguide.files import make_folder, write_whole
+from polarguide.records import read_record
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
@@ -63,7 +61,7 @@ class SceneFolder:
             )
 
     def _go_on(self, path: Path) -> None:
-        state = parse_json(path, read_file(path)).get("prepare")
+        state = read_record(path, dict[str, Any]).get("prepare")
         if not isinstance(state, dict) or not isinstance(state.get("request"), dict):
             raise PolarguideError(
                 self.root,
@@ -90,8 +88,8 @@ class SceneFolder:
 
     def start(self) -> None:
         """Create the folder and take note of the request."""
-        guarded(lambda: (self.root / "polar").mkdir(parents=True, exist_ok=True), self.root)
-        guarded(lambda: (self.root / "invalid").mkdir(exist_ok=True), self.root)
+        make_folder(self.root / "polar")
+        make_folder(self.root / "invalid")
         self.save()
         (self.root / SCENE).unlink(missing_ok=True)
 
@@ -125,14 +123,7 @@ class SceneFolder:
         mask: NDArray[np.bool_] | None = None,
     ) -> None:
         """Write the pictures of a view, then note it."""
-        files = {}
-        for angle, codes in zip(ANGLES, picture_codes(intensities, invalid), strict=True):
-            files[f"polar/{view}_{angle:03d}.png"] = codes[..., ::-1]
-        files[f"invalid/{view}.png"] = invalid.astype(np.uint8) * 255
-        if mask is not None:
-            guarded(lambda: (self.root / "masks").mkdir(exist_ok=True), self.root)
-            files[f"masks/{view}.png"] = mask.astype(np.uint8) * 255
-        sizes = {name: write_whole(self.root / name, encoded_png(pixels)) for name, pixels in files.items()}
+        sizes = write_view(self.root, view, intensity_codes(intensities, invalid), invalid, mask)
         self.views[view] = {**record, "files": sizes}
         self.save()
 

@@ -14,9 +14,9 @@ from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded
+from polarguide.files import make_folder, writing
 from polarguide.preparation.folder import SFM, SceneFolder
-from polarguide.preparation.settings import PrepareSettings, check_settings
+from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
 from polarguide.preparation.sources import given_poses, open_source, origin_of_poses
 from polarguide.preparation.working_folder import PHOTOGRAPHS, Workshop
@@ -66,7 +66,7 @@ def prepare_scene(
     """
     settings, reporter = settings or PrepareSettings(), reporter or Reporter()
     root, target = Path(source), Path(out)
-    check_settings(settings)
+    settings = settings.checked()
     pictures = open_source(root, settings)
     settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
     if settings.poses != "sfm" and settings.intrinsics is not None:
@@ -167,12 +167,13 @@ def _write_model(folder: SceneFolder, poses: Poses) -> None:
     partial, final = folder.root / _PARTIAL, folder.root / "sparse"
     for old in (partial, final):
         shutil.rmtree(old, ignore_errors=True)
-    guarded(lambda: (partial / "sparse" / "0").mkdir(parents=True), partial)
+    make_folder(partial / "sparse" / "0")
     poses.write(partial / "sparse" / "0")
     model = read_model(partial)
     for view in poses.views:
         model.camera(view)
-    guarded(lambda: (partial / "sparse").rename(final), final)
+    with writing(final):
+        (partial / "sparse").rename(final)
     shutil.rmtree(partial, ignore_errors=True)
 
 

@@ -16,28 +16,16 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError, PolarguideWarning
-from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.options import DeviceName, SceneOptions
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend, choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.runs.folder import CHECKPOINT, RunConfiguration, load_checkpoint, recipe_data
-from polarguide.shading.deferred import render
+from polarguide.runs.folder import RunConfiguration, load_checkpoint, recipe_data
+from polarguide.shading.gbuffer import render
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
-
-SIDE_ROWS = {
-    "strength_logits": (),
-    "local_dc": (3,),
-    "local_rest": (15, 3),
-    "outward": (3,),
-    "log_albedo": (3,),
-    "roughness_logits": (),
-    "features": (4,),
-}
-"""Side tensors that shading reads, with the shape of one row."""
 
 
 class Model(Protocol):
@@ -71,9 +59,9 @@ class GaussianModel:
         return self.backend.device
 
     @property
-    def light(self) -> dict[str, Tensor] | None:
-        """Parameters of the learned environment; None for a recipe without."""
-        return self.state.environment.parameters if self.state.environment else None
+    def light(self) -> dict[str, Tensor]:
+        """Parameters of the learned light by name; empty for a recipe without."""
+        return self.state.light
 
     def __len__(self) -> int:
         return len(self.state.gaussians)
@@ -85,8 +73,8 @@ class GaussianModel:
             self.state.gaussians,
             camera,
             self.backend.rasterize,
-            environment=self.light,
             shading=self.shading,
+            light=self.light,
             normals=normals,
             depth=depth,
         )
@@ -150,13 +138,12 @@ class OpenedRun:
         recipe = recipe or recipe_named(configuration.recipe)
         backend = choose_backend(device, say=reporter.say)
         state = load_checkpoint(folder, recipe, backend.device)
-        _check(folder / CHECKPOINT, state)
         if recipe_data(recipe) != configuration.recipe_data:
             _warn(
                 f"{folder} was trained with other values of the recipe {recipe.name} than this version has; its "
                 "pictures are shaded with this version's."
             )
-        model = GaussianModel(state, recipe.shading(configuration.settings.refractive_index), backend)
+        model = GaussianModel(state, recipe.shading.bind(configuration.settings.refractive_index), backend)
         return cls(folder, configuration, recipe, model, scene=scene, reporter=reporter)
 
     @property
@@ -171,10 +158,9 @@ class OpenedRun:
         return {name: found[name].detach() for name in found.names}
 
     @property
-    def light(self) -> dict[str, Tensor] | None:
-        """Parameters of the learned light, ``texels`` [6, R, R, C] raw; None for a recipe without reflection."""
-        found = self.model.light
-        return None if found is None else {name: values.detach() for name, values in found.items()}
+    def light(self) -> dict[str, Tensor]:
+        """The learned light's parameters, such as ``texels`` [6, R, R, C] raw; empty for a recipe without."""
+        return {name: values.detach() for name, values in self.model.light.items()}
 
     @cached_property
     def scene(self) -> Scene:
@@ -266,13 +252,7 @@ def read_scene(
     Raises:
         PolarguideError: it cannot be read.
     """
-    with reporter.track(f"reading {Path(folder).name}", None) as advance:
-        scene = load_scene(
-            folder,
-            downscale=options.downscale,
-            transfer=options.transfer,
-            progress=lambda done, total: advance(done, total=total),
-        )
+    scene = load_scene(folder, downscale=options.downscale, transfer=options.transfer, reporter=reporter)
     for warning in scene.warnings:
         reporter.warn(warning)
     return scene
@@ -281,29 +261,3 @@ def read_scene(
 def _warn(text: str) -> None:
     """Warn the caller of this package."""
     warnings.warn(text, PolarguideWarning, stacklevel=4)
-
-
-def _check(path: Path, state: TrainingState) -> None:
-    """Refuse rows and texels whose shapes or values no training leaves."""
-    gaussians, count = state.gaussians, len(state.gaussians)
-    for name, shape in {**CORE_SHAPES, **SIDE_ROWS}.items():
-        if name not in gaussians:
-            if name in CORE_SHAPES:
-                raise _damaged(path, f"no {name}")
-        elif gaussians[name].dtype != torch.float32 or gaussians[name].shape != (count, *shape):
-            raise _damaged(path, f"{name} of shape {list(gaussians[name].shape)}, {gaussians[name].dtype}")
-        elif not bool(torch.isfinite(gaussians[name]).all()):
-            raise _damaged(path, f"{name} that are not finite")
-    for name, values in (state.environment.parameters if state.environment else {}).items():
-        if values.dtype != torch.float32 or not bool(torch.isfinite(values).all()):
-            raise _damaged(path, f"an environment's {name} that are not finite floats")
-        if name == "texels" and (
-            values.ndim != 4 or values.shape[0] != 6 or values.shape[1] != values.shape[2]
-        ):
-            raise _damaged(path, f"an environment of shape {list(values.shape)}")
-
-
-def _damaged(path: Path, found: str) -> PolarguideError:
-    return PolarguideError(
-        path, expected="the Gaussians of a training", found=found, remedy="Train again into a new folder."
-    )

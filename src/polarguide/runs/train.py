@@ -124,7 +124,7 @@ def train(
                 make_folder(out)
                 configuration.save(out)
             _Loop(trainer, out, session.checkpoint_every, reporter, should_stop, look).run()
-        model = GaussianModel(trainer.state, chosen.shading(settings.refractive_index), backend)
+        model = GaussianModel(trainer.state, trainer.shading, backend)
         if leads:
             write_run_ply(out / PLY, model.state, model.shading)
     return OpenedRun(out, configuration, chosen, model, scene=loaded, reporter=reporter)

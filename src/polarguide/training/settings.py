@@ -1,4 +1,4 @@
-"""What decides a training's result, and what each of its steps tells. Nothing here imports torch."""
+"""What decides a training's result, and what each of its steps reports. Nothing here imports torch."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class TrainSettings:
 
 @dataclass(frozen=True, eq=False)
 class StepReport:
-    """What a step tells the progress display.
+    """What a step reports to the progress display.
 
     Attributes:
         step, stage, gaussians: plain values.

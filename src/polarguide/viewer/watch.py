@@ -11,7 +11,7 @@ from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
 from polarguide.training.trainer import Trainer
-from polarguide.viewer.photographs import photographs
+from polarguide.viewer.frusta import photographs
 from polarguide.viewer.server import Viewer
 from polarguide.viewer.shown import shown_run, shown_training
 
@@ -35,7 +35,7 @@ def view_run(
     viewer = Viewer(
         lambda: shown,
         photographs(run.scene),
-        lit=run.light is not None,
+        shading=run.model.shading,
         host=host,
         port=port,
         title=f"polarguide {run.folder.resolve().name}",
@@ -64,7 +64,7 @@ def watched(trainer: Trainer, host: str, port: int, reporter: Reporter = SILENT)
     viewer = Viewer(
         lambda: shown_training(trainer),
         photographs(scene),
-        lit=trainer.state.environment is not None,
+        shading=trainer.shading,
         trains=True,
         host=host,
         port=port,

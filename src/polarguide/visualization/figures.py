@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 
 import cv2
@@ -14,6 +13,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.color import shown
 from polarguide.errors import PolarguideError
+from polarguide.files import write_whole
 from polarguide.visualization.sheet import Picture, check_picture, contact_sheet
 
 __all__ = [
@@ -150,10 +150,7 @@ def write_png(path: str | Path, rgb8: Picture) -> None:
         raise PolarguideError(
             path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
         )
-    data = png_bytes(rgb8)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data)
-    os.replace(partial, path)
+    write_whole(path, png_bytes(rgb8))
 
 
 def png_bytes(rgb8: Picture) -> bytes:

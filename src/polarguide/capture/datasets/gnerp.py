@@ -31,7 +31,7 @@ from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_pi
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
-from polarguide.records import parse_json
+from polarguide.records import read_record
 
 _SHAPES = ((3, 4), (4, 4))
 
@@ -107,7 +107,7 @@ def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32
 
 def _cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
     """Number -> camera, from ``w2c_mat_<i>`` and ``intrinsic``, or ``intrinsic_<i>`` where there is one."""
-    content: dict[str, Any] = parse_json(path, read_file(path))
+    content: dict[str, Any] = read_record(path, dict[str, Any])
     cameras = {}
     for key, value in content.items():
         match = re.fullmatch(r"w2c_mat_(\d{1,6})", key)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import stat
 from pathlib import Path
 from typing import Any
 
@@ -15,34 +14,12 @@ from polarguide.capture.formats.integrity import find_damage, stated_size
 from polarguide.capture.view import FULL_CODE
 from polarguide.color import srgb_decode_array
 from polarguide.errors import PolarguideError
+from polarguide.files import read_file as read_file
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 TRANSFERS = ("linear", "srgb")
 LARGEST_PIXELS = 150_000_000
 """More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
-_LARGEST_FILE = 1 << 31
-
-
-def read_file(path: Path) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        PolarguideError: the file cannot be read.
-    """
-    try:
-        about = path.stat()
-        if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):  # reading may never end
-            raise OSError("a pipe or device")
-        if about.st_size > _LARGEST_FILE:
-            raise OSError(f"one of {about.st_size} bytes, more than 2 GiB")
-        return path.read_bytes()
-    except OSError as error:
-        raise PolarguideError(
-            path,
-            expected="a readable file",
-            found=error.strerror or str(error),
-            remedy="Check that the file exists and may be read.",
-        ) from error
 
 
 def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
