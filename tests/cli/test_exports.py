@@ -19,7 +19,8 @@ from safetensors.torch import load_file, save_file
 
 import polarguide
 from polarguide.cli.app import run
-from polarguide.export import extras, points
+from polarguide import errors
+from polarguide.export import points
 from polarguide.gaussians.ply import read_ply
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 from polarguide.trajectory import camera_record
@@ -172,7 +173,7 @@ def test_a_missing_library_is_named(
     def missing(name: str) -> object:
         raise ImportError(name)
 
-    monkeypatch.setattr(extras.importlib, "import_module", missing)
+    monkeypatch.setattr(errors.importlib, "import_module", missing)
     line = refused("export", trained, "--format", kind, "--out", tmp_path)
     assert module.partition(".")[0] in line
     assert "pip install 'polarguide[export]'" in line
@@ -257,13 +258,13 @@ def test_damaged_checkpoints_are_refused(damage: str, refused, copy: Path, tmp_p
         metadata = file.metadata()
     tensors = load_file(path)
     if damage == "shape":
-        tensors["rows.sh_rest"] = tensors["rows.sh_rest"][:, :8].contiguous()
+        tensors["gaussians.sh_rest"] = tensors["gaussians.sh_rest"][:, :8].contiguous()
     elif damage == "nan":
-        tensors["rows.means"][0, 0] = float("nan")
+        tensors["gaussians.means"][0, 0] = float("nan")
     elif damage == "type":
-        tensors["rows.sh_dc"] = tensors["rows.sh_dc"].double()
+        tensors["gaussians.sh_dc"] = tensors["gaussians.sh_dc"].double()
     elif damage == "missing":
-        del tensors["rows.log_scales"]
+        del tensors["gaussians.log_scales"]
     elif damage == "texels":
         tensors["environment.texels"] = tensors["environment.texels"][:5].contiguous()
     save_file(tensors, path, metadata=metadata)
