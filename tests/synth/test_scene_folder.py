@@ -6,7 +6,6 @@ import hashlib
 import json
 import shlex
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +41,7 @@ TINY = {
          "material": {"color": [0.2, 0.3, 0.1]}},
     ],
 }  # fmt: skip
-SETTINGS = SynthSettings(width=16, height=16, samples=1, points=60)
+SETTINGS = SynthSettings(size="16x16", samples=1, points=60)
 
 
 @pytest.fixture(scope="module")
@@ -109,8 +108,8 @@ def test_rendering_goes_on_to_the_same_files(
 
 
 def test_the_files_do_not_depend_on_the_threads(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
-    settings = SynthSettings(width=64, height=48, samples=16, points=60)
-    two = replace(spec, camera=replace(spec.camera, views=2))
+    settings = SynthSettings(size="64x48", samples=16, points=60)
+    two = Overrides(views=2).apply(spec)
     digests = []
     for threads in (1, 2):
         out = synthesize(two, tmp_path / str(threads), settings, Reporter(), threads=threads)
@@ -149,7 +148,7 @@ def test_a_finished_scene_is_verified(
 
 def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSpec, tmp_path: Path) -> None:
     with pytest.raises(Exception, match="same settings"):
-        synthesize(spec, scene, SynthSettings(width=16, height=16, samples=2), Reporter())
+        synthesize(spec, scene, SynthSettings(size="16x16", samples=2), Reporter())
     (tmp_path / "x").write_text("mine")
     with pytest.raises(Exception, match="empty folder"):
         synthesize(spec, tmp_path, SETTINGS, Reporter())

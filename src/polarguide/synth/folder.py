@@ -16,7 +16,9 @@ from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
 from polarguide.polarizer import ANGLES, malus
+from polarguide.records import read_record
 from polarguide.synth.mesh import Array
+from polarguide.synth.schema import with_new_keys
 
 REQUEST = "request.json"
 STEP = 16
@@ -32,6 +34,7 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
     """
     path = out / REQUEST
     text = json.dumps(request, indent=1)
+    remedy = "Give another --out, or remove the folder."
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         out.mkdir(parents=True, exist_ok=True)
         write_file(path, text.encode())
@@ -43,12 +46,13 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
             found="one with other files",
             remedy="Give another --out.",
         )
-    if path.read_text(encoding="utf-8") != text:
+    before = with_new_keys(read_record(path, dict[str, Any], remedy=remedy))
+    if before != json.loads(text):
         raise PolarguideError(
             out,
             expected="a scene that was begun with the same settings",
             found="one with others",
-            remedy="Give another --out, or remove the folder.",
+            remedy=remedy,
         )
     return (out / "scene.json").exists()
 
