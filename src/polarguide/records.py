@@ -34,7 +34,7 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
     Raises:
         PolarguideError: the file cannot be read, or ``decode`` refuses it.
     """
-    return decode(read_file(path), kind, path, remedy=remedy)
+    return decode(read_file(path, remedy=remedy), kind, path, remedy=remedy)
 
 
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:
