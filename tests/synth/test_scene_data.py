@@ -63,6 +63,16 @@ def test_presets_are_full_scenes(name: str) -> None:
         assert not all(thing.foreground for thing in spec.things)
 
 
+def test_keys_of_earlier_versions_are_accepted() -> None:
+    color = {"type": "stripes", "colors": [[0, 0, 0]]}
+    things = [{"name": "ball", "shape": {"type": "ball"}, "material": {"color": color}}]
+    lights = [{"position": [0, 0, 2], "toward": [0, 0, 0], "size": [1, 1], "radiance": [1, 1, 1]}]
+    new = {**SMALL, "things": things, "lights": lights}
+    old = json.loads(json.dumps(new).replace('"color', '"colour').replace('"toward', '"towards'))
+    assert "towards" in json.dumps(old)
+    assert parse_scene(old, "old", folder=Path()) == parse_scene(new, "new", folder=Path())
+
+
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [

@@ -16,6 +16,8 @@ from polarguide.errors import PolarguideError
 
 Vector = tuple[float, float, float]
 Data = dict[str, Any]
+OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward"}
+"""Keys of scene files of earlier versions, and their present names."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +90,10 @@ class SceneSpec:
         name, about: what it is.
         camera: the views.
         things: objects.
-        environment: light from afar (see ``environment``).
-        lights: rectangles that shine, each with ``position``, ``toward``, ``size`` and ``radiance``.
-        depth: largest number of surfaces that a path of light touches.
-        clamp: see ``transport.Walk``.
+        environment: environment light (see ``environment``).
+        lights: rectangular area lights, each with ``position``, ``toward``, ``size`` and ``radiance``.
+        depth: largest number of surfaces on a light path.
+        clamp: see ``transport.PathLimits``.
         exposure: display value of radiance 1; None takes one by which 1 % of S0 lies above 1.5.
         folder: where relative file names of meshes and pictures start.
     """
@@ -137,6 +139,7 @@ def read_scene_file(path: Path) -> SceneSpec:
 
 def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
     """A scene from JSON data; ``where`` names it in messages."""
+    data = _with_current_keys(data)
     if not isinstance(data, dict):
         raise _wrong(where, "an object with name, camera, things and environment", type(data).__name__)
     values = dict(data, folder=folder)
@@ -159,6 +162,13 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
             f"{where} (camera)", "rings, 1 or more views, a field of view from 1 to 150 degrees", str(camera)
         )
     return spec
+
+
+def _with_current_keys(data: Any) -> Any:
+    """The data with the keys of earlier versions renamed."""
+    if isinstance(data, dict):
+        return {OLD_KEYS.get(key, key): _with_current_keys(value) for key, value in data.items()}
+    return [_with_current_keys(item) for item in data] if isinstance(data, list) else data
 
 
 def _check_material(material: Material, where: str) -> None:
