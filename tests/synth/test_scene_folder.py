@@ -90,10 +90,10 @@ def test_points_lie_near_surfaces(scene: Path) -> None:
 def test_rendering_goes_on_to_the_same_files(
     scene: Path, spec: SceneSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stopped(job: runner.Job, number: int) -> None:
-        if number == 2:
+    def stopped(job: runner.Job, opaque: int) -> None:
+        if opaque == 2:
             raise KeyboardInterrupt
-        render(job, number)
+        render(job, opaque)
 
     render = runner._render_view
     out = tmp_path / "again"
@@ -242,7 +242,7 @@ def test_without_mitsuba_the_extra_is_named(
 
 
 def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.synth.variant._llvm_lack", lambda: "none was found")
+    monkeypatch.setattr("polarguide.synth.variant._missing_llvm", lambda: "none was found")
     try:
         found = choose_variant("rgb")
         assert not found.fast

@@ -88,10 +88,10 @@ class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
         name, about: what it is.
         camera: the views.
         things: objects.
-        environment: light from afar (see ``environment``).
-        lights: rectangles that shine, each with ``position``, ``toward``, ``size`` and ``radiance``.
-        depth: largest number of surfaces that a path of light touches.
-        clamp: see ``transport.Walk``.
+        environment: environment light (see ``environment``).
+        lights: rectangular area lights, each with ``position``, ``toward``, ``size`` and ``radiance``.
+        depth: largest number of surfaces on a light path.
+        clamp: see ``transport.PathLimits``.
         exposure: display value of radiance 1; None takes one by which 1 % of S0 lies above 1.5.
         folder: where relative file names of meshes and pictures start.
     """
@@ -129,7 +129,7 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
     Raises:
         PolarguideError: it lacks a field, has an unknown one or a value out of range.
     """
-    spec = decode(with_new_keys(data), SceneSpec, where, remedy=REMEDY)
+    spec = decode(with_current_keys(data), SceneSpec, where, remedy=REMEDY)
     names = [thing.name for thing in spec.things]
     if len(set(names)) < len(names):
         raise PolarguideError(
@@ -138,8 +138,8 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
     return msgspec.structs.replace(spec, folder=folder)
 
 
-def with_new_keys(data: Any) -> Any:
+def with_current_keys(data: Any) -> Any:
     """JSON data with today's names of fields."""
     if isinstance(data, dict):
-        return {OLD_KEYS.get(key, key): with_new_keys(value) for key, value in data.items()}
-    return [with_new_keys(value) for value in data] if isinstance(data, list) else data
+        return {OLD_KEYS.get(key, key): with_current_keys(value) for key, value in data.items()}
+    return [with_current_keys(value) for value in data] if isinstance(data, list) else data
