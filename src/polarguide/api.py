@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Mapping
 from functools import cached_property
@@ -14,7 +13,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.record import validate_metrics
+from polarguide.evaluation.record import read_metrics
 from polarguide.raster import DeviceName
 from polarguide.runs.opened import TrainedRun, open_trained
 from polarguide.shading.result import LAYERS, RenderResult
@@ -64,10 +63,9 @@ class Model:
         return {name: self._run.state.gaussians[name].detach() for name in self._run.state.gaussians.names}
 
     @property
-    def environment(self) -> dict[str, Tensor] | None:
-        """The learned light's parameters, ``texels`` [6, R, R, C] raw; None for a recipe without reflection."""
-        found = self._run.environment
-        return None if found is None else {name: values.detach() for name, values in found.items()}
+    def light(self) -> dict[str, Tensor]:
+        """The learned light's parameters, such as ``texels`` [6, R, R, C] raw; empty for a recipe without."""
+        return {name: values.detach() for name, values in self._run.light.items()}
 
     @cached_property
     def scene(self) -> Scene:
@@ -134,16 +132,7 @@ class Model:
         Raises:
             PolarguideError: the run has not been scored, or the file is not such a record.
         """
-        path = self.folder / "metrics.json"
-        try:
-            record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            found = "none" if isinstance(error, FileNotFoundError) else f"something else ({error})"
-            raise PolarguideError(
-                path, expected="the scores of a run", found=found, remedy="Run polarguide eval."
-            ) from None
-        validate_metrics(record, where=path)
-        return record
+        return read_metrics(self.folder)
 
 
 def load(

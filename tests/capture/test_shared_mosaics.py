@@ -17,7 +17,7 @@ SETTINGS = PrepareSettings(sensor="IMX250MZR", poses="none")
 
 pytestmark = [
     pytest.mark.shared,
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="the mosaics are not beside the checkout (../shared)"),
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="no captures in ../shared -> ln -s FOLDER ../shared"),
 ]
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import encode, gained, one_view, write_scene
+from captures import gained, one_view, write_scene
+from tiny_capture import encode_srgb
 
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.measurements import measure_view
@@ -37,7 +38,7 @@ def test_a_sound_capture_is_not_flagged(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (encode, {"encoding": "wrong"}),
+        (encode_srgb, {"encoding": "wrong"}),
         (lambda v: v**1.6, {"encoding": "wrong"}),
         (gained(1.05, 1, 1, 1), {"exposure": "warning"}),
         (gained(1, 1.05, 1, 1), {"exposure": "warning"}),

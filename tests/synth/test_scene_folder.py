@@ -42,6 +42,8 @@ TINY = {
     ],
 }  # fmt: skip
 SETTINGS = SynthSettings(size="16x16", samples=1, points=60)
+# The scalar variant has no threads, and takes minutes for pictures with little noise.
+COMPILED = pytest.mark.parametrize("variant", ["compiled"], indirect=True)
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +109,7 @@ def test_rendering_goes_on_to_the_same_files(
         assert (scene / name).read_text() == (out / name).read_text()
 
 
+@COMPILED
 def test_the_files_do_not_depend_on_the_threads(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
     settings = SynthSettings(size="64x48", samples=16, points=60)
     two = Overrides(views=2).apply(spec)
@@ -156,6 +159,7 @@ def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSp
         synthesize(spec, tmp_path / "new", SynthSettings(samples=0), Reporter())
 
 
+@COMPILED
 @pytest.mark.parametrize("sensor", ["imx250mzr", "imx250myr"])
 def test_mosaics_come_back_through_prepare(
     sensor: str, variant: Variant, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import resource
 from pathlib import Path
@@ -16,28 +15,13 @@ import polarguide
 from polarguide import _native
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, console, open_run, use_threads
-from polarguide.errors import PolarguideError
 from polarguide.evaluation import ViewTarget, score_view, write_metrics
-from polarguide.evaluation.record import RUN_KEYS, validate_metrics
+from polarguide.evaluation.record import METRICS_FILE
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.speed import frames_per_second
+from polarguide.evaluation.table import shown_metrics
 from polarguide.raster import DeviceName
 from polarguide.runs.folder import RunLog
-
-METRICS = "metrics.json"
-SHOWN_KEYS = (
-    ("psnr", "PSNR", "dB"),
-    ("psnr_foreground", "PSNR, foreground", "dB"),
-    ("psnr_reflective", "PSNR, reflective", "dB"),
-    ("ssim", "SSIM", ""),
-    ("normal_mae_deg", "normal error", "degrees"),
-    ("normal_within_11", "normals within 11.25 degrees", ""),
-    ("specular_psnr", "specular layer PSNR", "dB"),
-    ("diffuse_psnr", "diffuse layer PSNR", "dB"),
-    ("fps", "frames a second", ""),
-    ("gaussians", "Gaussians", ""),
-    ("train_seconds", "training", "s"),
-)
 
 
 def evaluate(
@@ -69,7 +53,7 @@ def evaluate_run(opened: OpenRun, *, speed: bool = True) -> dict[str, Any]:
         views[view.name] = score_view(target, opened.draw(view))
     seconds, alone = RunLog(opened.folder).elapsed()
     record = write_metrics(
-        opened.folder / METRICS,
+        opened.folder / METRICS_FILE,
         views=views,
         run={
             "fps": _speed(opened, normals=False) if speed else None,
@@ -83,32 +67,6 @@ def evaluate_run(opened: OpenRun, *, speed: bool = True) -> dict[str, Any]:
     )
     _print(record, opened)
     return record
-
-
-def shown_metrics(run: Path) -> list[tuple[str, str]]:
-    """Labels and values of a run's scores, for people; nothing where it has not been scored.
-
-    Raises:
-        PolarguideError: ``metrics.json`` is not what ``eval`` writes.
-    """
-    path = run / METRICS
-    if not path.exists():
-        return []
-    try:
-        record = json.loads(path.read_text())
-    except ValueError as error:
-        raise PolarguideError(
-            path,
-            expected="the scores of a run",
-            found=f"no JSON ({error})",
-            remedy="Run polarguide eval again.",
-        ) from None
-    validate_metrics(record, where=path)
-    return [
-        (f"{label}, test views", f"{record[key]:.3f} {unit}".rstrip())
-        for key, label, unit in SHOWN_KEYS
-        if key not in RUN_KEYS and record[key] is not None
-    ]
 
 
 def _speed(opened: OpenRun, **layers: bool) -> float | None:
@@ -153,11 +111,7 @@ def _print(record: dict[str, Any], opened: OpenRun) -> None:
     )
     table.add_column("metric")
     table.add_column("value", justify="right")
-    for key, label, unit in SHOWN_KEYS:
-        value = record[key]
-        text = "n/a" if value is None else f"{value:,}" if isinstance(value, int) else f"{value:.3f}"
-        table.add_row(label, f"{text} {unit}".rstrip())
-    lpips = record["lpips"]
-    table.add_row("LPIPS", f"{lpips:.3f}" if lpips is not None else f"n/a ({record['lpips_reason']})")
+    for label, text in shown_metrics(record):
+        table.add_row(label, text)
     console.print(table)
-    console.print(f"metrics: {opened.folder / METRICS}")
+    console.print(f"metrics: {opened.folder / METRICS_FILE}")

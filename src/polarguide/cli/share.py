@@ -8,8 +8,9 @@ from typing import Annotated
 import tyro
 
 from polarguide.cli.common import OpenRun, console, open_run, use_threads
-from polarguide.cli.evaluate import shown_metrics
 from polarguide.errors import PolarguideError
+from polarguide.evaluation.record import METRICS_FILE, read_metrics
+from polarguide.evaluation.table import shown_metrics
 from polarguide.export.share import share_page, write_page
 
 
@@ -51,13 +52,18 @@ def page_of(opened: OpenRun, *, title: str = "", caption: str = "") -> str:
     """The page of a run; the photographs' poses are its views, the first test view is where it begins."""
     views = opened.scene.test_views + opened.scene.train_views
     configuration = opened.configuration
+    scored = (opened.folder / METRICS_FILE).exists()
+    scores = shown_metrics(read_metrics(opened.folder), scores_only=True) if scored else []
     return share_page(
         opened.state.gaussians,
-        opened.environment,
+        opened.light,
         opened.shading,
         {view.name: view.camera for view in views},
         first=views[0].name,
         title=title or opened.scene.name,
         caption=caption or f"{configuration.recipe}, {opened.state.step:,} steps",
-        metrics=[*shown_metrics(opened.folder), ("Gaussians", f"{len(opened.state.gaussians):,}")],
+        metrics=[
+            *((f"{label}, test views", text) for label, text in scores),
+            ("Gaussians", f"{len(opened.state.gaussians):,}"),
+        ],
     )
