@@ -146,7 +146,7 @@ def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
                 raise KeyboardInterrupt
             return inner(self, *arguments, **more)
 
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        with monkeypatch.context(), pytest.raises(KeyboardInterrupt):
             train(resume=(tmp_path / "run" / CONFIGURATION).exists())
 
     interrupted_in("_backpropagate", 17)
