@@ -61,10 +61,8 @@ def _view(camera: Camera, device: torch.device) -> _View:
     """The camera on a device, kept for each camera, so that a second rendering copies nothing there."""
     kept = _views.setdefault(camera, {})
     if device not in kept:
-        matrix = torch.eye(4, dtype=torch.float64)
-        matrix[:3, :3], matrix[:3, 3] = camera.rotation, camera.translation
-        intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        kept[device] = _View(*(t[None].to(device, torch.float32) for t in (matrix, intrinsics)))
+        matrices = (camera.world_to_camera, camera.intrinsics)
+        kept[device] = _View(*(t[None].to(device, torch.float32) for t in matrices))
     return kept[device]
 
 
