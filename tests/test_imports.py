@@ -18,6 +18,7 @@ ROOMS = (
     "system",
     "progress",
     "color",
+    "polarizer",
     "vectors",
     "camera",
     "scene_frame",

@@ -14,8 +14,9 @@ from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture import ColmapModel, checks
 from polarguide.capture.calibration import Calibration, oriented
-from polarguide.inspection.pictures import Pictures
+from polarguide.inspection.capture import InspectedView
 from polarguide.inspection.surfaces import Surface
+from polarguide.polarizer import ANGLES
 
 WIDTH, HEIGHT, INDEX = 72, 64, 1.5
 
@@ -26,7 +27,7 @@ class Sighted(ColmapModel):
 
     seen: Tensor = dataclasses.field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.bool))
 
-    def sightings(self, views: object) -> Tensor:
+    def observations(self, views: object) -> Tensor:
         return self.seen
 
 
@@ -56,18 +57,20 @@ def ball(camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     return normal.float(), (distance * rays[..., 2]).float(), hit
 
 
-def pictures_of(name: str, camera: Camera, specular: float, diffuse: float, noise: float = 0.0) -> Pictures:
+def pictures_of(
+    name: str, camera: Camera, specular: float, diffuse: float, noise: float = 0.0
+) -> InspectedView:
     """The four pictures of the ball before an unpolarized gray wall."""
     normal, _, hit = ball(camera)
     gloss = torch.where(hit, specular, 0.0)[..., None].expand(HEIGHT, WIDTH, 3)
     body = torch.where(hit, diffuse, 0.4)[..., None].expand(HEIGHT, WIDTH, 3)
     normal = torch.where(hit[..., None], normal, -camera.rays())
     stokes = optics.predicted_stokes(gloss, body, normal, camera.rays(), INDEX)
-    values = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in (0, 45, 90, 135)])
+    values = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in ANGLES])
     generator = torch.Generator().manual_seed(len(name) + ord(name[-1]))
     values = values + noise * torch.randn(values.shape, generator=generator)
     return with_intensities(
-        Pictures(
+        InspectedView(
             name,
             torch.zeros(0, dtype=torch.uint16),
             torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
@@ -80,20 +83,20 @@ def pictures_of(name: str, camera: Camera, specular: float, diffuse: float, nois
     )
 
 
-def with_intensities(view: Pictures, values: np.ndarray) -> Pictures:
+def with_intensities(view: InspectedView, values: np.ndarray) -> InspectedView:
     """A view with other pictures."""
     codes = np.rint(np.clip(values, 0, 1) * 65535).astype(np.uint16)
     usable = ~(view.invalid | view.saturated).numpy()
     return dataclasses.replace(view, codes=torch.from_numpy(codes), measures=checks.measure(codes, usable))
 
 
-def mistaken(view: Pictures, *, files: tuple[int, ...] = (0, 45, 90, 135), zero: float = 0.0) -> Pictures:
+def mistaken(view: InspectedView, *, files: tuple[int, ...] = ANGLES, zero: float = 0.0) -> InspectedView:
     """The view as an instrument with this zero and these file names would have stored it."""
     values = oriented(view.intensities().numpy(), Calibration(zero=-zero))
-    return with_intensities(view, values[[(0, 45, 90, 135).index(angle) for angle in files]])
+    return with_intensities(view, values[[ANGLES.index(angle) for angle in files]])
 
 
-def surfaces(views: tuple[Pictures, ...]) -> list[tuple[Pictures, Surface]]:
+def surfaces(views: tuple[InspectedView, ...]) -> list[tuple[InspectedView, Surface]]:
     """Views with the true surface."""
     pairs = []
     for view in views:
@@ -103,7 +106,9 @@ def surfaces(views: tuple[Pictures, ...]) -> list[tuple[Pictures, Surface]]:
     return pairs
 
 
-def views_around(specular: float = 0.3, diffuse: float = 0.03, noise: float = 0.001) -> tuple[Pictures, ...]:
+def views_around(
+    specular: float = 0.3, diffuse: float = 0.03, noise: float = 0.001
+) -> tuple[InspectedView, ...]:
     """Fourteen views from two heights, each with a roll of its own."""
     places = [(2 * math.pi * k / 14, 0.25 if k % 2 else 0.6, 0.2 * (k % 5 - 2)) for k in range(14)]
     return tuple(
@@ -112,7 +117,7 @@ def views_around(specular: float = 0.3, diffuse: float = 0.03, noise: float = 0.
     )
 
 
-def model_of(views: tuple[Pictures, ...], count: int = 400) -> Sighted:
+def model_of(views: tuple[InspectedView, ...], count: int = 400) -> Sighted:
     """Points on the ball, seen by the views toward which they face."""
     generator = torch.Generator().manual_seed(1)
     places = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)

@@ -22,10 +22,11 @@ from camera_files import (
 )
 
 from polarguide.capture.calibration import Calibration
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 COLORED = PrepareSettings(sensor="IMX250MYR", poses="none", gains="none", demosaic="quarter")
-GREY = replace(COLORED, sensor="IMX250MZR")
+GRAY = replace(COLORED, sensor="IMX250MZR")
 
 
 def summary(scene: Path) -> dict:
@@ -80,7 +81,7 @@ def test_regions_of_interest(tmp_path: Path, offset: tuple[int, int], pattern: t
     color = pattern is COLOR
     light = smooth_light(49, 65, color=color)
     write_mosaic(tmp_path / "in" / "v.png", mosaic(behind(light), pattern, offset))
-    settings = replace(COLORED if color else GREY, offset_x=offset[0], offset_y=offset[1])
+    settings = replace(COLORED if color else GRAY, offset_x=offset[0], offset_y=offset[1])
     prepare_scene(tmp_path / "in", tmp_path / "out", settings)
     expected = superpixels(light, pattern, offset if color else (0, 0))
     if not color:
@@ -149,7 +150,7 @@ def test_gains_of_the_angles_are_found(tmp_path: Path, pattern: tuple[str, ...])
     light = smooth_light(color=pattern is COLOR)
     response = np.array([0.98, 1.0, 0.98, 1.0])[:, None, None, None]
     write_mosaic(tmp_path / "in" / "v.png", mosaic(behind(light) * response, pattern))
-    settings = replace(COLORED if pattern is COLOR else GREY, gains="auto")
+    settings = replace(COLORED if pattern is COLOR else GRAY, gains="auto")
     prepare_scene(tmp_path / "in", tmp_path / "out", settings)
     found = summary(tmp_path / "out")
     assert found["pair_ratio"] == pytest.approx(0.98, abs=0.003)
@@ -173,7 +174,7 @@ def test_order_sense_and_zero(tmp_path: Path, calibration: Calibration, angles: 
     """The sensor's "0" samples saw the light behind the angle that the calibration says, and so on."""
     light = smooth_light(color=False) * 0.9
     write_mosaic(tmp_path / "in" / "v.png", mosaic(behind(light, angles), MONO))
-    prepare_scene(tmp_path / "in", tmp_path / "out", replace(GREY, calibration=calibration))
+    prepare_scene(tmp_path / "in", tmp_path / "out", replace(GRAY, calibration=calibration))
     found = summary(tmp_path / "out")
     expected = behind(light).reshape(4, 12, 4, 16, 4, 3).mean(axis=(2, 4)) * found["scale"]
     np.testing.assert_allclose(read_polar(tmp_path / "out", "v"), expected, atol=0.025)

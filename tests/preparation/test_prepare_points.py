@@ -9,28 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from camera_files import behind, smooth_light, write_shots
+from heard import Heard
 from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
 from polarguide.capture.colmap import triangulate as points_module
-from polarguide.capture.colmap.sample import region_samples
+from polarguide.capture.colmap.visual_hull import sample_visual_hull
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, Reporter, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 FILTER = PrepareSettings(gains="none", align=False, transfer="linear")
-
-
-class Heard(Reporter):
-    """Keeps what was said."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.said.append(text)
-
-    warn = say
 
 
 def summary(scene: Path) -> dict:
@@ -90,7 +80,7 @@ def test_pictures_without_texture_get_samples(tmp_path: Path) -> None:
     prepare_scene(tmp_path / "in", tmp_path / "out", settings, heard)
     found = summary(tmp_path / "out")["points"]
     assert found["from"] == "random samples in the cameras' common field of view"
-    assert any("They know nothing of the surface" in text for text in heard.said)
+    assert any("They do not lie on the surface" in text for text in heard.said)
     places = load_scene(tmp_path / "out").points.numpy()
     assert len(places) == found["count"] > 10_000
     assert np.abs(places.mean(axis=0)).max() < 0.1
@@ -128,7 +118,7 @@ def test_cameras_that_look_apart_are_refused(tmp_path: Path) -> None:
         write_shots(tmp_path / "in", view, behind(smooth_light()))
     (tmp_path / "model").mkdir()
     write_cameras(tmp_path / "model", apart)
-    with pytest.raises(PolarguideError, match="expected poses whose cameras look at one place"):
+    with pytest.raises(PolarguideError, match="expected poses of cameras with a common field of view"):
         prepare_scene(tmp_path / "in", tmp_path / "out", replace(FILTER, poses=str(tmp_path / "model")))
     assert not (tmp_path / "out" / "scene.json").exists()
 
@@ -146,7 +136,7 @@ def test_samples_fill_the_hull_of_a_ball(distorted: bool) -> None:
             view: replace(camera, model="SIMPLE_RADIAL", parameters=parameters)
             for view, camera in cameras.items()
         }
-    places = region_samples(cameras, dict.fromkeys(cameras, disc), 5000, np.random.default_rng(0))
+    places = sample_visual_hull(cameras, dict.fromkeys(cameras, disc), 5000, np.random.default_rng(0))
     assert len(places) == 5000
     assert np.hypot(places[:, 0], places[:, 2]).max() < 0.56
     assert np.abs(places[:, 1]).max() < 0.56
@@ -162,5 +152,5 @@ def test_parallel_cameras_are_not_a_traceback() -> None:
         )
         for index in range(3)
     }
-    places = region_samples(cameras, {}, 100, np.random.default_rng(0))
+    places = sample_visual_hull(cameras, {}, 100, np.random.default_rng(0))
     assert len(places) == 0 or (places[:, 2] > 0).all()

@@ -18,11 +18,11 @@ from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.cli.app import run
 from polarguide.errors import PolarguideError
-from polarguide.preparation import Reporter
+from polarguide.progress import Reporter
 from polarguide.synth import render as runner
 from polarguide.synth import sweep as sweeps
 from polarguide.synth.manifest import MANIFEST, scene_digest, verify_scene
-from polarguide.synth.render import synthesise
+from polarguide.synth.render import synthesize
 from polarguide.synth.schema import SceneSpec, parse_scene
 from polarguide.synth.sensor import Sensor
 from polarguide.synth.settings import Overrides, SynthSettings
@@ -43,6 +43,8 @@ TINY = {
     ],
 }  # fmt: skip
 SETTINGS = SynthSettings(width=16, height=16, samples=1, points=60)
+# The scalar variant has no threads, and takes minutes for pictures with little noise.
+COMPILED = pytest.mark.parametrize("variant", ["compiled"], indirect=True)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +54,7 @@ def spec() -> SceneSpec:
 
 @pytest.fixture(scope="module")
 def scene(spec: SceneSpec, variant: Variant, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return synthesise(spec, tmp_path_factory.mktemp("synth") / "tiny", SETTINGS, Reporter(), threads=1)
+    return synthesize(spec, tmp_path_factory.mktemp("synth") / "tiny", SETTINGS, Reporter(), threads=1)
 
 
 def test_the_folder_is_read_like_a_capture(scene: Path) -> None:
@@ -100,20 +102,21 @@ def test_rendering_goes_on_to_the_same_files(
     out = tmp_path / "again"
     monkeypatch.setattr(runner, "_render_view", stopped)
     with pytest.raises(KeyboardInterrupt):
-        synthesise(spec, out, SETTINGS, Reporter(), threads=1)
+        synthesize(spec, out, SETTINGS, Reporter(), threads=1)
     assert not (out / "scene.json").exists()
     monkeypatch.setattr(runner, "_render_view", render)
-    synthesise(spec, out, SETTINGS, Reporter(), threads=1)
+    synthesize(spec, out, SETTINGS, Reporter(), threads=1)
     for name in (MANIFEST, "scene.json"):
         assert (scene / name).read_text() == (out / name).read_text()
 
 
+@COMPILED
 def test_the_files_do_not_depend_on_the_threads(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
     settings = SynthSettings(width=64, height=48, samples=16, points=60)
     two = replace(spec, camera=replace(spec.camera, views=2))
     digests = []
     for threads in (1, 2):
-        out = synthesise(two, tmp_path / str(threads), settings, Reporter(), threads=threads)
+        out = synthesize(two, tmp_path / str(threads), settings, Reporter(), threads=threads)
         digests.append(scene_digest(out))
     choose_variant("rgb", threads=1)
     assert digests[0] == digests[1]
@@ -137,26 +140,27 @@ def test_a_finished_scene_is_verified(
 ) -> None:
     out = tmp_path / "copy"
     shutil.copytree(scene, out)
-    synthesise(spec, out, SETTINGS, Reporter(), threads=1)
+    synthesize(spec, out, SETTINGS, Reporter(), threads=1)
     if lost:
         (out / name).unlink()
     else:
         (out / name).write_bytes((out / name).read_bytes() + b"x")
     with pytest.raises(PolarguideError, match=r"no file" if lost else r"another") as error:
-        synthesise(spec, out, SETTINGS, Reporter(), threads=1)
+        synthesize(spec, out, SETTINGS, Reporter(), threads=1)
     assert name in str(error.value)
 
 
 def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSpec, tmp_path: Path) -> None:
     with pytest.raises(Exception, match="same settings"):
-        synthesise(spec, scene, SynthSettings(width=16, height=16, samples=2), Reporter())
+        synthesize(spec, scene, SynthSettings(width=16, height=16, samples=2), Reporter())
     (tmp_path / "x").write_text("mine")
     with pytest.raises(Exception, match="empty folder"):
-        synthesise(spec, tmp_path, SETTINGS, Reporter())
+        synthesize(spec, tmp_path, SETTINGS, Reporter())
     with pytest.raises(Exception, match="--samples"):
-        synthesise(spec, tmp_path / "new", SynthSettings(samples=0), Reporter())
+        synthesize(spec, tmp_path / "new", SynthSettings(samples=0), Reporter())
 
 
+@COMPILED
 @pytest.mark.parametrize("sensor", ["imx250mzr", "imx250myr"])
 def test_mosaics_come_back_through_prepare(
     sensor: str, variant: Variant, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -228,7 +232,7 @@ def test_members_of_a_sweep_sort_like_their_numbers(
         (out / "scene.json").write_text("{}")
         return out
 
-    monkeypatch.setattr(sweeps, "synthesise", written)
+    monkeypatch.setattr(sweeps, "synthesize", written)
     family = Sweep("noise", (0.0, 1.5, 12.0))
     folders = sweep_scenes(spec, tmp_path, SETTINGS, Overrides(), family, Reporter())
     assert [folder.name for folder in folders] == ["noise-00", "noise-01.5", "noise-12"]

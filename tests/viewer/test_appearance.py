@@ -1,4 +1,4 @@
-"""What a visitor sees, against the renderer itself."""
+"""What the viewer shows, against the renderer itself."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 from random_runs import KINDS, ring
-from sights import around, photograph, shown
+from viewer_scenes import frame_of_scene, photograph, shown
 
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.appearance import MEASURED, Appearance, Crop, Painter
-from polarguide.viewer.lens import fit
+from polarguide.viewer.viewport import letterbox
 from polarguide.visualization import figures
 
 CAMERAS = ring()
@@ -24,13 +24,13 @@ PLAIN = Appearance()
 
 
 def paint(seen, appearance=PLAIN, view=None, camera=CAMERA, **named):
-    return Painter(around()).paint(seen, camera, appearance, view, **named)
+    return Painter(frame_of_scene()).paint(seen, camera, appearance, view, **named)
 
 
 @pytest.mark.parametrize("recipe", KINDS)
 def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
     seen = shown(recipe)
-    result = seen.render(CAMERA, seen.gaussians, seen.environment, depth=True)
+    result = seen.render(CAMERA, depth=True)
     for layer in LAYERS:
         picture = paint(seen, Appearance(layer=layer))
         if getattr(result, layer) is None:
@@ -45,7 +45,7 @@ def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
 
 def test_exposure_and_reflection():
     seen = shown()
-    result = seen.render(CAMERA, seen.gaussians, seen.environment, depth=False)
+    result = seen.render(CAMERA, depth=False)
     brighter = paint(seen, Appearance(exposure=-1.5))
     assert np.array_equal(brighter, figures.radiance_to_rgb(result.final / 2**1.5))
     without = paint(seen, Appearance(strength=0.0))
@@ -65,7 +65,7 @@ def test_turning_the_environment_turns_what_a_mirror_shows():
     assert far > 5 * barely
     assert far > 1
     # Light that is the same all around stays; so does what does not reflect.
-    even = replace(seen, environment={"texels": torch.full((6, 8, 8, 3), 0.3)})
+    even = replace(seen, light={"texels": torch.full((6, 8, 8, 3), 0.3)})
     assert np.abs(paint(even, Appearance(turn=90)).astype(int) - paint(even)).max() <= 1
     base = Appearance(layer="base")
     assert np.array_equal(paint(seen, replace(base, turn=90)), paint(seen, base))
@@ -90,11 +90,11 @@ def test_a_crop_shows_what_is_inside():
 
 
 def test_a_crops_corners_are_inside_and_a_bit_more_is_not():
-    place, crop = around(), Crop((-0.5, -0.25, -1), (0.5, 0.75, 0.1))
-    corners = crop.corners(place)
+    placement, crop = frame_of_scene(), Crop((-0.5, -0.25, -1), (0.5, 0.75, 0.1))
+    corners = crop.corners(placement)
     middle = corners.mean(dim=0)
-    assert crop.inside(middle + 0.999 * (corners - middle), place).all()
-    assert not crop.inside(middle + 1.001 * (corners - middle), place).any()
+    assert crop.inside(middle + 0.999 * (corners - middle), placement).all()
+    assert not crop.inside(middle + 1.001 * (corners - middle), placement).any()
 
 
 def test_at_a_photograph_the_pose_is_the_photographs():
@@ -102,7 +102,7 @@ def test_at_a_photograph_the_pose_is_the_photographs():
     view = photograph("v2", CAMERAS["v2"], seen).view
     window = replace(CAMERA, width=200, height=90)
     picture = paint(seen, view=view, camera=window)
-    expected = fit(view.camera, (200, 90)).camera(view.camera)
+    expected = letterbox(view.camera, (200, 90)).camera(view.camera)
     assert np.array_equal(picture, paint(seen, camera=expected))
 
 
@@ -118,14 +118,14 @@ def test_what_was_measured_there():
     assert np.abs(found["DoLP"].astype(int) - dolp)[there].max() <= 3
     aolp = figures.aolp_to_rgb(torch.zeros(there.shape))
     assert np.abs(found["AoLP"].astype(int) - aolp)[there].max() <= 3
-    final = seen.render(CAMERA, seen.gaussians, seen.environment, depth=False).final
+    final = seen.render(CAMERA, depth=False).final
     assert np.array_equal(found["error"], figures.error_to_rgb(final, view.photograph()))
     right = paint(replace(seen, gaussians=seen.gaussians), Appearance(layer="error"), view)
     assert np.array_equal(right, found["error"])
 
 
 def test_colors_of_depths_stay_while_the_camera_moves():
-    seen, painter, depth = shown(), Painter(around()), Appearance(layer="depth")
+    seen, painter, depth = shown(), Painter(frame_of_scene()), Appearance(layer="depth")
     first = painter.paint(seen, CAMERA, depth)
     nearer = replace(CAMERA, translation=0.7 * CAMERA.translation)
     moving = painter.paint(seen, nearer, depth, settled=False)

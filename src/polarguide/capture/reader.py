@@ -1,13 +1,13 @@
-"""``load_scene``: a capture folder -> Scene."""
+"""Read a capture folder: ``read_views`` reads its pictures, ``load_scene`` makes a scene with poses of them."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,14 +15,33 @@ from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unused_poses
 from polarguide.capture.formats.pictures import TRANSFERS
-from polarguide.capture.layout import find_layout, select_views
+from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import held_out, refractive_index_of
 from polarguide.capture.view import Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, read_view
 from polarguide.errors import PolarguideError
-from polarguide.records import decode
+from polarguide.progress import SILENT, Reporter
 
 _THREADS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class StoredViews:
+    """The views of a capture as read, with a pose or without.
+
+    Attributes:
+        data: the views, sorted by name.
+        cameras: of each view at the size of its averaged pictures; None where the model has no pose.
+        measures: ``checks.measure`` of each view.
+        largest_value: the largest value that the files can store, 255 or 65535.
+        full_scale: the stored value at which the capture saturates; None if nothing is saturated.
+    """
+
+    data: tuple[ViewData, ...]
+    cameras: tuple[Camera | None, ...]
+    measures: tuple[checks.Measures, ...]
+    largest_value: int
+    full_scale: int | None
 
 
 def load_scene(
@@ -31,7 +50,7 @@ def load_scene(
     downscale: int = 1,
     transfer: str = "linear",
     views: Sequence[str] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    reporter: Reporter = SILENT,
 ) -> Scene:
     """Read a capture.
 
@@ -47,7 +66,7 @@ def load_scene(
             only where all of its box is; it is invalid or saturated where any of it is.
         transfer: how the files are encoded: "linear", or "srgb" for display-encoded pictures.
         views: names of the views to read; all if None. The split is that of the whole capture.
-        progress: called with the number of views read and the number to read, after each view.
+        reporter: receives the progress.
 
     Returns:
         The scene; ``Scene.warnings`` says what looks wrong without preventing its use.
@@ -56,40 +75,32 @@ def load_scene(
         PolarguideError: something in the capture cannot be used; the message names the file and the remedy.
     """
     root = Path(path)
-    _check_arguments(downscale, transfer)
+    _check_downscale(downscale)
+    check_transfer(transfer)
     layout = find_layout(root)
     names = select_views(layout, views)
     model = read_model(root)
     files = Files()
     for file in model.files:
         files.read(file)
-    tests = held_out(root / "split.json", _read_json(files, root / "split.json"), layout.names)
-    index = refractive_index_of(root / "scene.json", _read_json(files, root / "scene.json"))
+    tests = held_out(root / "split.json", files.read_if_there(root / "split.json"), layout.names)
+    index = refractive_index_of(root / "scene.json", files.read_if_there(root / "scene.json"))
     for name in names:
         model.camera(name)  # a missing pose is to be found before the pictures are read
 
-    def read(name: str) -> ViewData:
-        return read_view(layout, name, factor=downscale, transfer=transfer)
-
-    data: list[ViewData] = []
-    cameras: list[Camera] = []
-    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-        for item in pool.map(read, names):
-            data.append(item)
-            cameras.append(
-                fit_camera(model.camera(item.name), *item.size, folder=model.folder, view=item.name)
-            )
-            files.digests.update(item.digests)
-            if progress is not None:
-                progress(len(data), len(names))
-    scale, warnings = _judge(data, transfer)
+    stored = read_views(layout, names, model, downscale=downscale, transfer=transfer, reporter=reporter)
+    for item in stored.data:
+        files.digests.update(item.digests)
+    posed_views = tuple(
+        item.view(camera, stored.full_scale)
+        for item, camera in zip(stored.data, stored.cameras, strict=True)
+        if camera is not None
+    )
+    warnings = [*layout.warnings, *model.warnings, *_pose_warnings(model, layout.names, stored.data)]
     return Scene(
         root=root,
         name=root.resolve().name,
-        views=tuple(
-            item.view(camera if downscale == 1 else camera.downscaled(downscale), scale)
-            for item, camera in zip(data, cameras, strict=True)
-        ),
+        views=posed_views,
         test_names=tuple(name for name in tests if name in names),
         points=model.points,
         point_colors=model.point_colors,
@@ -97,18 +108,63 @@ def load_scene(
         downscale=downscale,
         transfer=transfer,
         digest=_digest_all(root, files),
-        warnings=(*layout.warnings, *model.warnings, *_pose_warnings(model, layout.names, data), *warnings),
+        warnings=(*warnings, *_picture_warnings(stored, transfer)),
     )
 
 
-def _check_arguments(downscale: int, transfer: str) -> None:
-    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
-        raise PolarguideError(
-            "downscale",
-            expected="a whole number from 1 up",
-            found=repr(downscale),
-            remedy="1 keeps the full size.",
-        )
+def read_views(
+    layout: Layout,
+    names: Sequence[str],
+    model: ColmapModel | None,
+    *,
+    downscale: int,
+    transfer: str,
+    reporter: Reporter = SILENT,
+) -> StoredViews:
+    """Read the files of some views, in several threads.
+
+    Args:
+        layout: the files of the capture.
+        names: of the views to read, sorted.
+        model: the capture's COLMAP model, if it has one; views that it lacks are read without a camera.
+        downscale: side of the pixel boxes to average.
+        transfer: "linear" or "srgb".
+        reporter: receives the progress.
+
+    Raises:
+        PolarguideError: a file cannot be used, a camera does not fit its pictures, or the views differ in depth.
+    """
+
+    def read(name: str) -> ViewData:
+        return read_view(layout, name, factor=downscale, transfer=transfer)
+
+    posed = frozenset(() if model is None else model.names)
+    data: list[ViewData] = []
+    cameras: list[Camera | None] = []
+    with (
+        reporter.track(f"reading {layout.root.resolve().name}", len(names)) as advance,
+        ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool,
+    ):
+        for item in pool.map(read, names):
+            data.append(item)
+            camera = None
+            if model is not None and item.name in posed:
+                camera = fit_camera(model.camera(item.name), *item.size, folder=model.folder, view=item.name)
+                camera = camera if downscale == 1 else camera.downscaled(downscale)
+            cameras.append(camera)
+            advance(len(data))
+    largest_value = _largest_value(data)
+    scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
+    measures = [checks.measure(item.codes, ~(item.invalid | item.saturated(scale))) for item in data]
+    return StoredViews(tuple(data), tuple(cameras), tuple(measures), largest_value, scale)
+
+
+def check_transfer(transfer: str) -> None:
+    """Check the name of an encoding.
+
+    Raises:
+        PolarguideError: it is neither "linear" nor "srgb".
+    """
     if transfer not in TRANSFERS:
         raise PolarguideError(
             "transfer",
@@ -118,13 +174,18 @@ def _check_arguments(downscale: int, transfer: str) -> None:
         )
 
 
-def _read_json(files: Files, path: Path) -> dict[str, Any] | None:
-    """The JSON object in a file, or None if there is no such file."""
-    return decode(files.read(path), dict[str, Any], path) if path.exists() else None
+def _check_downscale(downscale: int) -> None:
+    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
+        raise PolarguideError(
+            "downscale",
+            expected="a whole number from 1 up",
+            found=repr(downscale),
+            remedy="1 keeps the full size.",
+        )
 
 
-def _judge(data: list[ViewData], transfer: str) -> tuple[int | None, list[str]]:
-    """The stored value at which the capture saturates (None: it does not), and what looks wrong."""
+def _largest_value(data: Sequence[ViewData]) -> int:
+    """The largest value of the views' common type, 255 or 65535."""
     kinds = {item.peak.dtype for item in data}
     if len(kinds) > 1:
         few = next(item.name for item in data if item.peak.dtype == np.uint8)
@@ -135,18 +196,20 @@ def _judge(data: list[ViewData], transfer: str) -> tuple[int | None, list[str]]:
             found=f"8 bits in view {few} and 16 in view {many}",
             remedy="Export all pictures alike.",
         )
-    full = int(np.iinfo(kinds.pop()).max)
-    scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), full)
-    names = [item.name for item in data]
-    measures = [checks.measure(item.codes, ~(item.invalid | item.saturated(scale))) for item in data]
-    blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in data]
-    largest = max(int(item.peak.max()) for item in data)
-    warnings = checks.exposure_warnings(names, measures, blown, largest, full)
-    return scale, warnings + checks.polarization_warnings(names, measures, transfer)
+    return int(np.iinfo(kinds.pop()).max)
 
 
-def _pose_warnings(model: ColmapModel, all_names: list[str], data: list[ViewData]) -> list[str]:
-    """What does not match between the COLMAP model and the pictures, where it could be put right."""
+def _picture_warnings(stored: StoredViews, transfer: str) -> list[str]:
+    """Warnings about the exposure, encoding and file order of the pictures."""
+    names, scale = [item.name for item in stored.data], stored.full_scale
+    blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in stored.data]
+    largest = max(int(item.peak.max()) for item in stored.data)
+    warnings = checks.exposure_warnings(names, stored.measures, blown, largest, stored.largest_value)
+    return warnings + checks.polarization_warnings(names, stored.measures, transfer)
+
+
+def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:
+    """Warnings about poses without pictures, and about intrinsics that were scaled to the pictures."""
     warnings = unused_poses(model, all_names)
     sizes = {item.name: (model.camera(item.name).width, model.camera(item.name).height) for item in data}
     scaled = [item.name for item in data if item.size != sizes[item.name]]

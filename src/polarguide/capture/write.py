@@ -1,25 +1,76 @@
-"""Pictures of a scene folder: linear intensities to 16-bit codes, and codes to PNG."""
+"""Write the pictures of a scene folder."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.view import FULL_CODE
+from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.files import make_folder, write_whole
 
 
-def picture_codes(intensities: NDArray[np.float32], invalid: NDArray[np.bool_]) -> NDArray[np.uint16]:
-    """Linear intensities -> 16-bit codes; full scale is left to invalid pixels, for it means saturated."""
+def intensity_codes(intensities: NDArray[np.float32], invalid: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    """Linear intensities [4, H, W, 3] in [0, 1] as 16-bit codes.
+
+    Only invalid pixels [H, W] may have the largest code, because readers take it for saturation.
+    """
     codes = np.rint(np.clip(intensities, 0.0, 1.0) * FULL_CODE).astype(np.uint16)
     return np.where(invalid[None, ..., None], codes, np.minimum(codes, FULL_CODE - 1)).astype(np.uint16)
 
 
-def encoded_png(pixels: NDArray[Any]) -> bytes:
-    """A PNG file."""
-    done, data = cv2.imencode(".png", pixels)
+def picture_name(view: str, angle: int) -> str:
+    """The path of a view's picture in its scene folder."""
+    return f"polar/{view}_{angle:03d}.png"
+
+
+def write_view(
+    root: Path,
+    view: str,
+    codes: NDArray[np.uint16],
+    invalid: NDArray[np.bool_] | None = None,
+    mask: NDArray[np.bool_] | None = None,
+) -> dict[str, int]:
+    """Write the pictures of a view.
+
+    Args:
+        root: the scene folder.
+        view: name of the view.
+        codes: linear 16-bit codes at 0, 45, 90 and 135 degrees, [4, H, W, 3] RGB.
+        invalid: unusable pixels, [H, W].
+        mask: object mask, [H, W].
+
+    Returns:
+        The size in bytes of each file that was written, by its path in the scene folder.
+
+    Raises:
+        PolarguideError: a file cannot be written.
+    """
+    files: dict[str, NDArray[Any]] = {
+        picture_name(view, angle): picture for angle, picture in zip(ANGLES, codes, strict=True)
+    }
+    for folder, pixels in (("invalid", invalid), ("masks", mask)):
+        if pixels is not None:
+            files[f"{folder}/{view}.png"] = pixels.astype(np.uint8) * 255
+    return {name: write_png(root / name, pixels) for name, pixels in files.items()}
+
+
+def write_png(path: Path, pixels: NDArray[Any]) -> int:
+    """Write a PNG file, and its folder if it is missing; returns the size in bytes.
+
+    Args:
+        path: the file.
+        pixels: gray [H, W] or RGB [H, W, 3], uint8 or uint16.
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
+    stored = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+    done, data = cv2.imencode(".png", np.ascontiguousarray(stored))
     if not done:
-        raise OSError("the picture cannot be encoded")
-    return data.tobytes()
+        raise OSError(f"{path}: the picture cannot be encoded")
+    make_folder(path.parent)
+    return write_whole(path, data.tobytes())

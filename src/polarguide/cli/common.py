@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.capture import Scene, View, load_scene
 from polarguide.cli.console import console as console
+from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.raster import DeviceName
 from polarguide.runs.folder import recipe_data
@@ -37,22 +37,10 @@ def read_scene(path: Path, *, downscale: int, transfer: Transfer) -> Scene:
         raise PolarguideError(
             "--downscale", expected="1 or more", found=str(downscale), remedy="Give a whole factor."
         )
-    with Progress(
-        TextColumn("reading {task.fields[name]}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    ) as progress:
-        task = progress.add_task("", name=path.name, total=None)
-
-        def report(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
-        scene = load_scene(path, downscale=downscale, transfer=transfer, progress=report)
+    reporter = ConsoleReporter()
+    scene = load_scene(path, downscale=downscale, transfer=transfer, reporter=reporter)
     for warning in scene.warnings:
-        _warn(warning)
+        reporter.warn(warning)
     return scene
 
 
@@ -84,19 +72,13 @@ def open_run(folder: Path, *, device: DeviceName = "auto", scene: Scene | None =
         transfer: Transfer = "srgb" if configuration.transfer == "srgb" else "linear"
         scene = read_scene(Path(configuration.scene), downscale=configuration.downscale, transfer=transfer)
     if scene.digest != configuration.scene_digest:
-        _warn(f"{configuration.scene} has changed since {folder} was trained on it.")
+        ConsoleReporter().warn(f"{configuration.scene} has changed since {folder} was trained on it.")
     if recipe_data(recipe) != configuration.recipe_data:
-        _warn(
+        ConsoleReporter().warn(
             f"{folder} was trained with other values of the recipe {recipe.name} than this version has; its pictures "
             "are shaded with this version's."
         )
     return OpenRun(folder, configuration, recipe, run.state, run.backend, scene)
-
-
-def _warn(text: str) -> None:
-    """Print a warning; names in it are shown as they are."""
-    console.print("[yellow]warning:[/] ", end="")
-    console.print(text, markup=False)
 
 
 def select_views(scene: Scene, choice: str) -> tuple[View, ...]:

@@ -11,7 +11,7 @@ from polarguide.cli.common import console, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.synth.manifest import MANIFEST, scene_digest
-from polarguide.synth.render import synthesise
+from polarguide.synth.render import synthesize
 from polarguide.synth.settings import Overrides, SynthSettings, find_scene
 from polarguide.synth.sweep import parse_sweep, sweep_scenes
 
@@ -76,7 +76,7 @@ def synth(
         folders = sweep_scenes(spec, out, settings, overrides, family, ConsoleReporter(), threads=threads)
         console.print(f"scenes: {' '.join(str(folder) for folder in folders)}", markup=False)
         return
-    done = synthesise(overrides.apply(spec), out, settings, ConsoleReporter(), threads=threads)
+    done = synthesize(overrides.apply(spec), out, settings, ConsoleReporter(), threads=threads)
     console.print(f"scene: {done}   SHA-256 of its {MANIFEST}: {scene_digest(done)}", markup=False)
     if sensor == "ideal":
         console.print(f"next: polarguide train {done} --out runs/{done.name}", markup=False)

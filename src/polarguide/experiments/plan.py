@@ -194,13 +194,7 @@ def run_key(
 
 def read_scene(path: Path, options: SceneOptions, reporter: Reporter) -> Scene:
     """Load a scene, with progress, and pass on its warnings."""
-    with reporter.track(f"reading {path.name}") as advance:
-        scene = load_scene(
-            path,
-            downscale=options.downscale,
-            transfer=options.transfer,
-            progress=lambda done, total: advance(done, total=total),
-        )
+    scene = load_scene(path, downscale=options.downscale, transfer=options.transfer, reporter=reporter)
     for warning in scene.warnings:
         reporter.warn(warning)
     return scene

@@ -1,4 +1,4 @@
-"""Epipolar errors of feature matches between neighboring views: what the pictures say of the poses."""
+"""Epipolar errors of feature matches between neighboring views: a test of the poses."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera
-from polarguide.inspection.pictures import Capture, Pictures
+from polarguide.inspection.capture import Capture, InspectedView
 
-NEIGHBOURS = 4
+NEIGHBORS = 4
 FEATURES = 3000
 FEWEST_MATCHES = 15
 RATIO = 0.75
 GATE_SHARE = 0.02
-"""Matches farther from their epipolar line than this share of the picture's diagonal are taken for mismatches."""
+"""Matches farther from their epipolar line than this share of the picture's diagonal count as mismatches."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PairError:
 
 
 def epipolar_errors(capture: Capture) -> list[PairError]:
-    """Match every posed view with its nearest neighbors by direction and place."""
+    """Match every posed view with its nearest neighbors in position and viewing direction."""
     views = capture.posed
     features = [_features(view) for view in views]
     pairs = _neighbor_pairs([view.camera for view in views if view.camera is not None])
@@ -44,7 +44,7 @@ def epipolar_errors(capture: Capture) -> list[PairError]:
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
-    """Each view's error: the lower quartile over its pairs, so that one bad view does not spoil its neighbors."""
+    """Each view's error: the lower quartile over its pairs, so that one bad view does not affect its neighbors."""
     by_view: dict[str, list[float]] = {}
     for pair in errors:
         for name in (pair.first, pair.second):
@@ -52,14 +52,14 @@ def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
     return {name: float(np.quantile(values, 0.25)) for name, values in sorted(by_view.items())}
 
 
-def _features(view: Pictures) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
     gray = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
     top = max(float(np.percentile(gray, 99.5)), 1.0)
     shown = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
     keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(  # type: ignore[attr-defined]
         shown, None
     )
-    # OpenCV counts pixel centers from 0.
+    # OpenCV has its first pixel center at 0, COLMAP at 0.5.
     places = np.array([point.pt for point in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     return places, None if descriptors is None else np.sqrt(
         descriptors / (descriptors.sum(1, keepdims=True) + 1e-9)
@@ -72,13 +72,13 @@ def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     apart = apart / max(float(np.median(apart)), 1e-12) + 2 * (1 - axes @ axes.T)
     np.fill_diagonal(apart, np.inf)
-    near = np.argsort(apart, axis=1)[:, : min(NEIGHBOURS, len(cameras) - 1)]
+    near = np.argsort(apart, axis=1)[:, : min(NEIGHBORS, len(cameras) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row})
 
 
 def _pair_error(
-    first: Pictures,
-    second: Pictures,
+    first: InspectedView,
+    second: InspectedView,
     features1: tuple[NDArray[np.float64], NDArray[np.float32] | None],
     features2: tuple[NDArray[np.float64], NDArray[np.float32] | None],
     factor: int,

@@ -1,11 +1,9 @@
-"""A corrected copy of a scene: pictures under the names of their true angles, the zero turned back."""
+"""Write a corrected copy of a scene: pictures named by their true angles, the zero rotated back."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,52 +14,51 @@ from polarguide.capture.calibration import Calibration, oriented
 from polarguide.capture.layout import contents
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
-from polarguide.capture.write import encoded_png, picture_codes
+from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import write_whole, writing
-from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.angle_checks import AngleFindings
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import FileOrder, swaps
-from polarguide.inspection.pictures import Capture
-from polarguide.records import read_record
+from polarguide.progress import SILENT, Reporter
+from polarguide.records import read_record, to_json
 
-SIDES = ("sparse", "masks", "invalid", "gt", "split.json")
-"""What is copied as it is, beside the pictures."""
-SCENE = "scene.json"
+COPIED = ("sparse", "masks", "invalid", "gt", "split.json")
+"""Files and folders that are copied unchanged."""
+METADATA = "scene.json"
 
 
-def correction(capture: Capture, angles: Angles) -> Calibration | None:
-    """What puts the angles right, or None where they are right already.
+def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
+    """The correction of the angles, or None if they are right.
 
     Raises:
-        PolarguideError: the order is not decided; nothing may be written then.
+        PolarguideError: the order is not decided.
     """
     files = angles.files
     if files is None:
         raise PolarguideError(
             capture.root,
             expected="a decided order of the angles",
-            found="one that geometry does not decide",
-            remedy="Nothing was written. See the report for what to do; --order of prepare sets it by hand.",
+            found="an order that geometry does not decide",
+            remedy="Nothing was written. The report says what to do; --order of prepare sets it by hand.",
         )
     zero = round(angles.offset, 2) if angles.offset is not None else 0.0
     return None if files == ANGLES and zero == 0.0 else Calibration(order=files, zero=zero)
 
 
-def fix_scene(
-    capture: Capture, change: Calibration, out: Path, advance: Callable[[int], None] = lambda done: None
-) -> str:
-    """Write a corrected copy of the scene; the scene itself is left as it is.
+def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Reporter = SILENT) -> str:
+    """Write a corrected copy of a scene; the scene itself does not change.
 
-    A pure exchange copies the files under their right names, byte by byte. A turned zero forms the four
-    intensities anew, as linear 16-bit PNG; they are divided by 1.21 so that none exceeds full scale, and saturated
-    pixels become invalid. The folder appears when it is complete.
+    If only the order changes, files are copied under their right names, byte by byte. If the zero changes, the four
+    intensities are computed anew and written as linear 16-bit PNG; they are divided by 1.21 so that none exceeds full
+    scale, and saturated pixels become invalid. The folder appears when it is complete.
 
     Args:
-        capture: as read. change: from ``correction``. out: a folder that does not exist.
-        advance: called with the number of views written.
+        capture: the scene. change: from ``correction``. out: a new folder.
+        reporter: receives the progress.
 
     Returns:
-        What was done, a sentence.
+        A description of what was done.
 
     Raises:
         PolarguideError: ``out`` exists, or a file cannot be read or written.
@@ -78,7 +75,7 @@ def fix_scene(
     shutil.rmtree(partial, ignore_errors=True)
     try:
         with writing(out):
-            _write(capture, change, partial, advance)
+            _write(capture, change, partial, reporter)
             if out.is_dir():
                 out.rmdir()
             os.replace(partial, out)
@@ -88,30 +85,31 @@ def fix_scene(
 
 
 def described(change: Calibration) -> str:
-    """What a correction does, in words."""
+    """A correction in words."""
     parts = []
     if change.order != ANGLES:
         parts.append(f"the files were renamed ({swaps(change.order)})")
     if change.zero:
-        parts.append(f"the Stokes vectors were turned by {change.zero:+.2f}°")
+        parts.append(f"the Stokes vectors were rotated by {change.zero:+.2f}°")
     return " and ".join(parts)
 
 
-def _write(capture: Capture, change: Calibration, folder: Path, advance: Callable[[int], None]) -> None:
+def _write(capture: Capture, change: Calibration, folder: Path, reporter: Reporter) -> None:
     (folder / "polar").mkdir(parents=True)
-    for name in SIDES:
+    for name in COPIED:
         source = capture.root / name
         if source.is_dir():
             shutil.copytree(source, folder / name)
         elif source.exists():
             shutil.copy2(source, folder / name)
-    for done, view in enumerate(capture.layout.names):
-        if change.zero:
-            _turn_view(capture, change, folder, view)
-        else:
-            _rename_view(capture, change.order, folder, view)
-        advance(done + 1)
-    write_whole(folder / SCENE, _sidecar(capture, change))
+    with reporter.track("fixing", len(capture.layout.names)) as advance:
+        for done, view in enumerate(capture.layout.names, 1):
+            if change.zero:
+                _rotate_view(capture, change, folder, view)
+            else:
+                _rename_view(capture, change.order, folder, view)
+            advance(done)
+    write_whole(folder / METADATA, _corrected_metadata(capture, change))
 
 
 def _rename_view(capture: Capture, order: FileOrder, folder: Path, view: str) -> None:
@@ -120,22 +118,19 @@ def _rename_view(capture: Capture, order: FileOrder, folder: Path, view: str) ->
         shutil.copy2(source, folder / "polar" / f"{view}_{true:03d}{source.suffix}")
 
 
-def _turn_view(capture: Capture, change: Calibration, folder: Path, view: str) -> None:
+def _rotate_view(capture: Capture, change: Calibration, folder: Path, view: str) -> None:
     data = read_view(capture.layout, view, factor=1, transfer=capture.transfer)
     full = int(np.iinfo(data.peak.dtype).max)
     lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
-    turned = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
-    for angle, codes in zip(ANGLES, picture_codes(turned, lost), strict=True):
-        write_whole(folder / "polar" / f"{view}_{angle:03d}.png", encoded_png(codes[..., ::-1]))
-    (folder / "invalid").mkdir(exist_ok=True)
+    rotated = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
     for old in (folder / "invalid").glob(f"{view}.*"):
         old.unlink()
-    write_whole(folder / "invalid" / f"{view}.png", encoded_png(lost.astype(np.uint8) * 255))
+    write_view(folder, view, intensity_codes(rotated, lost), lost)
 
 
-def _sidecar(capture: Capture, change: Calibration) -> bytes:
-    """``scene.json`` of the copy: that of the scene, and a note on what was changed."""
-    path = capture.root / SCENE
+def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
+    """``scene.json`` of the copy: that of the scene, with a note on the correction."""
+    path = capture.root / METADATA
     content: dict[str, Any] = read_record(path, dict[str, Any]) if path.exists() else {}
     note = {
         "program": f"polarguide {__version__}",
@@ -146,4 +141,4 @@ def _sidecar(capture: Capture, change: Calibration) -> bytes:
         "scale": 1.0 / change.peak,
     }
     content["corrections"] = [*content.get("corrections", []), note]
-    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
+    return to_json(content)

@@ -2,55 +2,38 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
-from polarguide.inspection.angle_checks import Angles, handedness_check, order_check, weigh, zero_check
+from polarguide.inspection.angle_checks import (
+    AngleFindings,
+    combine_evidence,
+    handedness_check,
+    order_check,
+    zero_check,
+)
+from polarguide.inspection.capture import Capture, InspectedView, read_capture
 from polarguide.inspection.dielectric import dielectric_check
 from polarguide.inspection.likelihood import Evidence
-from polarguide.inspection.picture_checks import pairing_of, picture_checks
-from polarguide.inspection.pictures import Capture, Pictures, read_capture
+from polarguide.inspection.measurements import ViewMeasurements, measure_view
+from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.points import point_evidence
 from polarguide.inspection.pose_checks import coverage_check, pose_check
-from polarguide.inspection.readings import Readings, read_view_figures
+from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.short_run import LONGEST, short_run, surface_of
-from polarguide.inspection.surfaces import Pixels, Surface, surface_evidence, surface_pixels
+from polarguide.inspection.surfaces import Surface, SurfaceSamples, normal_evidence, sample_surfaces
 from polarguide.inspection.verdict import Check, Verdict, worst
+from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend
 
-Normals = Literal["auto", "points", "train"]
 SURE = 0.98
 """Probability from which on ``auto`` is content with the points."""
 FEWEST_TO_TRAIN = 8
 RUN_FOLDER = "short_run"
-Progress = Callable[[int], None]
-Track = Callable[[str, int], AbstractContextManager[Progress]]
-
-
-@dataclass(frozen=True)
-class InspectSettings:
-    """What the user chooses.
-
-    Attributes:
-        downscale: side of the pixel boxes to average; 0: chosen. transfer: how the files are encoded.
-        refractive_index: of the surfaces; None: that of ``scene.json``, else 1.5.
-        normals: "points" uses points seen in several views alone, "train" trains for normals as well, "auto" does so
-            if the points do not decide.
-        steps: of the short training.
-    """
-
-    downscale: int = 0
-    transfer: str = "linear"
-    refractive_index: float | None = None
-    normals: Normals = "auto"
-    steps: int = 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +48,9 @@ class Inspection:
     capture: Capture
     settings: InspectSettings
     index: float
-    readings: tuple[Readings, ...]
+    measurements: tuple[ViewMeasurements, ...]
     checks: tuple[Check, ...]
-    angles: Angles
+    angles: AngleFindings
 
     @property
     def verdict(self) -> Verdict:
@@ -79,14 +62,22 @@ class Inspection:
         return next(check for check in self.checks if check.key == key)
 
 
-@contextlib.contextmanager
-def silent(label: str, total: int) -> Iterator[Progress]:
-    """Progress that nobody sees."""
-    yield lambda done: None
+def inspection_folder(scene: Path, out: Path | None = None) -> Path:
+    """The folder that an inspection writes: ``out``, or SCENE-inspection beside the scene.
+
+    Raises:
+        PolarguideError: there is a file of this name.
+    """
+    folder = out if out is not None else scene.resolve().with_name(scene.resolve().name + "-inspection")
+    if folder.exists() and not folder.is_dir():
+        raise PolarguideError(
+            folder, expected="a folder to write", found="a file", remedy="Give another --out."
+        )
+    return folder
 
 
 def inspect_scene(
-    path: Path, out: Path, settings: InspectSettings, backend: Backend, track: Track = silent
+    path: Path, out: Path, settings: InspectSettings, backend: Backend, reporter: Reporter = SILENT
 ) -> Inspection:
     """Inspect a scene folder.
 
@@ -95,32 +86,27 @@ def inspect_scene(
         out: folder for what is kept of a short training.
         settings: the user's choices.
         backend: what the short training runs on.
-        track: opens a progress bar, given a label and a total.
+        reporter: receives the progress.
 
     Raises:
-        PolarguideError: the scene cannot be read.
+        PolarguideError: the scene cannot be read, or a setting is out of range.
     """
-    with track("reading", 0) as advance:
-        capture = read_capture(
-            path,
-            downscale=settings.downscale,
-            transfer=settings.transfer,
-            progress=lambda done, total: advance(done),
-        )
+    settings.check()
+    capture = read_capture(path, downscale=settings.downscale, transfer=settings.transfer, reporter=reporter)
     index = settings.refractive_index or capture.refractive_index or 1.5
-    readings: list[Readings] = []
-    with track("measuring", len(capture.views)) as advance:
+    measurements: list[ViewMeasurements] = []
+    with reporter.track("measuring", len(capture.views)) as advance:
         for view in capture.views:
-            readings.append(read_view_figures(view, index))
-            advance(len(readings))
-    pairing = pairing_of(capture)
-    checks = picture_checks(capture, readings, pairing)
-    with track("matching features", 1):
+            measurements.append(measure_view(view, index))
+            advance(len(measurements))
+    pairing = find_pairing(capture)
+    checks = picture_checks(capture, measurements, pairing)
+    with reporter.track("matching features", 1):
         checks += [pose_check(capture), coverage_check(capture)]
-    angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, track)
+    angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
     checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
-    checks.append(dielectric_check(readings, pixels, index))
-    return Inspection(capture, settings, index, tuple(readings), tuple(checks), angles)
+    checks.append(dielectric_check(measurements, pixels, index))
+    return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
 
 
 def _angles(
@@ -130,44 +116,39 @@ def _angles(
     index: float,
     pairing: int,
     backend: Backend,
-    track: Track,
-) -> tuple[Angles, Pixels | None]:
+    reporter: Reporter,
+) -> tuple[AngleFindings, SurfaceSamples | None]:
     """Order, sense and zero by what geometry there is; and the pixels with normals if there are any."""
     sources: list[Evidence] = []
     if capture.model is None or len(capture.posed) < 2:
-        return weigh(sources, pairing), None
-    with track("weighing points", 1):
+        return combine_evidence(sources, pairing), None
+    with reporter.track("weighing points", 1):
         evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
     sources.append(evidence)
-    angles = weigh(sources, pairing)
-    sure = angles.odds is not None and max(angles.odds.probabilities) >= SURE
+    angles = combine_evidence(sources, pairing)
+    sure = angles.posterior is not None and max(angles.posterior.probabilities) >= SURE
     if settings.normals == "points" or (settings.normals == "auto" and sure):
         return angles, pixels
     if len(capture.posed) < FEWEST_TO_TRAIN:
         return angles, pixels
-    pixels = _trained_pixels(capture, out, settings, pairing, backend, track)
-    sources.append(surface_evidence(pixels, index))
-    return weigh(sources, pairing), pixels
+    pixels = _trained_pixels(capture, out, settings, pairing, backend, reporter)
+    sources.append(normal_evidence(pixels, index))
+    return combine_evidence(sources, pairing), pixels
 
 
 def _trained_pixels(
-    capture: Capture, out: Path, settings: InspectSettings, pairing: int, backend: Backend, track: Track
-) -> Pixels:
+    capture: Capture, out: Path, settings: InspectSettings, pairing: int, backend: Backend, reporter: Reporter
+) -> SurfaceSamples:
     factor = max(1, math.ceil(max(capture.size) / LONGEST))
     names = [view.name for view in capture.posed]
-    with track("reading for the short training", 0) as advance:
-        scene = load_scene(
-            capture.root,
-            downscale=factor,
-            transfer=settings.transfer,
-            views=names,
-            progress=lambda done, total: advance(done),
-        )
+    scene = load_scene(
+        capture.root, downscale=factor, transfer=settings.transfer, views=names, reporter=reporter
+    )
     if not scene.train_views:
         raise PolarguideError(
             capture.root, expected="views to train on", found="none", remedy="Use --normals points."
         )
-    with track("short training", settings.steps) as advance:
+    with reporter.track("short training", settings.steps) as advance:
         state = short_run(
             scene,
             out / RUN_FOLDER,
@@ -175,11 +156,11 @@ def _trained_pixels(
             backend=backend,
             on_step=lambda report: advance(report.step + 1),
         )
-    with track("comparing with normals", len(names)) as advance:
+    with reporter.track("comparing with normals", len(names)) as advance:
 
-        def surfaces() -> Iterator[tuple[Pictures, Surface]]:
+        def surfaces() -> Iterator[tuple[InspectedView, Surface]]:
             for done, view in enumerate(capture.posed):
                 yield view, surface_of(state, scene.view(view.name), backend)
                 advance(done + 1)
 
-        return surface_pixels(surfaces(), pairing)
+        return sample_surfaces(surfaces(), pairing)

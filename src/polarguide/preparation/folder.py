@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.view import ANGLES
-from polarguide.capture.write import encoded_png, picture_codes
+from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
 from polarguide.records import read_record
@@ -124,14 +123,7 @@ class SceneFolder:
         mask: NDArray[np.bool_] | None = None,
     ) -> None:
         """Write the pictures of a view, then note it."""
-        files = {}
-        for angle, codes in zip(ANGLES, picture_codes(intensities, invalid), strict=True):
-            files[f"polar/{view}_{angle:03d}.png"] = codes[..., ::-1]
-        files[f"invalid/{view}.png"] = invalid.astype(np.uint8) * 255
-        if mask is not None:
-            make_folder(self.root / "masks")
-            files[f"masks/{view}.png"] = mask.astype(np.uint8) * 255
-        sizes = {name: write_whole(self.root / name, encoded_png(pixels)) for name, pixels in files.items()}
+        sizes = write_view(self.root, view, intensity_codes(intensities, invalid), invalid, mask)
         self.views[view] = {**record, "files": sizes}
         self.save()
 

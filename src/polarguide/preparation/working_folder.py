@@ -12,8 +12,8 @@ from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.colmap.sfm import reconstruct, tone_mapped
 from polarguide.capture.colmap.triangulate import add_points
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.write import encoded_png
-from polarguide.files import make_folder, write_whole
+from polarguide.capture.write import write_png
+from polarguide.files import make_folder
 from polarguide.preparation.folder import SFM, SceneFolder
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
 from polarguide.preparation.source import Source
@@ -87,8 +87,8 @@ class Workshop:
                 if view not in known or not path.exists():
                     done = self._pictures.develop(view, measured)
                     if done.mask is not None:
-                        write_whole(masks / f"{view}.png", encoded_png(done.mask.astype(np.uint8) * 255))
-                    write_whole(path, encoded_png(tone_mapped(done.intensities, self._settings.sfm_pictures)))
+                        write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
+                    write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
                     known[view] = done.geometry.record()
                     self._folder.save()
                 advance(count)

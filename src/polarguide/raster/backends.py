@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 import torch
 
+from polarguide import _native
 from polarguide.errors import PolarguideError
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
@@ -51,3 +52,10 @@ def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str]
     torch.cuda.set_device(device)
     load_gsplat(say)
     return Backend(device, rasterize_cuda)
+
+
+def use_threads(threads: int) -> None:
+    """Use this many threads everywhere in this process; 0 leaves things as they are."""
+    if threads:
+        _native.set_thread_count(threads)
+        torch.set_num_threads(threads)

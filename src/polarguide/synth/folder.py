@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.view import ANGLES
+from polarguide.capture.write import picture_name
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
+from polarguide.polarizer import ANGLES, malus
 from polarguide.synth.mesh import Array
 
 REQUEST = "request.json"
@@ -53,29 +54,23 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a whole file or nothing."""
+    """Write a file completely or not at all, and its folder if it is missing.
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
     make_folder(path.parent)
     write_whole(path, data)
 
 
-def write_picture(path: Path, values: NDArray[Any]) -> None:
-    """Write a PNG, gray or RGB."""
-    color = values[..., ::-1] if values.ndim == 3 else values
-    done, data = cv2.imencode(".png", np.ascontiguousarray(color))
-    if not done:
-        raise OSError(f"{path}: PNG encoding failed")
-    write_file(path, data.tobytes())
-
-
-def picture_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.uint16]:
-    """The four pictures behind a polarizer, [4, H, W, 3].
+def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.uint16]:
+    """The four pictures behind a polarizer as a 12-bit sensor stores them, [4, H, W, 3].
 
     Args:
         stokes: [3, H, W, 3], full scale 1.
         change: what happens to intensities [4, H, W, 3] before they are stored (noise).
     """
-    twice = [2 * np.radians(angle) for angle in ANGLES]
-    light = np.stack([(stokes[0] + stokes[1] * np.cos(a) + stokes[2] * np.sin(a)) / 2 for a in twice])
+    light = np.stack([malus(stokes, np.radians(angle)) for angle in ANGLES])
     return np.clip(np.round(change(light) * (65535 / STEP)), 0, TOP).astype(np.uint16) * STEP
 
 
@@ -88,7 +83,7 @@ def clipped_share(out: Path, names: Sequence[str]) -> float:
 
 def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[Path]:
     """All files of a view; it is finished when they exist."""
-    files = [out / "polar" / f"{name}_{angle:03d}.png" for angle in ANGLES]
+    files = [out / picture_name(name, angle) for angle in ANGLES]
     files += [out / "gt" / f"{name}.npz"] if ground_truth else []
     return files + ([out / "raw" / f"{name}.png"] if raw else [])
 

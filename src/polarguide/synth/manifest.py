@@ -54,7 +54,7 @@ def scene_digest(out: Path) -> str:
 def _written(out: Path) -> Iterator[Path]:
     """The files that rendering writes; others in the folder are the user's."""
     for name in _FOLDERS:
-        yield from (path for path in (out / name).rglob("*") if path.is_file())
+        yield from (path for path in (out / name).rglob("*") if path.is_file() and path.name[0] != ".")
     yield from (out / name for name in _FILES if (out / name).is_file())
 
 

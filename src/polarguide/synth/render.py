@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from polarguide.camera import Camera
+from polarguide.capture.write import write_png, write_view
 from polarguide.progress import Reporter
 from polarguide.synth import folder
 from polarguide.synth.build import Built, build_scene
@@ -60,7 +61,7 @@ class Job:
         return folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name), raw=self.mosaics)
 
 
-def synthesise(
+def synthesize(
     spec: SceneSpec, out: Path, settings: SynthSettings, reporter: Reporter, *, threads: int = 0
 ) -> Path:
     """Render a scene, or go on with a rendering that was stopped.
@@ -136,7 +137,7 @@ def _render_view(job: Job, number: int) -> None:
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
         raw = mosaic(light.stokes * job.exposure, settings.sensor.upper(), settings.noise, random, job.sensor)
-        folder.write_picture(job.out / "raw" / f"{name}.png", raw)
+        write_png(job.out / "raw" / f"{name}.png", raw)
         light = Light(_halved(light.specular), _halved(light.diffuse), _halved(light.seen))
     stokes = light.stokes * job.exposure
     if job.has_ground_truth(name):
@@ -149,11 +150,8 @@ def _render_view(job: Job, number: int) -> None:
         folder.write_file(job.out / "gt" / f"{name}.npz", data.getvalue())
     # With a sensor the noise is in its mosaics, and these pictures are what they should lead to.
     noise = 0.0 if job.mosaics else settings.noise
-    codes = folder.picture_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
-    for path, picture in zip(
-        folder.view_files(job.out, name, ground_truth=False, raw=False), codes, strict=True
-    ):
-        folder.write_picture(path, picture)
+    codes = folder.sensor_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
+    write_view(job.out, name, codes)
 
 
 def _write_model(job: Job, names: list[str]) -> None:

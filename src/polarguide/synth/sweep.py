@@ -15,7 +15,7 @@ from polarguide.synth import folder
 from polarguide.synth.build import build_scene
 from polarguide.synth.cameras import held_out_names, place_cameras, view_names
 from polarguide.synth.manifest import verify_scene, write_manifest
-from polarguide.synth.render import synthesise
+from polarguide.synth.render import synthesize
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, SynthSettings
 from polarguide.synth.sparse import find_points, write_model
@@ -76,7 +76,7 @@ def sweep_scenes(
             one = replace(overrides, index=value)
         else:
             one = replace(overrides, spacing=value)
-        done.append(synthesise(one.apply(spec), _member(out, sweep, value), how, reporter, threads=threads))
+        done.append(synthesize(one.apply(spec), _member(out, sweep, value), how, reporter, threads=threads))
         _note(done[-1], sweep.parameter, value)
     return done
 
@@ -110,7 +110,7 @@ def _fewer_views(
             found=f"{sweep.values[-1]:g}",
             remedy=f"The scene has {len(cameras)} views; give --views to render more.",
         )
-    whole = synthesise(spec, out / "all", settings, reporter, threads=threads)
+    whole = synthesize(spec, out / "all", settings, reporter, threads=threads)
     record = json.loads((whole / "scene.json").read_text(encoding="utf-8"))
     done = []
     for value in sweep.values:

@@ -1,6 +1,6 @@
-"""A local web viewer over our own rasterizer, for a trained run or one that is being trained."""
+"""A local web viewer for trained runs and for trainings in progress."""
 
-from polarguide.viewer.photographs import photographs
+from polarguide.viewer.frusta import photographs
 from polarguide.viewer.server import LOOPBACK, Viewer, viewing_address
 from polarguide.viewer.shown import Shown, shown_run, shown_training
 

@@ -1,4 +1,4 @@
-"""The controls beside the picture, one set for each visitor."""
+"""The control panel of a session."""
 
 from __future__ import annotations
 
@@ -9,49 +9,51 @@ from typing import Any
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.appearance import MEASURED, Appearance, Crop
 
-NOWHERE = "(free)"
+FREE_VIEW = "(free)"
 
 
 @dataclass(frozen=True)
-class Offer:
-    """What a panel has to offer.
+class PanelOptions:
+    """The controls that a panel has.
 
     Attributes:
-        lit: whether the recipe learns light. turns: whether that can be turned.
+        layers: of the shading model. turns: whether the environment can be rotated.
         views: names of the photographs.
-        trains: whether a training can be made to wait.
+        trains: whether a training runs, which can be paused.
     """
 
-    lit: bool
+    layers: Sequence[str]
     turns: bool
     views: Sequence[str]
     trains: bool
 
 
 class Panel:
-    """Controls of one visitor.
+    """The controls of one session.
 
-    Names of views come from files, so they are only ever shown as plain text: Markdown in the browser may run code.
+    Names of views come from files, so they are shown as plain text only: Markdown in the browser may run code.
 
     Args:
-        gui: viser's interface of the visitor.
-        offer: what there is to choose from.
-        changed: called after every change that the picture shows.
+        gui: viser's handle of the session's controls.
+        options: the controls to show.
+        changed: called after every change that affects the picture.
     """
 
-    def __init__(self, gui: Any, offer: Offer, changed: Callable[[], None]) -> None:
+    def __init__(self, gui: Any, options: PanelOptions, changed: Callable[[], None]) -> None:
         self._crop: list[Any] = []
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self._told = gui.add_markdown("")
-        self.pause = gui.add_checkbox("Pause training", False, visible=offer.trains)
-        layers = [n for n in LAYERS if offer.lit or n in ("final", "normal", "depth", "alpha")]
-        self.layer = gui.add_dropdown("Layer", (*layers, *MEASURED), hint="The last four: at a photograph")
-        self.exposure = gui.add_slider("Exposure", -4.0, 4.0, 0.1, 0.0, hint="Stops")
-        self.strength = gui.add_slider("Reflection", 0.0, 2.0, 0.05, 1.0, visible=offer.lit)
-        hint = "Degrees, what is far away; what stands near stays"
-        self.turn = gui.add_slider("Environment", -180, 180, 1, 0, hint=hint, visible=offer.turns)
+        self._status = gui.add_markdown("")
+        self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
+        layers = [name for name in LAYERS if name in options.layers]
+        self.layer = gui.add_dropdown(
+            "Layer", (*layers, *MEASURED), hint="The last four need a photograph's pose"
+        )
+        self.exposure = gui.add_slider("Exposure", -4.0, 4.0, 0.1, 0.0, hint="In stops")
+        self.strength = gui.add_slider("Reflection", 0.0, 2.0, 0.05, 1.0, visible="specular" in layers)
+        hint = "Rotates the environment light, in degrees; the scene stays"
+        self.turn = gui.add_slider("Environment", -180, 180, 1, 0, hint=hint, visible=options.turns)
         with gui.add_folder("Photographs"):
-            self.view = gui.add_dropdown("Go to", (NOWHERE, *offer.views))
+            self.view = gui.add_dropdown("Go to", (FREE_VIEW, *options.views))
             self.step = gui.add_button_group("", ("previous", "next"))
             self.frusta = gui.add_checkbox("Show cameras", True)
         with gui.add_folder("Crop", expand_by_default=False):
@@ -59,27 +61,27 @@ class Panel:
             self.box = gui.add_checkbox("Show box", True)
             for label in ("Left, right", "Down, up", "Front, back"):
                 self._crop.append(gui.add_multi_slider(label, -150, 150, 1, (-40, 40), min_range=1))
-        with gui.add_folder("Picture and path", expand_by_default=False):
+        with gui.add_folder("Picture and camera path", expand_by_default=False):
             self.screenshot = gui.add_button("Save picture")
-            self.keys = gui.add_text("Poses", "0", disabled=True)
-            self.add_key = gui.add_button("Add this pose")
-            self.remove_key = gui.add_button("Remove the last")
-            self.seconds = gui.add_slider("Seconds each", 0.5, 10.0, 0.5, 2.0)
+            self.keyframes = gui.add_text("Keyframes", "0", disabled=True)
+            self.add_keyframe = gui.add_button("Add keyframe")
+            self.remove_keyframe = gui.add_button("Remove last keyframe")
+            self.seconds = gui.add_slider("Seconds per segment", 0.5, 10.0, 0.5, 2.0)
             self.play = gui.add_button("Play")
             self.save_path = gui.add_button("Save path")
         shown = (self.layer, self.exposure, self.strength, self.turn, self._use_crop, *self._crop)
         for control in shown:
             control.on_update(lambda _: changed())
 
-    def tell(self, *lines: str) -> None:
-        """Show some lines, none of them of a user's making."""
+    def show_status(self, *lines: str) -> None:
+        """Show status lines; they must not contain names from files."""
         text = "  \n".join(lines)
-        if self._told.content != text:
-            self._told.content = text
+        if self._status.content != text:
+            self._status.content = text
 
     @property
     def crop(self) -> Crop | None:
-        """The box that is chosen, if any."""
+        """The crop box, or None if it is off."""
         if not self._use_crop.value:
             return None
         sides = [control.value for control in self._crop]
@@ -89,7 +91,7 @@ class Panel:
 
     @property
     def appearance(self) -> Appearance:
-        """What is chosen."""
+        """The current choice of the user."""
         return Appearance(
             layer=self.layer.value,
             exposure=float(self.exposure.value),

@@ -1,4 +1,4 @@
-"""The server: browsers connect to it, and one thread of ours draws for them."""
+"""The web server of the viewer; one thread renders for all sessions."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.scene_frame import scene_frame
-from polarguide.shading.deferred import Shading
-from polarguide.viewer.panel import Offer
-from polarguide.viewer.photographs import Photograph
+from polarguide.shading.model import ShadingModel
+from polarguide.viewer.frusta import Photograph
+from polarguide.viewer.panel import PanelOptions
+from polarguide.viewer.session import Session
 from polarguide.viewer.shown import Shown
-from polarguide.viewer.visitor import Visitor
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-REFRESH = 1.0  # seconds between pictures of a training at least,
-SHARE = 10.0  # and at least this many times as long as the last one took
+REFRESH = 1.0  # least seconds between two pictures of a training,
+SHARE = 10.0  # which are also at least this multiple of the time that the last one took
 TICK = 0.02
 
 
 def viewing_address(host: str, port: int) -> str:
-    """What to type into a browser on the same machine."""
+    """The URL under which a browser on the same machine reaches the viewer."""
     name = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "::1": "[::1]"}.get(host, host)
     return f"http://{name}:{port}"
 
@@ -34,112 +34,112 @@ def viewing_address(host: str, port: int) -> str:
 class Viewer:
     """A web viewer.
 
-    Pictures are drawn in ``serve`` alone, by the thread that calls it, so that a training and its viewer take turns.
+    Pictures are rendered in ``serve`` only, by the thread that calls it, so that a training and its viewer take turns.
 
     Args:
-        look: gives the scene as it is now.
-        photographs: of the scene by name, at least one; the first one is where visitors begin.
-        lit: whether the recipe learns light. trains: whether ``paused`` is looked at.
-        host, port: where to listen; another port is taken if this one is in use.
+        current: returns the scene as it is now.
+        photographs: of the scene by name, at least one; sessions start at the first one.
+        shading: model of the recipe. trains: whether the panel can pause a training.
+        host, port: address to listen at; another port is used if this one is taken.
         title: plain text.
 
     Raises:
-        PolarguideError: viser is not installed, or the address cannot be listened at.
+        PolarguideError: viser is not installed, or the server cannot listen at the address.
     """
 
     def __init__(
         self,
-        look: Callable[[], Shown],
+        current: Callable[[], Shown],
         photographs: Mapping[str, Photograph],
         *,
-        lit: bool,
+        shading: ShadingModel,
         trains: bool = False,
         host: str = LOOPBACK[0],
         port: int = 8080,
         title: str = "polarguide",
     ) -> None:
         viser = optional_import("viser", "the viewer", install="'viser>=1.1'")
-        # Of pictures for a browser that has just left.
+        # viser warns of pictures for a browser that has just disconnected.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        self._look, self._photographs = look, photographs
-        self._around = scene_frame([photograph.view.camera for photograph in photographs.values()])
-        turns = lit and isinstance(look().shading, Shading)
-        self._offer = Offer(lit, turns, tuple(photographs), trains)
-        self._visitors: dict[int, Visitor] = {}
+        self._current, self._photographs = current, photographs
+        self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
+        turns = shading.radiance_cubemap is not None
+        self._options = PanelOptions(shading.layers, turns, tuple(photographs), trains)
+        self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._refreshed = time.monotonic()
         self._cost = 0.0
         self._server = _listening(viser, host, port, title)
-        self._server.scene.set_up_direction(tuple(self._around.up.tolist()))
+        self._server.scene.set_up_direction(tuple(self._scene_frame.up.tolist()))
         self._server.scene.world_axes.visible = False
         self.address = viewing_address(host, self._server.get_port())
-        self._server.on_client_connect(self._arrive)
-        self._server.on_client_disconnect(self._leave)
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._disconnected)
 
     @property
     def paused(self) -> bool:
-        """Whether a visitor wants the training to wait."""
+        """Whether a session pauses the training."""
         with self._lock:
-            return any(visitor.paused for visitor in self._visitors.values())
+            return any(session.paused for session in self._sessions.values())
 
-    def _arrive(self, client: Any) -> None:
-        visitor = Visitor(client, self._photographs, self._around, self._offer, self._wake.set)
-        visitor.go(next(iter(self._photographs)))
+    def _connected(self, client: Any) -> None:
+        session = Session(client, self._photographs, self._scene_frame, self._options, self._wake.set)
+        session.go(next(iter(self._photographs)))
         with self._lock:
-            self._visitors[client.client_id] = visitor
+            self._sessions[client.client_id] = session
         self._wake.set()
 
-    def _leave(self, client: Any) -> None:
+    def _disconnected(self, client: Any) -> None:
         with self._lock:
-            self._visitors.pop(client.client_id, None)
+            self._sessions.pop(client.client_id, None)
 
-    def serve(self, patience: float = 0.0) -> bool:
-        """Draw the picture that has been due for longest, if one is.
+    def serve(self, timeout: float = 0.0) -> bool:
+        """Render the picture that has been due for longest, if one is due.
 
         Args:
-            patience: seconds to wait for one.
+            timeout: seconds to wait for one.
 
         Returns:
-            Whether one was drawn.
+            Whether a picture was rendered.
         """
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + timeout
         while True:
             self._wake.clear()
             due = self._due()
             if due is not None:
-                visitor, kind = due
+                session, kind = due
                 began = time.monotonic()
-                visitor.draw(self._look(), kind)
+                session.draw(self._current(), kind)
                 self._cost = time.monotonic() - began
                 return True
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
-            # Rests, and paths that are played, are noticed by looking.
-            self._wake.wait(min(left, TICK if self._visitors else 1.0))
+            # Sharp pictures after a rest and paths that are played become due without an event.
+            self._wake.wait(min(left, TICK if self._sessions else 1.0))
 
-    def _due(self) -> tuple[Visitor, str] | None:
+    def _due(self) -> tuple[Session, str] | None:
         with self._lock:
-            visitors = sorted(self._visitors.values(), key=lambda visitor: visitor.pace.last)
-        for visitor in visitors:
-            kind = visitor.wants()
+            sessions = sorted(self._sessions.values(), key=lambda session: session.pacing.last_frame)
+        for session in sessions:
+            kind = session.due()
             if kind is not None:
-                return visitor, kind
+                return session, kind
         return None
 
     def refresh(self) -> None:
-        """The scene has changed: draw it anew, though not so often that a training would feel it."""
+        """Render a changed scene anew, but rarely enough not to slow a training down."""
         now = time.monotonic()
         if now - self._refreshed < max(REFRESH, SHARE * self._cost):
             return
         self._refreshed = now
         with self._lock:
-            for visitor in self._visitors.values():
-                visitor.pace.stale()
+            for session in self._sessions.values():
+                session.pacing.mark_outdated()
 
     def close(self) -> None:
-        """Send the visitors away."""
+        """Stop the server and close all sessions."""
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -147,18 +147,18 @@ class Viewer:
 def _listening(viser: Any, host: str, port: int, title: str) -> Any:
     if not 0 < port < 65536:
         raise PolarguideError(
-            "the port", expected="1 to 65535", found=str(port), remedy="Choose such a port."
+            "the port", expected="a port from 1 to 65535", found=str(port), remedy="Choose another port."
         )
-    try:  # viser itself would wait for ever
+    try:  # viser itself would wait forever
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as listener:
             listener.bind(address)
     except OSError as error:
         raise PolarguideError(
             host,
-            expected="an address of this machine to listen at",
+            expected="an address of this machine",
             found=error.strerror or str(error),
-            remedy="Choose 127.0.0.1, or one that this machine has.",
+            remedy="Choose 127.0.0.1, or another address of this machine.",
         ) from None
     with contextlib.redirect_stdout(io.StringIO()):
         return viser.ViserServer(host=host, port=port, label=title, verbose=False)

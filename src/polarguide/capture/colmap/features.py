@@ -1,30 +1,45 @@
-"""Steps of COLMAP that structure from motion and triangulation share: features, matches, and running them."""
+"""Extract and match features with COLMAP, for structure from motion and for triangulation."""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from polarguide.capture.colmap.row_counter import RowCounter
 from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.write import encoded_png
+from polarguide.capture.write import write_png
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
+from polarguide.files import make_folder, writing
 from polarguide.progress import Reporter
 
 _POLL_SECONDS = 0.5
 # COLMAP logs every picture and pair; what fails comes as an exception.
 _FATAL = 3
+_COUNT_ROWS = """
+import pathlib, sqlite3, sys, time
+link = pathlib.Path(sys.argv[1]).absolute().as_uri() + "?mode=ro"
+while True:
+    try:
+        database = sqlite3.connect(link, uri=True, timeout=0.1)
+        count = database.execute("SELECT COUNT(*) FROM " + sys.argv[2]).fetchone()[0]
+        database.close()
+        print(count, flush=True)
+    except sqlite3.Error:
+        print(0, flush=True)
+    time.sleep(1)
+"""
 
 
-def match(
+def match_features(
     database: Path,
     images: Path,
     sizes: dict[str, tuple[int, int]],
@@ -35,30 +50,30 @@ def match(
     cameras: Mapping[str, PosedCamera] | None = None,
     masks: Path | None = None,
 ) -> dict[str, tuple[int, int]]:
-    """Features, matches and two-view geometries of the pictures, into the database.
+    """Extract features, match them, and write features, matches and two-view geometries into the database.
 
     Args:
-        database: made, or gone on with.
+        database: the file; it is created, or continued where an earlier call stopped.
         images: folder of ``<view>.png``.
         sizes: width and height of every picture, by view.
         matching: "exhaustive" or "sequential".
         seed: of all random draws.
         reporter: for progress.
         cameras: intrinsics by view, where they are known.
-        masks: folder of ``<view>.png``, outside of whose white parts nothing is looked at; may lack some or all.
+        masks: folder of ``<view>.png``; features are extracted in white parts only. Views without a file have no mask.
 
     Returns:
-        The numbers of each view's image and camera in the database, where ``cameras`` were given; else nothing.
+        The ids of each view's image and camera in the database where ``cameras`` are given; else an empty dictionary.
 
     Raises:
-        PolarguideError: COLMAP failed; the database is removed, for it may be the reason.
+        PolarguideError: COLMAP failed; the database is removed because it may be the cause.
     """
     kinds = set(sizes.values()) if cameras is None else {camera.intrinsics for camera in cameras.values()}
     single = len(kinds) == 1
     mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE
     count = len(sizes)
     verify = pycolmap.TwoViewGeometryOptions()
-    seeded(verify.ransac, seed)
+    set_seed(verify.ransac, seed)
     compare = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
     pairs = count * (count - 1) // 2 if matching == "exhaustive" else None
     reading: dict[str, Any] = {}
@@ -66,16 +81,23 @@ def match(
         reading["reader_options"] = pycolmap.ImageReaderOptions()
         reading["reader_options"].mask_path = str(_named_for_colmap(masks, sizes))
     try:
-        with RowCounter(database, "keypoints") as counter:
-            run(
+        with _RowCounter(database, "keypoints") as counter:
+            run_step(
                 lambda: pycolmap.extract_features(database, images, camera_mode=mode, **reading),
-                seed, reporter, "finding features", count, lambda: counter.rows,
+                seed, reporter, "extracting features", count, lambda: counter.rows,
             )  # fmt: skip
         numbers: dict[str, tuple[int, int]] = {}
         if cameras is not None:
-            numbers = run(lambda: _know(database, cameras), seed, reporter, "known cameras", None, lambda: 0)
-        with RowCounter(database, "two_view_geometries") as counter:
-            run(
+            numbers = run_step(
+                lambda: _write_intrinsics(database, cameras),
+                seed,
+                reporter,
+                "setting intrinsics",
+                None,
+                lambda: 0,
+            )
+        with _RowCounter(database, "two_view_geometries") as counter:
+            run_step(
                 lambda: compare(database, verification_options=verify),
                 seed, reporter, "matching pairs", pairs, lambda: counter.rows,
             )  # fmt: skip
@@ -88,20 +110,21 @@ def match(
 
 
 def _named_for_colmap(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
-    """Masks under the names that COLMAP wants, ``<view>.png.png``; white for views without, which it would skip."""
+    """Copies of the masks as ``<view>.png.png``, which COLMAP expects; white for views without, which it would skip."""
     named = masks.with_name("colmap_masks")
-    guarded(lambda: named.mkdir(exist_ok=True), named)
+    make_folder(named)
     for view, (width, height) in sizes.items():
         mask, wanted = masks / f"{view}.png", named / f"{view}.png.png"
         if mask.exists():
-            guarded(lambda mask=mask, wanted=wanted: shutil.copyfile(mask, wanted), wanted)  # type: ignore[misc]
+            with writing(wanted):
+                shutil.copyfile(mask, wanted)
         else:
-            write_whole(wanted, encoded_png(np.full((height, width), 255, np.uint8)))
+            write_png(wanted, np.full((height, width), 255, np.uint8))
     return named
 
 
-def _know(database: Path, cameras: Mapping[str, PosedCamera]) -> dict[str, tuple[int, int]]:
-    """Write known intrinsics over those that COLMAP guessed: numbers of images and cameras by view."""
+def _write_intrinsics(database: Path, cameras: Mapping[str, PosedCamera]) -> dict[str, tuple[int, int]]:
+    """Replace the intrinsics that COLMAP guessed by the known ones; returns ids of image and camera by view."""
     numbers = {}
     with pycolmap.Database.open(database) as link:
         for view, camera in cameras.items():
@@ -121,7 +144,7 @@ def _know(database: Path, cameras: Mapping[str, PosedCamera]) -> dict[str, tuple
     return numbers
 
 
-def run(
+def run_step(
     work: Callable[[], Any],
     seed: int,
     reporter: Reporter,
@@ -129,7 +152,13 @@ def run(
     total: int | None,
     done: Callable[[], int],
 ) -> Any:
-    """Run a step of COLMAP in a thread, so that progress shows and Ctrl-C ends the program at once.
+    """Run a step of COLMAP in a thread, so that progress is shown and Ctrl-C ends the program at once.
+
+    Args:
+        work: the step. seed: of COLMAP's generators.
+        reporter: for progress, under the name ``label``.
+        total: number of units of work; None if it is unknown.
+        done: returns the number of finished units.
 
     Raises:
         PolarguideError: it failed.
@@ -163,7 +192,48 @@ def run(
     return outcome["value"]
 
 
-def seeded(options: Any, seed: int) -> None:
-    """Give COLMAP's options a seed, where this version of it takes one."""
+def set_seed(options: Any, seed: int) -> None:
+    """Set the seed of COLMAP's options, if this version of COLMAP has one."""
     if hasattr(options, "random_seed"):
         options.random_seed = seed
+
+
+class _RowCounter:
+    """Counts the rows of a table from a process of its own, for as long as it is entered.
+
+    COLMAP brings its own copy of SQLite. Two copies in one process undo each other's file locks (those of POSIX
+    belong to processes), and the database is destroyed: it must never be opened, nor even closed, from here.
+    """
+
+    def __init__(self, database: Path, table: str) -> None:
+        self.rows = 0
+        self._command = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, str(database), table]
+        self._process: subprocess.Popen[str] | None = None
+        self._listener: threading.Thread | None = None
+
+    def __enter__(self) -> _RowCounter:
+        with contextlib.suppress(OSError):  # without a second process there is no progress, but all else
+            self._process = subprocess.Popen(
+                self._command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+            )
+            self._listener = threading.Thread(target=self._listen, daemon=True)
+            self._listener.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._process is None:
+            return
+        self._process.kill()
+        self._process.wait()
+        if self._listener is not None:
+            self._listener.join()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def _listen(self) -> None:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.rows = max(self.rows, int(line))

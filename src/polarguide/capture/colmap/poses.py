@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from polarguide.capture.colmap.model import MODEL_FILES, find_model, load_model, posed_images
-from polarguide.capture.colmap.undistort import Geometry, Warp, fitted_camera, warp_of
+from polarguide.capture.colmap.undistort import Geometry, Undistortion, camera_for_picture, undistortion
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
@@ -58,8 +58,8 @@ class Poses:
                     remedy="Keep the one that is meant.",
                 )
             self._require_numbers(view)
-        self._warps: dict[Key, Warp] = {}
-        self._of_camera: dict[int, Warp] = {}
+        self._warps: dict[Key, Undistortion] = {}
+        self._of_camera: dict[int, Undistortion] = {}
 
     @classmethod
     def read(cls, path: Path, views: list[str]) -> Poses:
@@ -105,7 +105,7 @@ class Poses:
             )
         return found
 
-    def warp(self, view: str, geometry: Geometry) -> Warp:
+    def warp(self, view: str, geometry: Geometry) -> Undistortion:
         """What the view's picture has to go through.
 
         Raises:
@@ -114,10 +114,10 @@ class Poses:
         number = self._images[view].camera_id
         key = (number, geometry)
         if key not in self._warps:
-            camera = fitted_camera(
+            camera = camera_for_picture(
                 self._model.cameras[number], geometry, f"{self.folder} (camera of view {view})"
             )
-            self._warps[key] = warp_of(camera)
+            self._warps[key] = undistortion(camera)
         warp = self._warps[key]
         if self._of_camera.setdefault(number, warp) is not warp:
             raise PolarguideError(
@@ -144,7 +144,7 @@ class Poses:
             camera.params = warp.target.params
         model.write_binary(str(folder))
 
-    def _move_points(self, image: Any, before: Any, warp: Warp) -> None:
+    def _move_points(self, image: Any, before: Any, warp: Undistortion) -> None:
         """Observed points go where their pixels went."""
         places = np.array([point.xy for point in image.points2D])
         rays = np.nan_to_num(before.cam_from_img(places))

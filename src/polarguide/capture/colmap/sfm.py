@@ -10,11 +10,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.features import match, run, seeded
+from polarguide.capture.colmap.features import match_features, run_step, set_seed
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded
+from polarguide.files import make_folder
 from polarguide.progress import Reporter
 
 _FEW_SHARE = 0.8
@@ -26,7 +26,7 @@ ADVICE = (
 
 
 def tone_mapped(intensities: NDArray[np.float32], pictures: str = "photograph") -> NDArray[np.uint8]:
-    """A view as an 8-bit sRGB picture, BGR, with the 99th percentile at white.
+    """The photograph of a view as an 8-bit sRGB picture, [H, W, 3] RGB, with the 99th percentile at white.
 
     Args:
         intensities: [4, H, W, 3] linear.
@@ -35,7 +35,7 @@ def tone_mapped(intensities: NDArray[np.float32], pictures: str = "photograph") 
     photograph = intensities.min(axis=0) if pictures == "minimum" else intensities.mean(axis=0)
     white = max(float(np.percentile(photograph, 99.0)), 1e-4)
     shown = srgb_encode_array(np.clip(photograph / white, 0.0, 1.0))
-    return np.rint(255.0 * shown[..., ::-1]).astype(np.uint8)
+    return np.rint(255.0 * shown).astype(np.uint8)
 
 
 def reconstruct(
@@ -78,12 +78,12 @@ def reconstruct(
     if intrinsics is not None:
         still = np.eye(3), np.zeros(3)
         cameras = {view: PosedCamera(*size, *intrinsics, *still) for view, size in sizes.items()}
-    match(
+    match_features(
         database, images, sizes,
         matching=matching, seed=seed, reporter=reporter, cameras=cameras, masks=folder / "masks",
     )  # fmt: skip
     shutil.rmtree(trial, ignore_errors=True)
-    guarded(lambda: trial.mkdir(), trial)
+    make_folder(trial)
     free = intrinsics is None or refine
     models = _map(database, images, trial, len(sizes), seed, reporter, free)
     best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
@@ -97,7 +97,7 @@ def reconstruct(
         )
     chosen = folder / "chosen"
     shutil.rmtree(chosen, ignore_errors=True)
-    guarded(chosen.mkdir, chosen)
+    make_folder(chosen)
     best.write_binary(str(chosen))
     chosen.rename(model)
     said = f"{registered} of {len(sizes)} views registered"
@@ -118,13 +118,13 @@ def _map(
     options.min_model_size = _LEAST
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
     for part in (options, options.mapper, options.triangulation):
-        seeded(part, seed)
+        set_seed(part, seed)
     placed = [0]
 
     def step() -> None:
         placed[0] += 1
 
-    found: dict[int, Any] = run(
+    found: dict[int, Any] = run_step(
         lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
         seed, reporter, "placing cameras", count, lambda: placed[0] + 2 if placed[0] else 0,
     )  # fmt: skip

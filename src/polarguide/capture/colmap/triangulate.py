@@ -1,4 +1,4 @@
-"""3D points for poses that have none: matched and triangulated, else sampled where the cameras look."""
+"""3D points for given poses: triangulated from feature matches, or sampled in the visual hull."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.features import match, run, seeded
+from polarguide.capture.colmap.features import match_features, run_step, set_seed
 from polarguide.capture.colmap.model import load_model
-from polarguide.capture.colmap.sample import region_samples
+from polarguide.capture.colmap.visual_hull import colmap_camera, sample_visual_hull
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_file
 from polarguide.errors import PolarguideError
-from polarguide.files import guarded, write_whole
+from polarguide.files import make_folder, write_whole, writing
 from polarguide.progress import Reporter
 from polarguide.records import read_record
 
 FEWEST = 200
-"""Fewer triangulated points than this are no shape to start from."""
+"""With fewer triangulated points than this, points are sampled in the visual hull instead."""
 SAMPLES = 20_000
 FOUND = "points.json"
 
@@ -38,25 +38,25 @@ def add_points(
     seed: int,
     reporter: Reporter,
 ) -> tuple[Path, dict[str, Any]]:
-    """A model with the given cameras, as they are, and points.
+    """Add 3D points to given cameras; the cameras stay as they are.
 
     Features of ``folder/images/<view>.png`` are matched and triangulated with the poses held fixed. If fewer
-    than ``FEWEST`` points come out, points are sampled inside the hull of ``folder/masks/<view>.png``, or where
-    the cameras' pictures overlap if there are no masks.
+    than ``FEWEST`` points result, points are sampled in the visual hull of ``folder/masks/<view>.png``, or in the
+    cameras' common field of view if there are no masks.
 
     Args:
-        folder: for work; finished work in it is taken over.
+        folder: working folder; results of an earlier call in it are used.
         cameras: of the pictures in it, by view.
-        where: the poses came from, for messages.
+        where: the origin of the poses, for messages.
         matching: "exhaustive" or "sequential".
         seed: of all random draws.
-        reporter: for progress and what was found.
+        reporter: for progress and messages.
 
     Returns:
-        The folder of the model, and how its points came about.
+        The folder of the model, and a record of the origin and number of its points.
 
     Raises:
-        PolarguideError: nothing lies before enough cameras to sample from, or a file cannot be written.
+        PolarguideError: the cameras have no common field of view, or a file cannot be written.
     """
     model, note = folder / "model", folder / FOUND
     if model.is_dir() and note.exists():
@@ -64,8 +64,9 @@ def add_points(
     start, trial = folder / "start", folder / "triangulated"
     for path in (start, trial):
         shutil.rmtree(path, ignore_errors=True)
-        guarded(lambda path=path: path.mkdir(parents=True), path)  # type: ignore[misc]
-    guarded(lambda: write_cameras(start, cameras), start)
+        make_folder(path)
+    with writing(start):
+        write_cameras(start, cameras)
     count, error = _triangulated(folder, start, trial, cameras, matching, seed, reporter)
     found: dict[str, Any] = {"from": "triangulation with fixed poses", "count": count}
     if error is not None:
@@ -76,7 +77,8 @@ def add_points(
         reporter.say(
             f"The poses came without points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
         )
-    guarded(lambda: _replace(model, trial), model)
+    with writing(model):
+        _replace(model, trial)
     write_whole(note, (json.dumps(found) + "\n").encode())
     return model, found
 
@@ -95,22 +97,23 @@ def _triangulated(
     seed: int,
     reporter: Reporter,
 ) -> tuple[int, float | None]:
-    """Triangulate into ``trial``: number of points, and their mean reprojection error."""
+    """Triangulate into ``trial``; returns the number of points and their mean reprojection error."""
     database, images = folder / "database.db", folder / "images"
     sizes = {view: (camera.width, camera.height) for view, camera in cameras.items()}
     try:
-        numbers = match(
+        numbers = match_features(
             database, images, sizes, matching=matching, seed=seed, reporter=reporter, cameras=cameras
         )
-        guarded(lambda: write_cameras(start, cameras, numbers), start)
+        with writing(start):
+            write_cameras(start, cameras, numbers)
         model = load_model(start, ".bin")
         options = pycolmap.IncrementalPipelineOptions()
         for part in (options, options.mapper, options.triangulation):
-            seeded(part, seed)
+            set_seed(part, seed)
         options.ba_refine_focal_length = options.ba_refine_principal_point = (
             options.ba_refine_extra_params
         ) = False
-        made = run(
+        made = run_step(
             lambda: pycolmap.triangulate_points(model, database, images, trial, options=options),
             seed, reporter, "triangulating", None, lambda: 0,
         )  # fmt: skip
@@ -137,12 +140,12 @@ def _sample(
         path = folder / "masks" / f"{view}.png"
         if path.exists():
             masks[view] = decode_mask(path, read_file(path), any_value=True)
-    places = region_samples(cameras, masks, SAMPLES, np.random.default_rng(seed))
+    places = sample_visual_hull(cameras, masks, SAMPLES, np.random.default_rng(seed))
     kind = "the hull of the masks" if masks else "the cameras' common field of view"
     if len(places) == 0:
         raise PolarguideError(
             where,
-            expected="poses whose cameras look at one place",
+            expected="poses of cameras with a common field of view",
             found=f"{triangulated} triangulated points, and nothing in {kind}",
             remedy="Check the poses (world to camera, axes right, down, forward), or bring a model with points.",
         )
@@ -150,11 +153,11 @@ def _sample(
     for place, color in zip(places, _colors(folder, cameras, places), strict=True):
         model.add_point3D(place, pycolmap.Track(), color)
     shutil.rmtree(trial, ignore_errors=True)
-    guarded(trial.mkdir, trial)
+    make_folder(trial)
     model.write_binary(str(trial))
     reporter.warn(
         f"The poses came without points, and only {triangulated} could be triangulated (fewer than {FEWEST}): "
-        f"{len(places)} points were sampled at random in {kind} instead. They know nothing of the surface."
+        f"{len(places)} points were sampled at random in {kind} instead. They do not lie on the surface."
     )
     return {"from": f"random samples in {kind}", "count": len(places), "triangulated": triangulated}
 
@@ -162,7 +165,7 @@ def _sample(
 def _colors(
     folder: Path, cameras: Mapping[str, PosedCamera], places: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Mean color of the photographs where points [N, 3] would be seen, [N, 3] RGB."""
+    """Mean color of the photographs at the projections of points [N, 3], [N, 3] RGB."""
     total, seen = np.zeros((len(places), 3)), np.zeros(len(places))
     views = sorted(cameras)
     for view in views[:: max(1, len(views) // 8)]:
@@ -170,7 +173,7 @@ def _colors(
         picture = decode_picture(path, read_file(path))
         camera = cameras[view]
         local = places @ camera.rotation.T + camera.translation
-        focal, center = _inner(camera)
+        focal, center = _intrinsics(camera)
         pixel = local[:, :2] / np.maximum(local[:, 2:], 1e-9) * focal + center
         size = np.array([camera.width, camera.height])
         inside = (local[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
@@ -182,11 +185,9 @@ def _colors(
     return np.rint(gray).astype(np.uint8)
 
 
-def _inner(camera: PosedCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Focal lengths and principal point of any of COLMAP's models, distortion left out."""
-    made = pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=list(camera.parameters)
-    )
+def _intrinsics(camera: PosedCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Focal lengths and principal point of any of COLMAP's models, without distortion."""
+    made = colmap_camera(camera)
     return (
         np.array([made.focal_length_x, made.focal_length_y]),
         np.array([made.principal_point_x, made.principal_point_y]),

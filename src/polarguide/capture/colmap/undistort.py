@@ -46,7 +46,7 @@ class Geometry:
 
 
 @dataclass(frozen=True, eq=False)
-class Warp:
+class Undistortion:
     """How a picture becomes that of a pinhole camera.
 
     Attributes:
@@ -101,7 +101,7 @@ class Warp:
         return np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
 
 
-def fitted_camera(camera: Any, geometry: Geometry, where: str) -> Any:
+def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
     """A COLMAP camera in the pixels of the developed picture."""
     width, height = geometry.size
     size = (camera.width, camera.height)
@@ -128,15 +128,17 @@ def fitted_camera(camera: Any, geometry: Geometry, where: str) -> Any:
     return fitted
 
 
-def warp_of(camera: Any) -> Warp:
+def undistortion(camera: Any) -> Undistortion:
     """What pictures of a COLMAP camera have to go through."""
     straight = camera.model_name in PINHOLES and all(
         camera.params[i] == 0 for i in camera.extra_params_idxs()
     )
     if not straight:
-        return Warp(camera, pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera), True)
+        return Undistortion(
+            camera, pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera), True
+        )
     inner = [camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y]
     target = pycolmap.Camera(
         model="PINHOLE", width=camera.width, height=camera.height, params=inner, camera_id=camera.camera_id
     )
-    return Warp(camera, target, False)
+    return Undistortion(camera, target, False)

@@ -1,0 +1,107 @@
+"""Measure one view: exposure, noise, consistency of the four angles, polarization."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.inspection.capture import InspectedView
+
+DARK = 1.0 / 256.0
+"""Mean intensity below which a pixel is too dark to be used."""
+POLARIZED = 0.05
+"""DoLP from which a pixel counts as polarized."""
+_QUANTILE_SAMPLES = 200_000
+
+
+@dataclass(frozen=True)
+class ViewMeasurements:
+    """Measurements of one view. ``saturated``, ``invalid`` and ``dark`` are shares of all pixels, others of the usable.
+
+    Attributes:
+        view: its name.
+        bright: 99th percentile of the intensities, in [0, 1].
+        saturated, invalid, dark: shares of pixels with an angle at full scale (or black in all), marked invalid by
+            the capture, and darker than 1/256.
+        noise: median standard deviation of the noise of one intensity (mean over the colors), after averaging down.
+        noise_share: the same, as a share of S0 / 2.
+        pair_ratio: median of (I0 + I90) / (I45 + I135); None where too few pixels are bright enough.
+        sum_error: median of |I0 + I90 - I45 - I135| / S0.
+        dolp: quantiles 0.5 and 0.99 of the DoLP.
+        polarized: share with a DoLP over 0.05 and over three times its noise.
+        above_limit: share with a DoLP over the limit of diffuse light by three times its noise.
+    """
+
+    view: str
+    bright: float
+    saturated: float
+    invalid: float
+    dark: float
+    noise: float
+    noise_share: float
+    pair_ratio: float | None
+    sum_error: float
+    dolp: tuple[float, float]
+    polarized: float
+    above_limit: float
+
+    def record(self) -> dict[str, Any]:
+        """As plain JSON types."""
+        return {**vars(self), "dolp": {"median": self.dolp[0], "p99": self.dolp[1]}}
+
+
+def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
+    """Measure one view.
+
+    Args:
+        view: its pictures.
+        index: refractive index.
+    """
+    gray = view.intensities().mean(dim=-1)
+    stokes = optics.stokes(gray)
+    dark = gray.mean(dim=0) < DARK
+    good = view.usable & ~dark
+    share = float(good.float().mean())
+    noise = optics.intensity_noise(gray)
+    bright = _quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
+    saturated, invalid = (float(mask.float().mean()) for mask in (view.saturated, view.invalid))
+    nothing = ViewMeasurements(
+        view.name,
+        bright,
+        saturated,
+        invalid,
+        float(dark.float().mean()),
+        0.0,
+        0.0,
+        None,
+        0.0,
+        (0.0, 0.0),
+        0.0,
+        0.0,
+    )
+    if share < 0.001:
+        return nothing
+    i0, i45, i90, i135 = (angle[good] for angle in gray)
+    s0 = stokes[0][good]
+    degree, spread = optics.dolp(stokes)[good], optics.dolp_noise(stokes, noise)[good]
+    limit = float(optics.diffuse_dolp_limit(index))
+    return replace(
+        nothing,
+        noise=_quantile(noise[good], 0.5),
+        noise_share=_quantile(noise[good] / (s0 / 2), 0.5),
+        pair_ratio=_quantile((i0 + i90) / (i45 + i135).clamp(min=1e-6), 0.5),
+        sum_error=_quantile((i0 + i90 - i45 - i135).abs() / s0, 0.5),
+        dolp=(_quantile(degree, 0.5), _quantile(degree, 0.99)),
+        polarized=float(((degree > POLARIZED) & (degree > 3 * spread)).float().mean()),
+        above_limit=float((degree > limit + 3 * spread).float().mean()),
+    )
+
+
+def _quantile(values: Tensor, q: float) -> float:
+    """Quantile of the values; of a regular subset where there are very many."""
+    step = max(1, values.numel() // _QUANTILE_SAMPLES)
+    return float(torch.quantile(values.flatten()[::step], q))

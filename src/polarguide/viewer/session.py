@@ -1,0 +1,211 @@
+"""A session: one connected browser, with its controls, its camera, and the pictures that it receives."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from polarguide.camera import Camera
+from polarguide.scene_frame import SceneFrame
+from polarguide.viewer.appearance import Painter
+from polarguide.viewer.frame_pacing import FramePacing
+from polarguide.viewer.frusta import Frusta, Photograph
+from polarguide.viewer.keyframes import FRAMES_PER_SECOND, Keyframes
+from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
+from polarguide.viewer.pose import ViewPose, move_to_view
+from polarguide.viewer.shown import Shown
+from polarguide.viewer.viewport import free_camera
+from polarguide.visualization.figures import Picture, png_bytes
+
+PATH_FILE, PICTURE_FILE = "camera_path.json", "polarguide.png"
+JPEG_QUALITY = 75
+NO_LAYER = "This layer is not available here: go to a photograph, or choose another layer"
+
+
+class Session:
+    """A connected browser.
+
+    Callbacks only record changes; the rendering thread calls ``draw``.
+
+    Args:
+        client: viser's handle. photographs: by name. scene_frame: of the scene.
+        options: of the panel. wake: called when a picture may be due.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        photographs: Mapping[str, Photograph],
+        scene_frame: SceneFrame,
+        options: PanelOptions,
+        wake: Callable[[], None],
+    ) -> None:
+        self._client, self._photographs, self._scene_frame, self._wake = (
+            client,
+            photographs,
+            scene_frame,
+            wake,
+        )
+        self._lock = threading.Lock()
+        self._painter = Painter(scene_frame)
+        self.pacing = FramePacing()
+        self._view_pose: ViewPose | None = None
+        self._screenshot = False
+        self._playing: tuple[float, list[Camera]] | None = None
+        first = next(iter(photographs.values())).view.camera
+        self._size = first.width, first.height
+        self._keyframes = Keyframes(self._size)
+        self.panel = Panel(client.gui, options, self._changed)
+        self._frusta = Frusta(client.scene, list(photographs.values()), scene_frame, self.go)
+        self._connect()
+
+    @property
+    def paused(self) -> bool:
+        """Whether this session pauses the training."""
+        return bool(self.panel.pause.value)
+
+    def _connect(self) -> None:
+        panel = self.panel
+        self._client.camera.on_update(lambda _: self._moved())
+        panel.view.on_update(lambda _: self._selected(panel.view.value))
+        panel.step.on_click(lambda _: self._step(1 if panel.step.value == "next" else -1))
+        panel.frusta.on_update(lambda _: self._frusta.show(panel.frusta.value))
+        panel.box.on_update(lambda _: self._changed())
+        panel.pause.on_update(lambda _: self._wake())
+        panel.screenshot.on_click(lambda _: self._request_screenshot())
+        panel.add_keyframe.on_click(lambda _: self._add_keyframe())
+        panel.remove_keyframe.on_click(lambda _: self._remove_keyframe())
+        panel.seconds.on_update(lambda _: self._show_count())
+        panel.play.on_click(lambda _: self._play())
+        panel.save_path.on_click(lambda _: self._save_path())
+
+    def _changed(self) -> None:
+        with self._lock:
+            self.pacing.mark_changed(time.monotonic())
+        self._frusta.show_box(self.panel.crop if self.panel.box.value else None)
+        self._wake()
+
+    def _moved(self) -> None:
+        """The browser reports the pose of its camera."""
+        camera = self._client.camera
+        with self._lock:
+            now = time.monotonic()
+            self.pacing.mark_changed(now)
+            if self._view_pose is not None and not self._view_pose.is_kept(
+                camera, now, self._scene_frame.distance
+            ):
+                self._view_pose = None
+                self.panel.view.value = FREE_VIEW
+        self._wake()
+
+    def go(self, name: str) -> None:
+        """Move the camera to the pose of a photograph."""
+        with self._lock:
+            self._playing = None
+            view = self._photographs[name].view
+            self._view_pose = move_to_view(self._client, view, self._scene_frame, time.monotonic())
+            self.pacing.mark_changed(time.monotonic())
+        self.panel.view.value = name
+        self._wake()
+
+    def _selected(self, name: str) -> None:
+        if name in self._photographs and (self._view_pose is None or self._view_pose.view.name != name):
+            self.go(name)
+
+    def _step(self, by: int) -> None:
+        names = list(self._photographs)
+        at = names.index(self._view_pose.view.name) if self._view_pose else (-1 if by > 0 else 0)
+        self.go(names[(at + by) % len(names)])
+
+    def _request_screenshot(self) -> None:
+        self._screenshot = True
+        self._wake()
+
+    def _add_keyframe(self) -> None:
+        camera = self._view_pose.view.camera if self._view_pose else self._camera(self._size)
+        self._keyframes.add(camera)
+        self._show_count()
+
+    def _remove_keyframe(self) -> None:
+        del self._keyframes.cameras[-1:]
+        self._show_count()
+
+    def _show_count(self) -> None:
+        count = len(self._keyframes.cameras)
+        seconds = max(0, count - 1) * float(self.panel.seconds.value)
+        self.panel.keyframes.value = f"{count}" + (f", {seconds:g} s" if count > 1 else "")
+
+    def _save_path(self) -> None:
+        if self._keyframes.cameras:
+            text = self._keyframes.to_json(float(self.panel.seconds.value))
+            self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
+
+    def _play(self) -> None:
+        path = self._keyframes.path(float(self.panel.seconds.value))
+        if len(path) > 1:
+            with self._lock:
+                self._view_pose, self._playing = None, (time.monotonic(), path)
+            self.panel.view.value = FREE_VIEW
+            self._wake()
+
+    def _camera(self, frame_size: tuple[int, int]) -> Camera:
+        camera = self._client.camera
+        return free_camera(camera.wxyz, camera.position, camera.fov, frame_size)
+
+    def _follow_path(self) -> None:
+        """Move the browser's camera to the current pose of the path that is played."""
+        if self._playing is None:
+            return
+        began, path = self._playing
+        frame = int((time.monotonic() - began) * FRAMES_PER_SECOND)
+        if frame >= len(path):
+            self._playing = None
+            return
+        camera, target = self._client.camera, path[frame]
+        ahead = float(np.linalg.norm(camera.look_at - camera.position))
+        with self._client.atomic():
+            camera.position = target.center.numpy()
+            camera.up_direction = (-target.rotation[1]).numpy()
+            camera.look_at = (target.center + ahead * target.rotation[2]).numpy()
+        self.pacing.mark_changed(time.monotonic())
+
+    def due(self) -> str | None:
+        """The kind of picture that is due: "coarse", "sharp", or None."""
+        with self._lock:
+            self._follow_path()
+            return "sharp" if self._screenshot else self.pacing.due(time.monotonic())
+
+    def draw(self, shown: Shown, kind: str) -> None:
+        """Render a picture and send it to the browser."""
+        began = time.monotonic()
+        with self._lock:
+            version, view_pose = self.pacing.begin_frame(), self._view_pose
+            screenshot, self._screenshot = self._screenshot, False
+            camera = self._client.camera
+            frame_size = self.pacing.frame_size((camera.image_width, camera.image_height), kind)
+            viewpoint = self._camera(frame_size)
+        view = None if view_pose is None else view_pose.view
+        sharp = kind == "sharp"
+        appearance = self.panel.appearance
+        picture = self._painter.paint(shown, viewpoint, appearance, view, settled=sharp)
+        self._send(picture, frame_size, sharp=sharp)
+        self._frusta.hide_near(None if view else viewpoint.center.numpy())
+        if screenshot and picture is not None:
+            self._client.send_file_download(PICTURE_FILE, png_bytes(picture), save_immediately=True)
+        now = time.monotonic()
+        with self._lock:
+            self.pacing.end_frame(version, kind, now - began, now)
+        note = f"{frame_size[0]} x {frame_size[1]} in {1000 * (now - began):.0f} ms"
+        self.panel.show_status(shown.status, NO_LAYER if picture is None else note)
+
+    def _send(self, picture: Picture | None, frame_size: tuple[int, int], *, sharp: bool) -> None:
+        if picture is None:
+            picture = np.full((frame_size[1], frame_size[0], 3), 64, dtype=np.uint8)
+        if sharp:
+            self._client.scene.set_background_image(picture, format="png")
+        else:
+            self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)

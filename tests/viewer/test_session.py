@@ -1,0 +1,192 @@
+"""What a session sends to its browser, with a fake in place of the browser."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from fake_browser import FakeClient
+from viewer_scenes import frame_of_scene, photographs, shown
+
+from polarguide.shading.result import LAYERS
+from polarguide.viewer.panel import FREE_VIEW, PanelOptions
+from polarguide.viewer.session import NO_LAYER, PATH_FILE, PICTURE_FILE, Session
+from polarguide.viewer.viewport import letterbox
+from polarguide.visualization import figures
+
+
+class ViewingSession:
+    """A session, its fake browser, and the scene."""
+
+    def __init__(self, clock):
+        self.clock, self.seen = clock, shown()
+        self.photographs = photographs(self.seen)
+        self.client = FakeClient()
+        options = PanelOptions(LAYERS, turns=True, views=tuple(self.photographs), trains=True)
+        self.session = Session(self.client, self.photographs, frame_of_scene(), options, lambda: None)
+        self.session.go("v0")
+        self.client.camera.report()
+
+    def picture(self):
+        """The next picture, if one is due."""
+        kind = self.session.due()
+        if kind is None:
+            return None
+        self.session.draw(self.seen, kind)
+        return self.client.scene.pictures[-1]
+
+    def rest(self):
+        """The sharp picture after a rest."""
+        self.clock.now += 1.0
+        picture = self.picture()
+        assert self.picture() is None
+        return picture[0]
+
+    def at(self, name):
+        return self.photographs[name].view
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self):
+        self.now += 0.001
+        return self.now
+
+
+@pytest.fixture
+def viewing(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("polarguide.viewer.session.time.monotonic", clock)
+    return ViewingSession(clock)
+
+
+def rendered(seen, camera):
+    result = seen.render(camera, depth=False)
+    return figures.radiance_to_rgb(result.final)
+
+
+def psnr(a, b):
+    return -10 * np.log10(max(np.mean((a / 255.0 - b / 255.0) ** 2), 1e-12))
+
+
+def test_a_session_begins_at_the_first_photograph_and_sees_what_render_gives(viewing):
+    view = viewing.at("v0")
+    # The window is twice the photograph's size.
+    expected = rendered(viewing.seen, letterbox(view.camera, (128, 96)).camera(view.camera))
+    assert psnr(viewing.rest(), expected) > 60
+    assert viewing.client.control("Go to").value == "v0"
+
+
+def test_coarse_jpegs_while_moving_and_a_png_at_rest(viewing):
+    viewing.rest()
+    viewing.client.camera.drag((1.0, -1.0, -4.0))
+    assert viewing.picture()[1] == "jpeg"
+    assert viewing.picture() is None
+    viewing.clock.now += 1.0
+    assert viewing.picture()[1] == "png"
+
+
+def test_measured_layers_are_there_until_the_camera_moves(viewing):
+    viewing.client.control("Layer").value = "photograph"
+    sharp = viewing.rest()
+    shown_photograph = figures.radiance_to_rgb(viewing.at("v0").photograph())
+    assert psnr(cv2.resize(sharp, (64, 48), interpolation=cv2.INTER_AREA), shown_photograph) > 30
+    viewing.client.camera.drag((1.0, -1.0, -4.0))
+    assert (viewing.rest() == 64).all()
+    assert NO_LAYER in viewing.client.control("status").value
+    assert viewing.client.control("Go to").value == FREE_VIEW
+
+
+def test_a_late_report_from_before_a_jump_does_not_undo_it(viewing):
+    camera = viewing.client.camera
+    before = camera.position
+    viewing.session.go("v3")
+    there, camera.position = camera.position, before
+    camera.report()
+    camera.position = there
+    camera.report()
+    assert viewing.client.control("Go to").value == "v3"
+    viewing.client.camera.drag((1.0, -1.0, -4.0))
+    assert viewing.client.control("Go to").value == FREE_VIEW
+
+
+def test_jumping_by_list_by_buttons_and_by_a_click_on_a_camera(viewing):
+    client = viewing.client
+    client.control("Go to").value = "v2"
+    assert np.allclose(client.camera.position, viewing.at("v2").camera.center)
+    step = client.control("")
+    step.value = "next"
+    assert np.allclose(client.camera.position, viewing.at("v3").camera.center)
+    step.value = "previous"
+    step.click()
+    assert client.control("Go to").value == "v1"
+    client.scene.frusta[4].click()
+    assert client.control("Go to").value == "v4"
+
+
+def test_cameras_that_would_cover_the_picture_are_left_out(viewing):
+    viewing.rest()
+    assert not any(frustum.visible for frustum in viewing.client.scene.frusta)
+    near = viewing.at("v2").camera.center.numpy()
+    viewing.client.camera.drag(tuple(1.05 * near))
+    viewing.rest()
+    visible = [frustum.visible for frustum in viewing.client.scene.frusta]
+    assert not visible[2]
+    assert sum(visible) == 5
+    viewing.client.control("Show cameras").value = False
+    assert not any(frustum.visible for frustum in viewing.client.scene.frusta)
+
+
+def test_a_saved_picture_is_the_sharp_one(viewing):
+    sharp = viewing.rest()
+    viewing.client.control("Save picture").click()
+    viewing.picture()
+    data = np.frombuffer(viewing.client.files[PICTURE_FILE], dtype=np.uint8)
+    assert np.array_equal(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], sharp)
+
+
+def test_a_path_is_set_down_played_and_saved(viewing):
+    client = viewing.client
+    for name in ("v1", "v2"):
+        viewing.session.go(name)
+        client.control("Add keyframe").click()
+    client.control("Add keyframe").click()
+    client.control("Remove last keyframe").click()
+    assert client.control("Keyframes").value == "2, 2 s"
+    client.control("Seconds per segment").value = 3.0
+    assert client.control("Keyframes").value == "2, 3 s"
+    client.control("Seconds per segment").value = 2.0
+    client.control("Save path").click()
+    cameras = json.loads(client.files[PATH_FILE])["cameras"]
+    assert len(cameras) == 61
+    client.control("Play").click()
+    assert client.control("Go to").value == FREE_VIEW
+    viewing.clock.now += 1.0
+    assert viewing.session.due() == "coarse"
+    middle = client.camera.position
+    ends = [viewing.at(name).camera.center.numpy() for name in ("v1", "v2")]
+    assert np.linalg.norm(middle - ends[0]) < 0.7 * np.linalg.norm(ends[1] - ends[0])
+    assert np.linalg.norm(middle - ends[1]) < 0.7 * np.linalg.norm(ends[1] - ends[0])
+    viewing.clock.now += 5.0
+    assert viewing.session.due() == "sharp"
+
+
+def test_the_crop_is_drawn_as_a_box_and_hides_the_rest(viewing):
+    whole = viewing.rest()
+    client = viewing.client
+    client.control("Left, right").value = (-10, 10)
+    client.control("Crop").value = True
+    assert client.scene.boxes[-1].shape == (12, 2, 3)
+    cropped = viewing.rest()
+    assert cropped.sum() < 0.8 * whole.sum()
+    client.control("Crop").value = False
+    assert np.array_equal(viewing.rest(), whole)
+
+
+def test_a_training_waits_when_asked(viewing):
+    assert not viewing.session.paused
+    viewing.client.control("Pause training").value = True
+    assert viewing.session.paused
