@@ -1,8 +1,19 @@
-"""For all tests: the demo scene; and one thread for torch, because tensors are small here."""
+"""For all tests: the demo scene, one thread for torch, and closing lines that say what was skipped and why.
 
+The reason of a skip names what is missing and, behind an arrow, the command that brings it.
+"""
+
+import os
+import signal
+from collections import Counter
 from pathlib import Path
 
 import pytest
+
+# Tensors are small here, and threads that wait by spinning slow every test that runs beside them.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import torch
 from tiny import make_busy_recipe, make_scene
 
@@ -12,6 +23,8 @@ from polarguide.cli.app import run
 from polarguide.training.recipe import Recipe
 
 torch.set_num_threads(1)
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as a shell starts what runs in its background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 STEPS = 40
 SHORT = ("--downscale", "4", "--steps", str(STEPS), "--threads", "1")
@@ -45,3 +58,20 @@ def tiny_scene() -> Scene:
 @pytest.fixture
 def busy_recipe() -> Recipe:
     return make_busy_recipe()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """What was skipped, by reason, the most frequent first."""
+    reasons = Counter(skip_reason(report) for report in terminalreporter.stats.get("skipped", ()))
+    if reasons:
+        terminalreporter.section("skipped, and the command that changes it")
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count} skipped: {reason}")
+
+
+def skip_reason(report: pytest.TestReport | pytest.CollectReport) -> str:
+    """The reason of a skip, with the command for a package that could not be imported."""
+    assert isinstance(report.longrepr, tuple)
+    reason = str(report.longrepr[2]).removeprefix("Skipped: ")
+    lacking = reason.startswith("could not import") and " -> " not in reason
+    return f"{reason} -> pip install '.[test]'" if lacking else reason

@@ -5,13 +5,16 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polarguide.api import Model, PolarguideError, load
+    from polarguide.experiments.ablate import ablate
+    from polarguide.experiments.compare import compare
 
 __version__ = "0.1.0"
-__all__ = ["Model", "PolarguideError", "__version__", "load"]
+__all__ = ["Model", "PolarguideError", "__version__", "ablate", "compare", "load"]
 
 
 def __getattr__(name: str) -> Any:
@@ -20,4 +23,6 @@ def __getattr__(name: str) -> Any:
         from polarguide import api
 
         return getattr(api, name)
+    if name in ("ablate", "compare"):
+        return getattr(importlib.import_module(f"polarguide.experiments.{name}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -63,10 +63,9 @@ class Model:
         return {name: self._run.state.gaussians[name].detach() for name in self._run.state.gaussians.names}
 
     @property
-    def environment(self) -> dict[str, Tensor] | None:
-        """The learned light's parameters, ``texels`` [6, R, R, C] raw; None for a recipe without reflection."""
-        found = self._run.environment
-        return None if found is None else {name: values.detach() for name, values in found.items()}
+    def light(self) -> dict[str, Tensor]:
+        """The learned light's parameters, such as ``texels`` [6, R, R, C] raw; empty for a recipe without."""
+        return {name: values.detach() for name, values in self._run.light.items()}
 
     @cached_property
     def scene(self) -> Scene:

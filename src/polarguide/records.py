@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -66,27 +67,31 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
     return record
 
 
-def check_options(options: Any) -> None:
-    """Check the values of a dataclass of options against its annotations.
-
-    Raises:
-        PolarguideError: one has another type or is out of range; the message names it as the command line does.
-    """
-    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
-    for name, value in values.items():
-        _require_finite(value, option_name(name), "Correct the value.")
-    try:
-        msgspec.convert(values, type(options), from_attributes=True)
-    except msgspec.ValidationError as error:
-        field, expected, found = _fault(str(error), values, type(options))
-        raise PolarguideError(
-            option_name(field), expected=expected, found=found, remedy="Correct the value."
-        ) from None
-
-
 def option_name(field: str) -> str:
     """The command line's option that sets a field."""
     return "--" + field.replace("_", "-")
+
+
+def check_options(options: Any, name: Callable[[str], str] = option_name) -> None:
+    """Check the values of a dataclass against its annotations.
+
+    Args:
+        options: the dataclass. name: what messages call a field.
+
+    Raises:
+        PolarguideError: one has another type or is out of range.
+    """
+    remedy = "Correct the value."
+    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    for field, value in values.items():
+        _require_finite(value, name(field), remedy)
+    try:
+        msgspec.convert(values, type(options), dec_hook=lambda kind, value: kind(value))
+    except msgspec.ValidationError as error:
+        field, expected, found = _fault(str(error), values, type(options))
+        raise PolarguideError(
+            name(field.partition("[")[0]), expected=expected, found=found, remedy=remedy
+        ) from None
 
 
 def to_json(content: Any) -> bytes:
@@ -116,7 +121,10 @@ def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
     elif what.startswith("Number out of range"):
         expected = "a number of usual size"
     elif what.startswith("Invalid enum value"):
-        expected = " or ".join(str(choice) for choice in _choices(form))
+        *others, last = map(str, _choices(form))
+        expected = f"{', '.join(others)} or {last}" if others else last
+    elif _limits(form) and not got:
+        expected = _limits(form)
     return field, expected, found
 
 
@@ -162,6 +170,18 @@ def _names(form: Any) -> list[str]:
 def _choices(form: Any) -> list[Any]:
     options = getattr(form, "types", (form,))
     return [choice for option in options for choice in getattr(option, "values", ())]
+
+
+def _limits(form: Any) -> str:
+    """The range of a number in words; empty where there is none."""
+    for option in getattr(form, "types", (form,)):
+        least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
+        if least is not None and most is not None:
+            return f"{least:g} to {most:g}"
+        words = ((least, "{} or more"), (above, "above {}"), (most, "up to {}"), (below, "below {}"))
+        if any(limit is not None for limit, _ in words):
+            return " and ".join(text.format(limit) for limit, text in words if limit is not None)
+    return ""
 
 
 def _plain(text: str) -> str:

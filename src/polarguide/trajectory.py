@@ -19,21 +19,13 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, look_at
 from polarguide.errors import PolarguideError
 from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.vectors import dot, unit
 
 LARGEST_SIDE = 8192
 MOST_FRAMES = 100_000
-
-
-def looking(lens: Camera, eye: Tensor, target: Tensor, up: Tensor) -> Camera:
-    """A camera with the lens and size of another at ``eye`` [3], looking at ``target`` [3], upright toward ``up``."""
-    forward = unit(target - eye, 1e-12)
-    right = unit(torch.linalg.cross(forward, up), 1e-12)
-    rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
-    return replace(lens, rotation=rotation, translation=-rotation @ eye)
 
 
 def orbit(cameras: Sequence[Camera], frames: int, *, swing: float = 0.0) -> list[Camera]:
@@ -54,7 +46,8 @@ def orbit(cameras: Sequence[Camera], frames: int, *, swing: float = 0.0) -> list
         angle = 2 * math.pi * k / frames
         lift = height + swing * around.distance * math.sin(2 * angle)
         eye = around.center + radius * (math.cos(angle) * ahead + math.sin(angle) * side) + lift * around.up
-        path.append(looking(cameras[0], eye, around.center, around.up))
+        rotation, translation = look_at(eye, around.center, around.up)
+        path.append(replace(cameras[0], rotation=rotation, translation=translation))
     return path
 
 

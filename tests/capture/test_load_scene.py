@@ -193,7 +193,7 @@ def test_arguments_out_of_range(capture: TinyCapture, arguments: dict[str, objec
         ("split.json", '{"tests": []}', r"split.json: expected the field test, found only tests\."),
         ("split.json", '{"test": [3]}', r"split.json \(test\[0\]\): expected text, found 3.*\{\"test\""),
         ("split.json", '{"test": ["v000", "v0010"]}', r"split.json \(test\).*found 'v0010'.*v001"),
-        ("scene.json", '{"refractive_index": 0.5}', r"scene.json \(refractive_index\).*> 1.0.*found 0.5"),
+        ("scene.json", '{"refractive_index": 0.5}', r"scene.json \(refractive_index\).*above 1.*found 0.5"),
         ("scene.json", '{"refractive_index": "glass"}', 'found "glass"'),
         ("scene.json", '{"refractive_index": true}', "a number or null, found true"),
         ("scene.json", "\ufeff\ufeff", "broken JSON"),

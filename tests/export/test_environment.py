@@ -23,11 +23,12 @@ from polarguide.export.environment import (
 )
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
-from polarguide.shading.deferred import Shading
+from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
+from polarguide.shading.model import PLAIN
 
 AROUND = scene_frame(list(ring().values()))
-LERP, FRESNEL = Shading(), Shading("fresnel")
+LERP, FRESNEL = DeferredShading(), DeferredShading("fresnel")
 
 
 def smooth_texels(resolution: int = 32) -> torch.Tensor:
@@ -37,17 +38,17 @@ def smooth_texels(resolution: int = 32) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("shading", [LERP, FRESNEL])
-def test_a_panorama_becomes_the_light_it_was(shading: Shading) -> None:
+def test_a_panorama_becomes_the_light_it_was(shading: DeferredShading) -> None:
     texels = smooth_texels()
-    picture = panorama(texels, shading, AROUND, 256)
-    back = texels_of(picture, shading, AROUND, 32)
-    torch.testing.assert_close(shading.light(back), shading.light(texels), atol=0.01, rtol=0.01)
+    picture = panorama(texels, shading.radiance_cubemap, AROUND, 256)
+    back = texels_of(picture, shading.radiance_cubemap, AROUND, 32)
+    torch.testing.assert_close(shading.radiance(back), shading.radiance(texels), atol=0.01, rtol=0.01)
 
 
 def test_a_panorama_is_upright_and_runs_to_the_right() -> None:
     axes = AROUND.panorama_axes().float()
     texels = texel_directions(32) @ axes  # light = (right, up, back)
-    picture = panorama(texels, FRESNEL, AROUND, 64).log()
+    picture = panorama(texels, FRESNEL.radiance_cubemap, AROUND, 64).log()
     right, up, back = picture.unbind(-1)
     assert float(up[0].mean()) > 0.99
     assert float(up[-1].mean()) < -0.99
@@ -106,8 +107,8 @@ def test_a_damaged_exr_is_refused(tmp_path: Path) -> None:
 
 
 def test_recipes_without_radiance_say_so() -> None:
-    for shading, lit in ((DirectionalShading(), True), (LERP, False)):
+    for shading in (DirectionalShading(), PLAIN):
         with pytest.raises(PolarguideError, match="--environment: expected a recipe that learns"):
-            needs_radiance(shading, lit=lit, what="--environment")
-    assert needs_radiance(FRESNEL, lit=True, what="") is FRESNEL
+            needs_radiance(shading, what="--environment")
+    assert needs_radiance(FRESNEL, what="") == FRESNEL.radiance_cubemap
     assert math.isfinite(AROUND.distance)

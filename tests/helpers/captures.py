@@ -46,13 +46,6 @@ def write_scene(
     return root
 
 
-def encode(values: np.ndarray) -> np.ndarray:
-    """Linear -> sRGB."""
-    return np.where(
-        values <= 0.0031308, 12.92 * values, 1.055 * np.maximum(values, 1e-9) ** (1 / 2.4) - 0.055
-    )
-
-
 def gained(*gains: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda values: values * np.array(gains)[:, None, None, None]
 

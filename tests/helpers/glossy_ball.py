@@ -27,7 +27,7 @@ class Sighted(ColmapModel):
 
     seen: Tensor = dataclasses.field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.bool))
 
-    def sightings(self, views: object) -> Tensor:
+    def observations(self, views: object) -> Tensor:
         return self.seen
 
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 from glossy_ball import INDEX, mistaken, model_of, surfaces, views_around
 
-from polarguide.inspection.angle_checks import handedness_check, order_check, weigh, zero_check
-from polarguide.inspection.dielectric import dielectric_check, unexplained
-from polarguide.inspection.likelihood import odds
+from polarguide.inspection.angle_checks import combine_evidence, handedness_check, order_check, zero_check
+from polarguide.inspection.dielectric import dielectric_check, exceeds_dielectric
+from polarguide.inspection.likelihood import posterior
+from polarguide.inspection.measurements import measure_view
 from polarguide.inspection.orders import ORDERS, PAIRINGS
 from polarguide.inspection.points import point_evidence
-from polarguide.inspection.readings import read_view_figures
-from polarguide.inspection.surfaces import surface_evidence, surface_pixels
+from polarguide.inspection.surfaces import normal_evidence, sample_surfaces
 
 FIRST = ORDERS[0].files()
 
@@ -23,17 +23,17 @@ FIRST = ORDERS[0].files()
 def test_points_find_every_order(ball_views, order) -> None:
     views = tuple(mistaken(view, files=order.files()) for view in ball_views)
     evidence, _ = point_evidence(views, model_of(views), INDEX)
-    check = order_check(weigh([evidence], 0))
+    check = order_check(combine_evidence([evidence], 0))
     assert check.verdict == ("ok" if order is ORDERS[0] else "wrong")
     assert check.figures["order"] == list(order.files())
-    sense = handedness_check(weigh([evidence], 0))
+    sense = handedness_check(combine_evidence([evidence], 0))
     assert sense.verdict == ("ok" if order.sense > 0 else "wrong")
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_normals_find_every_order(ball_views, order) -> None:
     views = tuple(mistaken(view, files=order.files()) for view in ball_views)
-    check = order_check(weigh([surface_evidence(surface_pixels(surfaces(views)), INDEX)], 0))
+    check = order_check(combine_evidence([normal_evidence(sample_surfaces(surfaces(views)), INDEX)], 0))
     assert check.verdict == ("ok" if order is ORDERS[0] else "wrong")
     assert check.figures["order"] == list(order.files())
 
@@ -42,9 +42,9 @@ def test_another_pairing_is_read_through(ball_views) -> None:
     files = ORDERS[6].files(PAIRINGS[2])
     views = tuple(mistaken(view, files=files) for view in ball_views)
     evidence, _ = point_evidence(views, model_of(views), INDEX, pairing=2)
-    assert order_check(weigh([evidence], 2)).figures["order"] == list(files)
-    pixels = surface_pixels(surfaces(views), pairing=2)
-    assert order_check(weigh([surface_evidence(pixels, INDEX)], 2)).figures["order"] == list(files)
+    assert order_check(combine_evidence([evidence], 2)).figures["order"] == list(files)
+    pixels = sample_surfaces(surfaces(views), pairing=2)
+    assert order_check(combine_evidence([normal_evidence(pixels, INDEX)], 2)).figures["order"] == list(files)
 
 
 @pytest.mark.parametrize("zero", [10.0, -17.0, 1.0])
@@ -54,8 +54,8 @@ def test_the_zero_is_measured(ball_views, zero: float, source: str) -> None:
     if source == "points":
         evidence, _ = point_evidence(views, model_of(views), INDEX)
     else:
-        evidence = surface_evidence(surface_pixels(surfaces(views)), INDEX)
-    check = zero_check(weigh([evidence], 0))
+        evidence = normal_evidence(sample_surfaces(surfaces(views)), INDEX)
+    check = zero_check(combine_evidence([evidence], 0))
     assert check.figures["offset_degrees"] == pytest.approx(zero, abs=0.5)
     assert check.verdict == ("ok" if zero == 1.0 else "wrong")
 
@@ -63,12 +63,12 @@ def test_the_zero_is_measured(ball_views, zero: float, source: str) -> None:
 def test_without_pixels_that_must_be_specular_the_quarter_turn_stays_open() -> None:
     # A matte ball: DoLP as diffuse light has it, so specular light at another zenith explains it as well.
     views = views_around(specular=0.0, diffuse=0.5, noise=0.0)
-    pixels = surface_pixels(surfaces(views))
-    assert not pixels.must_be_specular(INDEX).any()
-    angles = weigh([surface_evidence(pixels, INDEX)], 0)
-    assert angles.odds is not None
-    assert angles.odds.probabilities[0] == pytest.approx(angles.odds.probabilities[2], abs=0.01)
-    assert angles.odds.probabilities[0] > 0.45
+    pixels = sample_surfaces(surfaces(views))
+    assert not pixels.certainly_specular(INDEX).any()
+    angles = combine_evidence([normal_evidence(pixels, INDEX)], 0)
+    assert angles.posterior is not None
+    assert angles.posterior.probabilities[0] == pytest.approx(angles.posterior.probabilities[2], abs=0.01)
+    assert angles.posterior.probabilities[0] > 0.45
     assert angles.order is None
     assert order_check(angles).verdict == "warning"
     assert handedness_check(angles).verdict == "ok"  # the sense is decided all the same
@@ -82,9 +82,9 @@ def test_wrong_normals_are_not_used(ball_views) -> None:
         facing = torch.where((normal * surface.camera.rays()).sum(-1, keepdim=True) > 0, -normal, normal)
         surface.normal.copy_(facing)
         pairs.append((view, surface))
-    evidence = surface_evidence(surface_pixels(pairs), INDEX)
+    evidence = normal_evidence(sample_surfaces(pairs), INDEX)
     assert not evidence.usable
-    check = order_check(weigh([evidence], 0))
+    check = order_check(combine_evidence([evidence], 0))
     assert check.verdict == "n/a"
     assert evidence.note in check.finding
 
@@ -100,8 +100,8 @@ def test_points_that_do_not_belong_to_the_pictures_are_not_used(ball_views) -> N
 def test_too_few_points_and_pixels_say_so(ball_views) -> None:
     evidence, _ = point_evidence(ball_views, model_of(ball_views, count=10), INDEX)
     assert not evidence.usable
-    assert "points have 4 sightings" in evidence.note
-    none = surface_evidence(surface_pixels(surfaces(ball_views[:1])), INDEX)
+    assert "points have 4 observations" in evidence.note
+    none = normal_evidence(sample_surfaces(surfaces(ball_views[:1])), INDEX)
     assert not none.usable
     assert "are needed" in none.note
 
@@ -110,28 +110,28 @@ def test_zeniths_of_points_are_those_of_the_ball(ball_views) -> None:
     model = model_of(ball_views)
     _, pixels = point_evidence(ball_views, model, INDEX)
     assert pixels is not None
-    assert not unexplained(pixels, INDEX).any()
+    assert not exceeds_dielectric(pixels, INDEX).any()
     # The normal of a point of the unit ball is its place.
     centers = torch.stack([view.camera.center.float() for view in ball_views if view.camera])
-    toward = torch.nn.functional.normalize(centers[None] - pixels.place[:, None], dim=-1)
-    zeniths = torch.acos((toward * pixels.place[:, None]).sum(-1).clamp(-1, 1))
+    toward = torch.nn.functional.normalize(centers[None] - pixels.position[:, None], dim=-1)
+    zeniths = torch.acos((toward * pixels.position[:, None]).sum(-1).clamp(-1, 1))
     nearest = (zeniths - pixels.zenith[:, None]).abs().amin(dim=1)
     assert math.degrees(float(nearest.quantile(0.9))) < 3
 
 
 def test_polarization_beyond_any_dielectric_is_flagged(ball_views) -> None:
-    readings = [read_view_figures(view, INDEX) for view in ball_views]
-    pixels = surface_pixels(surfaces(ball_views))
-    assert dielectric_check(readings, pixels, INDEX).verdict == "ok"
+    measurements = [measure_view(view, INDEX) for view in ball_views]
+    pixels = sample_surfaces(surfaces(ball_views))
+    assert dielectric_check(measurements, pixels, INDEX).verdict == "ok"
     strong = type(pixels)(
         pixels.aolp, torch.full_like(pixels.dolp, 0.9), pixels.noise, pixels.azimuth,
-        torch.full_like(pixels.zenith, 0.3), pixels.place,
+        torch.full_like(pixels.zenith, 0.3), pixels.position,
     )  # fmt: skip
-    check = dielectric_check(readings, strong, INDEX)
+    check = dielectric_check(measurements, strong, INDEX)
     assert check.verdict == "warning"
     assert check.figures["unexplained"] == 1.0
 
 
 def test_evidence_is_not_certain_beyond_its_failures(ball_views) -> None:
     evidence, _ = point_evidence(ball_views, model_of(ball_views), INDEX)
-    assert max(odds(evidence).probabilities) < 0.995
+    assert max(posterior(evidence).probabilities) < 0.995

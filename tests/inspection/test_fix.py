@@ -13,17 +13,19 @@ from captures import soft_intensities, write_scene
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.errors import PolarguideError
 from polarguide.inspection import fix
-from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.capture import read_capture
-from polarguide.inspection.likelihood import Odds
+from polarguide.inspection.likelihood import OrderPosterior
 from polarguide.inspection.orders import ORDERS, PAIRINGS
 from polarguide.polarizer import ANGLES
 
 
-def decided(order: int, offset: float = 0.0, error: float = 0.1, p: float = 0.99, pairing: int = 0) -> Angles:
+def decided(
+    order: int, offset: float = 0.0, error: float = 0.1, p: float = 0.99, pairing: int = 0
+) -> AngleFindings:
     rest = (1 - p) / 7
     probabilities = tuple(p if k == order else rest for k in range(8))
-    return Angles(pairing, (), Odds((0.0,) * 8, probabilities, offset, error))
+    return AngleFindings(pairing, (), OrderPosterior((0.0,) * 8, probabilities, offset, error))
 
 
 def hashes(root: Path) -> dict[str, str]:
@@ -90,8 +92,8 @@ def test_what_is_right_is_left_alone(tmp_path) -> None:
     assert fix.correction(capture, decided(0, offset=8.0, error=4.0)) is None
 
 
-@pytest.mark.parametrize("angles", [decided(2, p=0.9), Angles(0, (), None)])
-def test_what_is_not_decided_is_refused(tmp_path, angles: Angles) -> None:
+@pytest.mark.parametrize("angles", [decided(2, p=0.9), AngleFindings(0, (), None)])
+def test_what_is_not_decided_is_refused(tmp_path, angles: AngleFindings) -> None:
     capture = read_capture(write_scene(tmp_path / "s"))
     with pytest.raises(PolarguideError, match="a decided order of the angles"):
         fix.correction(capture, angles)

@@ -7,8 +7,16 @@ import math
 import pytest
 import torch
 
-from polarguide.inspection.clusters import cells, cluster_sums
-from polarguide.inspection.likelihood import FAILURE, Evidence, Odds, combined, odds, tempered
+from polarguide.inspection.likelihood import (
+    FAILURE,
+    Evidence,
+    OrderPosterior,
+    combine,
+    posterior,
+    spatial_cells,
+    sum_by_cluster,
+    tempered,
+)
 from polarguide.inspection.orders import ORDERS
 
 
@@ -46,7 +54,7 @@ def evidence_for(sense: int, zero: float, strength: float, clusters: int = 60) -
     ("sense", "zero", "best"), [(1, 0.0, 0), (1, 96.5, 2), (-1, 38.0, 5), (-1, 174.0, 4)]
 )
 def test_order_and_offset_are_found_with_their_error(sense: int, zero: float, best: int) -> None:
-    found = odds(evidence_for(sense, zero, 3.0))
+    found = posterior(evidence_for(sense, zero, 3.0))
     assert found.best == best
     offset = (zero - ORDERS[best].zero + 90) % 180 - 90
     assert found.offset == pytest.approx(offset, abs=max(3 * found.offset_error, 0.1))
@@ -59,19 +67,19 @@ def test_order_and_offset_are_found_with_their_error(sense: int, zero: float, be
 def test_weak_evidence_decides_nothing() -> None:
     generator = torch.Generator().manual_seed(5)
     noise = torch.randn(40, 2, 180, generator=generator)
-    assert max(odds(Evidence("test", noise, 40, True, "")).probabilities) < 0.8
+    assert max(posterior(Evidence("test", noise, 40, True, "")).probabilities) < 0.8
 
 
-def some_odds(best: int, offset: float, error: float) -> Odds:
+def some_odds(best: int, offset: float, error: float) -> OrderPosterior:
     probabilities = [FAILURE / 8] * 8
     probabilities[best] += 1 - FAILURE
     against = [20.0] * 8
     against[best] = 0.0
-    return Odds(tuple(against), tuple(probabilities), offset, error)
+    return OrderPosterior(tuple(against), tuple(probabilities), offset, error)
 
 
 def test_agreeing_sources_strengthen_and_average_by_their_errors() -> None:
-    found = combined([some_odds(2, 1.0, 0.1), some_odds(2, 2.0, 0.2)])
+    found = combine([some_odds(2, 1.0, 0.1), some_odds(2, 2.0, 0.2)])
     assert found.best == 2
     assert found.probabilities[2] > 0.9999
     assert found.offset == pytest.approx((1.0 / 0.01 + 2.0 / 0.04) / (1 / 0.01 + 1 / 0.04))
@@ -79,18 +87,18 @@ def test_agreeing_sources_strengthen_and_average_by_their_errors() -> None:
 
 
 def test_contradicting_sources_decide_nothing() -> None:
-    found = combined([some_odds(0, 0.0, 0.1), some_odds(2, 0.0, 0.1)])
+    found = combine([some_odds(0, 0.0, 0.1), some_odds(2, 0.0, 0.1)])
     assert found.probabilities[0] == pytest.approx(0.5, abs=0.01)
     assert found.probabilities[2] == pytest.approx(0.5, abs=0.01)
 
 
 def test_cells_part_what_lies_apart_and_sums_follow_them() -> None:
     places = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
-    numbers = cells(places)
+    numbers = spatial_cells(places)
     assert int(numbers.max()) + 1 == len(numbers.unique()) > 100
     near = (places - places[0]).norm(dim=1) > 0.3
     assert not (numbers[near] == numbers[0]).any()
-    sums = cluster_sums(torch.ones(500, 2), numbers)
+    sums = sum_by_cluster(torch.ones(500, 2), numbers)
     assert sums.sum() == 1000
     assert sums[numbers[0], 0] == (numbers == numbers[0]).sum()
-    assert cells(torch.zeros(7, 3)).tolist() == [0] * 7
+    assert spatial_cells(torch.zeros(7, 3)).tolist() == [0] * 7

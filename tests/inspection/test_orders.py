@@ -42,5 +42,5 @@ def test_an_order_turns_the_aolp_as_its_sense_and_zero_say(order) -> None:
 def test_swaps_in_words() -> None:
     assert swaps((0, 45, 90, 135)) == "nothing"
     assert swaps((90, 45, 0, 135)) == (
-        "the picture called 0° was taken at 90°, the picture called 90° was taken at 0°"
+        "the picture named 0° was taken at 90°, the picture named 90° was taken at 0°"
     )

@@ -6,20 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import encode, gained, one_view, write_scene
+from captures import gained, one_view, write_scene
+from tiny_capture import encode_srgb
 
 from polarguide.inspection.capture import read_capture
+from polarguide.inspection.measurements import measure_view
 from polarguide.inspection.orders import PAIRINGS
-from polarguide.inspection.picture_checks import pairing_of, picture_checks
-from polarguide.inspection.readings import read_view_figures
+from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.verdict import Check
 from polarguide.polarizer import ANGLES
 
 
 def checked(root: Path) -> dict[str, Check]:
     capture = read_capture(root)
-    readings = [read_view_figures(view, 1.5) for view in capture.views]
-    return {check.key: check for check in picture_checks(capture, readings, pairing_of(capture))}
+    measurements = [measure_view(view, 1.5) for view in capture.views]
+    return {check.key: check for check in picture_checks(capture, measurements, find_pairing(capture))}
 
 
 def flagged(found: dict[str, Check]) -> dict[str, str]:
@@ -37,7 +38,7 @@ def test_a_sound_capture_is_not_flagged(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (encode, {"encoding": "wrong"}),
+        (encode_srgb, {"encoding": "wrong"}),
         (lambda v: v**1.6, {"encoding": "wrong"}),
         (gained(1.05, 1, 1, 1), {"exposure": "warning"}),
         (gained(1, 1.05, 1, 1), {"exposure": "warning"}),

@@ -19,7 +19,8 @@ from polarguide import files
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 PLAIN = PrepareSettings(poses="none", gains="none")
 MOSAIC = replace(PLAIN, sensor="IMX250MYR")

@@ -32,7 +32,8 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.pictures import decode_mask
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 PLAIN = PrepareSettings(poses="none", gains="none")
 NAMES = {

@@ -17,7 +17,8 @@ from polarguide.capture.colmap import triangulate as points_module
 from polarguide.capture.colmap.visual_hull import sample_visual_hull
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 FILTER = PrepareSettings(gains="none", align=False, transfer="linear")
 

@@ -30,7 +30,8 @@ from relief import write_relief
 from polarguide.capture import load_scene
 from polarguide.capture.colmap.sfm import tone_mapped
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 MOSAIC = PrepareSettings(sensor="IMX250MYR", gains="none")
 FILTER = PrepareSettings(gains="none", align=False, transfer="linear")

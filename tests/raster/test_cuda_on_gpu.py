@@ -22,8 +22,10 @@ from polarguide.raster.cuda import has_gsplat, rasterize_cuda
 
 pytestmark = [
     pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA GPU"),
-    pytest.mark.skipif(not has_gsplat(), reason="gsplat is not installed"),
+    pytest.mark.skipif(
+        not torch.cuda.is_available(), reason="no CUDA GPU -> on a machine with one: make gpu-check"
+    ),
+    pytest.mark.skipif(not has_gsplat(), reason="no gsplat -> pip install '.[cuda]'"),
 ]
 
 # Norm of the difference over the norm, float32 with fast exponentials against float64.

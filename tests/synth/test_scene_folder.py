@@ -18,7 +18,7 @@ from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.cli.app import run
 from polarguide.errors import PolarguideError
-from polarguide.preparation import Reporter
+from polarguide.progress import Reporter
 from polarguide.synth import render as runner
 from polarguide.synth import sweep as sweeps
 from polarguide.synth.manifest import MANIFEST, scene_digest, verify_scene
@@ -43,6 +43,8 @@ TINY = {
     ],
 }  # fmt: skip
 SETTINGS = SynthSettings(width=16, height=16, samples=1, points=60)
+# The scalar variant has no threads, and takes minutes for pictures with little noise.
+COMPILED = pytest.mark.parametrize("variant", ["compiled"], indirect=True)
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +110,7 @@ def test_rendering_goes_on_to_the_same_files(
         assert (scene / name).read_text() == (out / name).read_text()
 
 
+@COMPILED
 def test_the_files_do_not_depend_on_the_threads(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
     settings = SynthSettings(width=64, height=48, samples=16, points=60)
     two = replace(spec, camera=replace(spec.camera, views=2))
@@ -157,6 +160,7 @@ def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSp
         synthesize(spec, tmp_path / "new", SynthSettings(samples=0), Reporter())
 
 
+@COMPILED
 @pytest.mark.parametrize("sensor", ["imx250mzr", "imx250myr"])
 def test_mosaics_come_back_through_prepare(
     sensor: str, variant: Variant, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -104,7 +104,7 @@ def look_at_all(trainer: Trainer, step: int) -> None:
     """A step of the stage at ``step`` on every training view, without a round of the density control."""
     for slot in range(len(trainer.scene.train_views)):
         trainer.state.step = step
-        trainer._look(slot, trainer.schedule.at(step).stage, True)
+        trainer._backpropagate(slot, trainer.schedule.at(step).stage, True)
         trainer._join_gradients(idle=False)
         trainer._optimize()
 

@@ -95,16 +95,16 @@ def _mesh(opened: OpenRun, folder: Path, resolution: int) -> list[Path]:
 
 def _points(opened: OpenRun, folder: Path) -> list[Path]:
     path = folder / "points.ply"
-    write_points(path, *surface_points(opened.state.gaussians, opened.scene.views, opened.backend.rasterize))
+    views, rasterize = opened.scene.views, opened.backend.rasterize
+    points = surface_points(opened.state.gaussians, opened.shading, views, rasterize)
+    write_points(path, *points)
     return [path]
 
 
 def _environment(opened: OpenRun, folder: Path) -> list[Path]:
-    environment = opened.environment
-    shading = needs_radiance(opened.shading, lit=environment is not None, what="--format environment")
-    assert environment is not None
+    cubemap = needs_radiance(opened.shading, what="--format environment")
     around = scene_frame(list(opened.cameras.values()))
-    picture = panorama(environment["texels"], shading, around, PANORAMA_HEIGHT)
+    picture = panorama(opened.light[cubemap.name], cubemap, around, PANORAMA_HEIGHT)
     paths = [folder / "environment.exr", folder / "environment.png"]
     write_exr(paths[0], picture)
     figures.write_png(paths[1], figures.radiance_to_rgb(picture))

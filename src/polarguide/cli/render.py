@@ -90,19 +90,18 @@ def relight(opened: OpenRun, panorama: Path | None, degrees: float) -> None:
         raise PolarguideError(
             "--rotate-environment", expected="degrees", found=str(degrees), remedy="Give a number."
         )
-    learned = opened.environment
     what = "--environment" if panorama else "--rotate-environment"
-    shading = needs_radiance(opened.shading, lit=learned is not None, what=what)
-    assert learned is not None
+    cubemap = needs_radiance(opened.shading, what=what)
+    learned = opened.light
     around = scene_frame(list(opened.cameras.values()))
     if panorama is not None:
-        texels = texels_of(read_panorama(panorama), shading, around, RELIT_RESOLUTION)
-        learned["texels"] = texels.to(learned["texels"].device)
-    learned["texels"] = turned_cubemap(learned["texels"].detach(), around.turn(degrees), RELIT_RESOLUTION)
-    if shading.local:
-        console.print(
-            "note: what stands near is reflected by light of the Gaussians' own, which stays as it was learned"
-        )
+        texels = texels_of(read_panorama(panorama), cubemap, around, RELIT_RESOLUTION)
+        learned[cubemap.name] = texels.to(learned[cubemap.name].device)
+    learned[cubemap.name] = turned_cubemap(
+        learned[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION
+    )
+    if opened.shading.local_note:
+        console.print(f"note: {opened.shading.local_note}")
 
 
 def render_run(opened: OpenRun, views: tuple[View, ...], layers: list[str], out: Path) -> Path:

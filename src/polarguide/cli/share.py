@@ -56,7 +56,7 @@ def page_of(opened: OpenRun, *, title: str = "", caption: str = "") -> str:
     scores = shown_metrics(read_metrics(opened.folder), scores_only=True) if scored else []
     return share_page(
         opened.state.gaussians,
-        opened.environment,
+        opened.light,
         opened.shading,
         {view.name: view.camera for view in views},
         first=views[0].name,

@@ -36,7 +36,7 @@ def view(
     viewer = Viewer(
         lambda: shown,
         photographs(opened.scene),
-        lit=opened.environment is not None,
+        shading=opened.shading,
         host=host,
         port=port,
         title=f"polarguide {run.resolve().name}",

@@ -54,8 +54,7 @@ def write_metrics(
 ) -> dict[str, Any]:
     """Write ``metrics.json`` in one step: a reader sees the old file or the whole new one.
 
-    Top level: the means of ``summarize``, the keys of ``run``, ``views`` and ``provenance``. What is not finite
-    becomes null.
+    Top level: the means of ``summarize``, the keys of ``run``, ``views`` and ``provenance``. NaN becomes null.
 
     Args:
         path: the file; its folder must exist.

@@ -13,7 +13,7 @@ from polarguide.experiments.aggregate import RunRecord
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
 from polarguide.experiments.results import Results, make_results, write_results
 from polarguide.experiments.tables import csv_text, latex, markdown
-from polarguide.files import atomic
+from polarguide.files import write_text
 from polarguide.runs.folder import recipe_data
 
 BESIDE_OTHERS = "beside_others.txt"
@@ -44,12 +44,12 @@ def collect(
         },
         settings={
             "steps": comparison.settings.steps,
-            "seeds": comparison.seeds,
-            "downscale": comparison.downscale,
-            "transfer": comparison.transfer,
+            "seeds": comparison.options.seeds,
+            "downscale": comparison.options.downscale,
+            "transfer": comparison.options.transfer,
             "refractive_index": comparison.settings.refractive_index,
-            "threads": comparison.threads,
-            "jobs": comparison.jobs,
+            "threads": comparison.options.threads,
+            "jobs": comparison.options.parallel,
         },
         scenes=[
             {"name": s.name, "digest": s.digest, "views": s.views, "test_views": list(s.test_views)}
@@ -93,5 +93,4 @@ def write_tables(out: Path, results: Results) -> None:
     write_results(out / "results.json", results)
     files = {"md": TITLE + markdown(results), "csv": csv_text(results), "tex": latex(results)}
     for suffix, text in files.items():
-        with atomic(out / f"results.{suffix}") as path:
-            path.write_text(text, encoding="utf-8")
+        write_text(out / f"results.{suffix}", text)

@@ -10,6 +10,7 @@ from pathlib import Path
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import ticks
 from polarguide.experiments.results import Results
+from polarguide.files import write_text
 
 DRAWN = tuple(metric for metric in COLUMNS if metric.key in ("psnr", "normal_mae_deg"))
 NAMES = {
@@ -19,6 +20,7 @@ NAMES = {
     "spacing": "degrees between neighboring views",
 }
 """What the parameters of a sweep are called at the axis, where their name does not say it."""
+STUDY = "study.svg"
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM, ROW = 430, 330, 52, 14, 26, 44, 18
 PALETTE = ("#3366cc", "#dc3912", "#109618", "#ff9900", "#990099", "#0099c6", "#dd4477", "#66aa00")
 
@@ -32,6 +34,13 @@ def read_study(scene: Path) -> tuple[str, float] | None:
         return str(study["parameter"]), float(study["value"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def write_study(out: Path, results: Results, scenes: Mapping[str, Path]) -> None:
+    """Write ``study.svg``, where the scenes (folders by name) are a family of ``polarguide synth --sweep``."""
+    drawn = study_svg(results, {name: read_study(path) for name, path in scenes.items()})
+    if drawn is not None:
+        write_text(out / STUDY, drawn)
 
 
 def study_svg(results: Results, studies: Mapping[str, tuple[str, float] | None]) -> str | None:

@@ -1,6 +1,6 @@
 """The learned environment as a panorama, and panoramas as environments.
 
-A panorama [H, 2 H, 3] is upright in the scene: row i, column j look at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
+A panorama [H, 2 H, 3] is upright in the scene: row i, column j is at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
 cameras' common level and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle, to the right. Files hold linear
 radiance on the scale of the photographs (S0 / 2).
 """
@@ -19,33 +19,32 @@ from torch.nn.functional import grid_sample, pad
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.scene_frame import SceneFrame
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
-from polarguide.shading.deferred import Shading
-from polarguide.shading.model import MAXIMUM_LOG_LIGHT, ShadingModel
+from polarguide.shading.model import RadianceCubemap, ShadingModel
 
 LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
 """Texels along the sides of a cubemap that is made of another light, or of the learned one turned."""
-_NO_LIGHT = 1e-4  # radiance of black, so that its logarithm is finite
 
 
-def needs_radiance(shading: ShadingModel, *, lit: bool, what: str) -> Shading:
-    """The shading model if its environment is radiance; ``what`` asks for it.
+def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
+    """The radiance that a shading model's light holds; ``what`` asks for it.
 
     Raises:
-        PolarguideError: the recipe has no environment, or one of features that only its network can read.
+        PolarguideError: the model has no light, or none that is a cubemap of radiance.
     """
-    if lit and isinstance(shading, Shading):
-        return shading
+    cubemap = shading.radiance_cubemap
+    if cubemap is not None:
+        return cubemap
     raise PolarguideError(
         what,
         expected="a recipe that learns the radiance of its surroundings",
-        found="one whose environment holds features for a network" if lit else "a run without reflection",
+        found="one whose light is something else" if shading.reflects else "a run without reflection",
         remedy="Take a run of 3dgs-dr, polarguide or polarguide-stokes.",
     )
 
 
 @torch.no_grad()
-def panorama(texels: Tensor, shading: Shading, around: SceneFrame, height: int) -> Tensor:
+def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, height: int) -> Tensor:
     """Radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
     steps = torch.arange(2 * height, dtype=torch.float64) + 0.5
     latitude, longitude = (
@@ -57,15 +56,12 @@ def panorama(texels: Tensor, shading: Shading, around: SceneFrame, height: int) 
     )
     directions = torch.stack((x, y, z), dim=-1).reshape(-1, 3) @ around.panorama_axes().T
     found = cubemap_lookup(texels.detach(), directions.to(texels.dtype))
-    return shading.light(found).reshape(height, 2 * height, 3)
+    return cubemap.radiance(found).reshape(height, 2 * height, 3)
 
 
 @torch.no_grad()
-def texels_of(picture: Tensor, shading: Shading, around: SceneFrame, resolution: int) -> Tensor:
-    """Raw texels [6, R, R, 3] that a panorama [H, W, 3] of radiance is the light of, as far as the blend can hold it.
-
-    ``lerp`` holds radiance below 1, ``fresnel`` below e^5.
-    """
+def texels_of(picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, resolution: int) -> Tensor:
+    """Raw texels [6, R, R, 3] of a panorama [H, W, 3] of radiance, as far as raw values can hold it."""
     directions = texel_directions(resolution).double() @ around.panorama_axes()
     x, y, z = directions.unbind(-1)
     across, down = torch.atan2(x, -z) / math.pi, -2 / math.pi * torch.asin(y.clamp(-1, 1))
@@ -77,9 +73,7 @@ def texels_of(picture: Tensor, shading: Shading, around: SceneFrame, resolution:
     )
     found = grid_sample(wide, places, mode="bilinear", padding_mode="border", align_corners=False)
     light = found[0].movedim(0, -1).reshape(6, resolution, resolution, 3)
-    if shading.blend == "lerp":
-        return torch.logit(light.clamp(_NO_LIGHT, 1 - _NO_LIGHT)).float()
-    return torch.log(light.clamp(min=_NO_LIGHT)).clamp(max=MAXIMUM_LOG_LIGHT).float()
+    return cubemap.raw(light).float()
 
 
 @torch.no_grad()

@@ -1,1 +1,1 @@
-"""Inspection: verdicts on a capture; order, sense and zero of the polarizer angles by geometry."""
+"""Inspection of a capture: checks of its pictures and poses, and of the order, sense and zero of its angles."""

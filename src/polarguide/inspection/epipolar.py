@@ -1,4 +1,4 @@
-"""Epipolar errors of feature matches between neighboring views: what the pictures say of the poses."""
+"""Epipolar errors of feature matches between neighboring views: a test of the poses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FEATURES = 3000
 FEWEST_MATCHES = 15
 RATIO = 0.75
 GATE_SHARE = 0.02
-"""Matches farther from their epipolar line than this share of the picture's diagonal are taken for mismatches."""
+"""Matches farther from their epipolar line than this share of the picture's diagonal count as mismatches."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PairError:
 
 
 def epipolar_errors(capture: Capture) -> list[PairError]:
-    """Match every posed view with its nearest neighbors by direction and place."""
+    """Match every posed view with its nearest neighbors in position and viewing direction."""
     views = capture.posed
     features = [_features(view) for view in views]
     pairs = _neighbor_pairs([view.camera for view in views if view.camera is not None])
@@ -44,7 +44,7 @@ def epipolar_errors(capture: Capture) -> list[PairError]:
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
-    """Each view's error: the lower quartile over its pairs, so that one bad view does not spoil its neighbors."""
+    """Each view's error: the lower quartile over its pairs, so that one bad view does not affect its neighbors."""
     by_view: dict[str, list[float]] = {}
     for pair in errors:
         for name in (pair.first, pair.second):
@@ -59,7 +59,7 @@ def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.floa
     keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(  # type: ignore[attr-defined]
         shown, None
     )
-    # OpenCV counts pixel centers from 0.
+    # OpenCV has its first pixel center at 0, COLMAP at 0.5.
     places = np.array([point.pt for point in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     return places, None if descriptors is None else np.sqrt(
         descriptors / (descriptors.sum(1, keepdims=True) + 1e-9)

@@ -1,4 +1,4 @@
-"""A corrected copy of a scene: pictures under the names of their true angles, the zero turned back."""
+"""Write a corrected copy of a scene: pictures named by their true angles, the zero rotated back."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import write_whole, writing
-from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import FileOrder, swaps
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import read_record, to_json
 
-SIDES = ("sparse", "masks", "invalid", "gt", "split.json")
-"""What is copied as it is, beside the pictures."""
-SCENE = "scene.json"
+COPIED = ("sparse", "masks", "invalid", "gt", "split.json")
+"""Files and folders that are copied unchanged."""
+METADATA = "scene.json"
 
 
-def correction(capture: Capture, angles: Angles) -> Calibration | None:
-    """What puts the angles right, or None where they are right already.
+def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
+    """The correction of the angles, or None if they are right.
 
     Raises:
-        PolarguideError: the order is not decided; nothing may be written then.
+        PolarguideError: the order is not decided.
     """
     files = angles.files
     if files is None:
         raise PolarguideError(
             capture.root,
             expected="a decided order of the angles",
-            found="one that geometry does not decide",
-            remedy="Nothing was written. See the report for what to do; --order of prepare sets it by hand.",
+            found="an order that geometry does not decide",
+            remedy="Nothing was written. The report says what to do; --order of prepare sets it by hand.",
         )
     zero = round(angles.offset, 2) if angles.offset is not None else 0.0
     return None if files == ANGLES and zero == 0.0 else Calibration(order=files, zero=zero)
 
 
 def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Reporter = SILENT) -> str:
-    """Write a corrected copy of the scene; the scene itself is left as it is.
+    """Write a corrected copy of a scene; the scene itself does not change.
 
-    A pure exchange copies the files under their right names, byte by byte. A turned zero forms the four
-    intensities anew, as linear 16-bit PNG; they are divided by 1.21 so that none exceeds full scale, and saturated
-    pixels become invalid. The folder appears when it is complete.
+    If only the order changes, files are copied under their right names, byte by byte. If the zero changes, the four
+    intensities are computed anew and written as linear 16-bit PNG; they are divided by 1.21 so that none exceeds full
+    scale, and saturated pixels become invalid. The folder appears when it is complete.
 
     Args:
-        capture: as read. change: from ``correction``. out: a folder that does not exist.
+        capture: the scene. change: from ``correction``. out: a new folder.
         reporter: receives the progress.
 
     Returns:
-        What was done, a sentence.
+        A description of what was done.
 
     Raises:
         PolarguideError: ``out`` exists, or a file cannot be read or written.
@@ -85,18 +85,18 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
 
 
 def described(change: Calibration) -> str:
-    """What a correction does, in words."""
+    """A correction in words."""
     parts = []
     if change.order != ANGLES:
         parts.append(f"the files were renamed ({swaps(change.order)})")
     if change.zero:
-        parts.append(f"the Stokes vectors were turned by {change.zero:+.2f}°")
+        parts.append(f"the Stokes vectors were rotated by {change.zero:+.2f}°")
     return " and ".join(parts)
 
 
 def _write(capture: Capture, change: Calibration, folder: Path, reporter: Reporter) -> None:
     (folder / "polar").mkdir(parents=True)
-    for name in SIDES:
+    for name in COPIED:
         source = capture.root / name
         if source.is_dir():
             shutil.copytree(source, folder / name)
@@ -105,11 +105,11 @@ def _write(capture: Capture, change: Calibration, folder: Path, reporter: Report
     with reporter.track("fixing", len(capture.layout.names)) as advance:
         for done, view in enumerate(capture.layout.names, 1):
             if change.zero:
-                _turn_view(capture, change, folder, view)
+                _rotate_view(capture, change, folder, view)
             else:
                 _rename_view(capture, change.order, folder, view)
             advance(done)
-    write_whole(folder / SCENE, _sidecar(capture, change))
+    write_whole(folder / METADATA, _corrected_metadata(capture, change))
 
 
 def _rename_view(capture: Capture, order: FileOrder, folder: Path, view: str) -> None:
@@ -118,19 +118,19 @@ def _rename_view(capture: Capture, order: FileOrder, folder: Path, view: str) ->
         shutil.copy2(source, folder / "polar" / f"{view}_{true:03d}{source.suffix}")
 
 
-def _turn_view(capture: Capture, change: Calibration, folder: Path, view: str) -> None:
+def _rotate_view(capture: Capture, change: Calibration, folder: Path, view: str) -> None:
     data = read_view(capture.layout, view, factor=1, transfer=capture.transfer)
     full = int(np.iinfo(data.peak.dtype).max)
     lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
-    turned = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
+    rotated = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
     for old in (folder / "invalid").glob(f"{view}.*"):
         old.unlink()
-    write_view(folder, view, intensity_codes(turned, lost), lost)
+    write_view(folder, view, intensity_codes(rotated, lost), lost)
 
 
-def _sidecar(capture: Capture, change: Calibration) -> bytes:
-    """``scene.json`` of the copy: that of the scene, and a note on what was changed."""
-    path = capture.root / SCENE
+def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
+    """``scene.json`` of the copy: that of the scene, with a note on the correction."""
+    path = capture.root / METADATA
     content: dict[str, Any] = read_record(path, dict[str, Any]) if path.exists() else {}
     note = {
         "program": f"polarguide {__version__}",

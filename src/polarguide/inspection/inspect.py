@@ -9,17 +9,23 @@ from pathlib import Path
 
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
-from polarguide.inspection.angle_checks import Angles, handedness_check, order_check, weigh, zero_check
+from polarguide.inspection.angle_checks import (
+    AngleFindings,
+    combine_evidence,
+    handedness_check,
+    order_check,
+    zero_check,
+)
 from polarguide.inspection.capture import Capture, InspectedView, read_capture
 from polarguide.inspection.dielectric import dielectric_check
 from polarguide.inspection.likelihood import Evidence
-from polarguide.inspection.picture_checks import pairing_of, picture_checks
+from polarguide.inspection.measurements import ViewMeasurements, measure_view
+from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.points import point_evidence
 from polarguide.inspection.pose_checks import coverage_check, pose_check
-from polarguide.inspection.readings import Readings, read_view_figures
 from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.short_run import LONGEST, short_run, surface_of
-from polarguide.inspection.surfaces import Pixels, Surface, surface_evidence, surface_pixels
+from polarguide.inspection.surfaces import Surface, SurfaceSamples, normal_evidence, sample_surfaces
 from polarguide.inspection.verdict import Check, Verdict, worst
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend
@@ -42,9 +48,9 @@ class Inspection:
     capture: Capture
     settings: InspectSettings
     index: float
-    readings: tuple[Readings, ...]
+    measurements: tuple[ViewMeasurements, ...]
     checks: tuple[Check, ...]
-    angles: Angles
+    angles: AngleFindings
 
     @property
     def verdict(self) -> Verdict:
@@ -88,19 +94,19 @@ def inspect_scene(
     settings.check()
     capture = read_capture(path, downscale=settings.downscale, transfer=settings.transfer, reporter=reporter)
     index = settings.refractive_index or capture.refractive_index or 1.5
-    readings: list[Readings] = []
+    measurements: list[ViewMeasurements] = []
     with reporter.track("measuring", len(capture.views)) as advance:
         for view in capture.views:
-            readings.append(read_view_figures(view, index))
-            advance(len(readings))
-    pairing = pairing_of(capture)
-    checks = picture_checks(capture, readings, pairing)
+            measurements.append(measure_view(view, index))
+            advance(len(measurements))
+    pairing = find_pairing(capture)
+    checks = picture_checks(capture, measurements, pairing)
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), coverage_check(capture)]
     angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
     checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
-    checks.append(dielectric_check(readings, pixels, index))
-    return Inspection(capture, settings, index, tuple(readings), tuple(checks), angles)
+    checks.append(dielectric_check(measurements, pixels, index))
+    return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
 
 
 def _angles(
@@ -111,28 +117,28 @@ def _angles(
     pairing: int,
     backend: Backend,
     reporter: Reporter,
-) -> tuple[Angles, Pixels | None]:
+) -> tuple[AngleFindings, SurfaceSamples | None]:
     """Order, sense and zero by what geometry there is; and the pixels with normals if there are any."""
     sources: list[Evidence] = []
     if capture.model is None or len(capture.posed) < 2:
-        return weigh(sources, pairing), None
+        return combine_evidence(sources, pairing), None
     with reporter.track("weighing points", 1):
         evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
     sources.append(evidence)
-    angles = weigh(sources, pairing)
-    sure = angles.odds is not None and max(angles.odds.probabilities) >= SURE
+    angles = combine_evidence(sources, pairing)
+    sure = angles.posterior is not None and max(angles.posterior.probabilities) >= SURE
     if settings.normals == "points" or (settings.normals == "auto" and sure):
         return angles, pixels
     if len(capture.posed) < FEWEST_TO_TRAIN:
         return angles, pixels
     pixels = _trained_pixels(capture, out, settings, pairing, backend, reporter)
-    sources.append(surface_evidence(pixels, index))
-    return weigh(sources, pairing), pixels
+    sources.append(normal_evidence(pixels, index))
+    return combine_evidence(sources, pairing), pixels
 
 
 def _trained_pixels(
     capture: Capture, out: Path, settings: InspectSettings, pairing: int, backend: Backend, reporter: Reporter
-) -> Pixels:
+) -> SurfaceSamples:
     factor = max(1, math.ceil(max(capture.size) / LONGEST))
     names = [view.name for view in capture.posed]
     scene = load_scene(
@@ -157,4 +163,4 @@ def _trained_pixels(
                 yield view, surface_of(state, scene.view(view.name), backend)
                 advance(done + 1)
 
-        return surface_pixels(surfaces(), pairing)
+        return sample_surfaces(surfaces(), pairing)

@@ -1,4 +1,4 @@
-"""The pictures of a view on the page of an inspection, as data URIs."""
+"""Layers of a view (S0, DoLP, AoLP, ...) for the inspection page, as data URIs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.inspection.capture import InspectedView
-from polarguide.inspection.readings import Readings
+from polarguide.inspection.measurements import ViewMeasurements
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.figures import Picture
@@ -20,43 +20,43 @@ SIDE = 240
 """Longest side of the pictures in pixels."""
 DOLP_HIGH, NOISE_HIGH, EXCESS_HIGH = 0.5, 0.05, 0.1
 AOLP_FULL_DOLP = 0.1
-"""DoLP from which on the AoLP is shown at full brightness."""
+"""DoLP from which the AoLP is shown at full brightness."""
 SATURATED_COLOR, INVALID_COLOR = (255, 40, 40), (60, 120, 255)
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One kind of picture.
+    """A layer that the page can show.
 
     Attributes:
-        key, label: its name. legend: what its colors say. ramp: color map of the legend's bar, or None.
-        caption: the line beneath a view.
+        key, label: its name in HTML and for people. legend: a description of its colors.
+        ramp: color map of the legend's bar, or None. caption: the line below a view.
     """
 
     key: str
     label: str
     legend: str
     ramp: str | None
-    caption: Callable[[Readings], str]
+    caption: Callable[[ViewMeasurements], str]
 
 
 LAYERS: tuple[Layer, ...] = (
-    Layer("s0", "S0", "Photograph S0/2, brightened to the view's 99th percentile, sRGB.", None,
+    Layer("s0", "S0", "Photograph S0 / 2 in sRGB; the view's 99th percentile is white.", None,
           lambda r: f"99 % under {r.bright:.2f}"),
     Layer("dolp", "DoLP", f"0 to {DOLP_HIGH:g}", "inferno", lambda r: f"median {r.dolp[0]:.3f}, 99 % {r.dolp[1]:.2f}"),
-    Layer("aolp", "AoLP", f"Direction of the field, by color; dark where the DoLP is under {AOLP_FULL_DOLP:g}.", None,
+    Layer("aolp", "AoLP", f"Angle of the field by color; dark where the DoLP is below {AOLP_FULL_DOLP:g}.", None,
           lambda r: f"{r.polarized:.0%} polarized"),
-    Layer("saturation", "Saturation", "Red: an angle at full scale, or all black. Blue: declared invalid.", None,
+    Layer("saturation", "Saturation", "Red: one angle at full scale, or all black. Blue: marked invalid.", None,
           lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
-    Layer("noise", "Noise", f"Of one intensity, as a share of the photograph: 0 to {NOISE_HIGH:.0%}", "viridis",
+    Layer("noise", "Noise", f"Of one intensity relative to the photograph: 0 to {NOISE_HIGH:.0%}", "viridis",
           lambda r: f"median {r.noise_share:.2%}"),
-    Layer("consistency", "Four angles", f"|I0 + I90 - I45 - I135| / S0: 0 to {EXCESS_HIGH:.0%}", "magma",
+    Layer("consistency", "Pair sums", f"|I0 + I90 - I45 - I135| / S0: 0 to {EXCESS_HIGH:.0%}", "magma",
           lambda r: f"median {r.sum_error:.1%}" + ("" if r.pair_ratio is None else f", ratio {r.pair_ratio:.3f}")),
 )  # fmt: skip
 
 
 def layer_uris(view: InspectedView) -> dict[str, str]:
-    """All layers of a view by key."""
+    """All layers of a view as data URIs, by key."""
     intensities = view.intensities()
     gray = intensities.mean(dim=-1)
     stokes = optics.stokes(gray)
@@ -78,13 +78,13 @@ def layer_uris(view: InspectedView) -> dict[str, str]:
 
 
 def _marked(shown: Picture, view: InspectedView) -> Picture:
-    """The photograph in dim gray with its lost pixels in color."""
+    """The photograph in dark gray, with saturated and invalid pixels in color."""
     dim = (shown.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
     for mask, color in ((view.saturated, SATURATED_COLOR), (view.invalid, INVALID_COLOR)):
-        dim[_grown(mask).numpy()] = color
+        dim[_dilated(mask).numpy()] = color
     return dim
 
 
-def _grown(mask: Tensor) -> Tensor:
-    """A mask [H, W] grown by a pixel, so that single ones survive when the picture is made smaller."""
+def _dilated(mask: Tensor) -> Tensor:
+    """A mask [H, W] dilated by a pixel, so that single pixels stay visible after downscaling."""
     return torch.nn.functional.max_pool2d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0

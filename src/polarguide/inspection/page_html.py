@@ -1,4 +1,4 @@
-"""The page of an inspection: one HTML file that needs nothing beside itself, nor scripts."""
+"""Render an inspection as one HTML page without scripts or other files."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from string import Template
 
 import torch
 
-from polarguide.inspection.angle_checks import Angles
+from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.layers import LAYERS, layer_uris
-from polarguide.inspection.readings import Readings
+from polarguide.inspection.measurements import ViewMeasurements
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.progress import SILENT, Reporter
 from polarguide.visualization import figures
@@ -22,7 +22,7 @@ _CLASSES: dict[Verdict, str] = {"ok": "ok", "warning": "warning", "wrong": "wron
 
 
 def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
-    """The page; all names and texts in it are escaped.
+    """The HTML page; all names and texts in it are escaped.
 
     Args:
         found: the findings.
@@ -32,8 +32,8 @@ def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
     marked = {name for check in found.checks for name in check.views}
     tiles = []
     with reporter.track("drawing", len(capture.views)) as advance:
-        for view, reading in zip(capture.views, found.readings, strict=True):
-            tiles.append(_tile(layer_uris(view), reading, view.name in marked))
+        for view, measured in zip(capture.views, found.measurements, strict=True):
+            tiles.append(_tile(layer_uris(view), measured, view.name in marked))
             advance(len(tiles))
     posed = f"{len(capture.posed)} with a pose" if capture.model is not None else "no poses"
     width, height = capture.size
@@ -52,7 +52,7 @@ def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
         labels="".join(f'<label for="layer-{layer.key}">{html.escape(layer.label)}</label>' for layer in LAYERS),
         legends=_legends(),
         tiles="".join(tiles),
-        figures=_figures(found.readings),
+        figures=_figures(found.measurements),
         facts=_facts(found),
     )  # fmt: skip
 
@@ -62,7 +62,7 @@ def _part(name: str) -> str:
 
 
 def _switching() -> str:
-    """Rules by which the chosen radio button shows its layer."""
+    """CSS rules that show the layer of the selected radio button."""
     return "\n".join(
         f"#layer-{layer.key}:checked ~ .tiles .{layer.key} {{ display: block; }}\n"
         f"#layer-{layer.key}:checked ~ .legend.{layer.key} {{ display: flex; }}\n"
@@ -85,31 +85,31 @@ def _check_row(check: Check) -> str:
     )
 
 
-def _angles(angles: Angles) -> str:
+def _angles(angles: AngleFindings) -> str:
     notes = "".join(
         f'<p class="note">{html.escape(e.source.capitalize())}{"" if e.usable else " (not used)"}: '
         f"{html.escape(e.note)}</p>"
         for e in angles.sources
     )
-    if angles.odds is None:
-        return "<p>Not judged: it takes poses, and surfaces that reflect.</p>" + notes
+    if angles.posterior is None:
+        return "<p>Not decided: this check needs poses and reflecting surfaces.</p>" + notes
     rows = []
     for k, row in enumerate(angles.hypotheses):
         files = ", ".join(f"{angle}°" for angle in row.files)
-        mark = ' class="best"' if k == angles.odds.best else ""
-        said = "" if k == angles.odds.best else f"{-row.log_odds:.1f}"
+        mark = ' class="best"' if k == angles.posterior.best else ""
+        said = "" if k == angles.posterior.best else f"{-row.log_odds:.1f}"
         p = row.probability
         rows.append(
             f"<tr{mark}><th>{files}</th><td>{html.escape(row.order.label)}</td><td>{p:.2%}</td>"
             f'<td><span class="bar"><i style="width:{100 * p:.1f}%"></i></span></td><td>{said}</td></tr>'
         )
     return (
-        '<table class="odds"><thead><tr><th>pictures called 0°, 45°, 90°, 135° taken at</th><th>angles count</th>'
-        "<th>probability</th><th></th><th>log-odds to the best</th></tr></thead><tbody>"
+        '<table class="odds"><thead><tr><th>true angles of pictures 0°, 45°, 90°, 135°</th><th>sense and zero</th>'
+        "<th>probability</th><th></th><th>log-odds relative to the best</th></tr></thead><tbody>"
         + "".join(rows)
         + "</tbody></table>"
-        + f'<p class="note">Zero offset beyond the best order: {angles.odds.offset:+.2f}° ± '
-        f"{angles.odds.offset_error:.2f}°.</p>" + notes
+        + f'<p class="note">Zero offset beyond the best order: {angles.posterior.offset:+.2f}° ± '
+        f"{angles.posterior.offset_error:.2f}°.</p>" + notes
     )
 
 
@@ -127,7 +127,7 @@ def _legends() -> str:
 
 
 def aolp_wheel() -> str:
-    """The colors of the AoLP as half a disc, 0 to the right, counter-clockwise, as an SVG drawing."""
+    """The color code of the AoLP as an SVG half disc: 0 degrees to the right, counter-clockwise."""
     count, cx, cy, radius = 36, 66.0, 58.0, 40.0
     angles = (torch.arange(count, dtype=torch.float64) + 0.5) * math.pi / count
     colors = figures.aolp_to_rgb(angles[None])[0].tolist()
@@ -147,9 +147,9 @@ def aolp_wheel() -> str:
     return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by color">{drawing}</svg>'
 
 
-def _tile(uris: dict[str, str], reading: Readings, marked: bool) -> str:
-    name = html.escape(reading.view)
-    captions = "".join(f'<span class="{la.key}">{html.escape(la.caption(reading))}</span>' for la in LAYERS)
+def _tile(uris: dict[str, str], measured: ViewMeasurements, marked: bool) -> str:
+    name = html.escape(measured.view)
+    captions = "".join(f'<span class="{la.key}">{html.escape(la.caption(measured))}</span>' for la in LAYERS)
     pictures = "".join(
         f'<img class="{la.key}" src="{uris[la.key]}" alt="{name}, {html.escape(la.label)}">' for la in LAYERS
     )
@@ -157,11 +157,11 @@ def _tile(uris: dict[str, str], reading: Readings, marked: bool) -> str:
     return f'<figure class="{kind}"><figcaption><b>{name}</b>{captions}</figcaption>{pictures}</figure>'
 
 
-def _figures(readings: tuple[Readings, ...]) -> str:
+def _figures(measurements: tuple[ViewMeasurements, ...]) -> str:
     heads = ("view", "99 % under", "saturated", "invalid", "dark", "noise", "pair ratio", "sum error", "DoLP median",
-             "DoLP 99 %", "polarized", "over diffuse limit")  # fmt: skip
+             "DoLP 99 %", "polarized", "above diffuse limit")  # fmt: skip
     rows = []
-    for r in readings:
+    for r in measurements:
         ratio = "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}"
         cells = (f"{r.bright:.3f}", f"{r.saturated:.2%}", f"{r.invalid:.2%}", f"{r.dark:.2%}", f"{r.noise_share:.2%}",
                  ratio, f"{r.sum_error:.2%}", f"{r.dolp[0]:.3f}", f"{r.dolp[1]:.3f}", f"{r.polarized:.1%}",
@@ -177,9 +177,9 @@ def _facts(found: Inspection) -> str:
     capture, settings = found.capture, found.settings
     facts = {
         "transfer": capture.transfer,
-        "averaged over": f"{capture.factor} x {capture.factor} pixels",
+        "box filter": f"{capture.factor} x {capture.factor} pixels",
         "refractive index": f"{found.index:g}",
-        "normals": f"{settings.normals}, {settings.steps} steps where they are trained",
-        "digest of the pictures": capture.digest,
+        "normals": f"{settings.normals}, {settings.steps} steps if trained",
+        "SHA-256 of the pictures": capture.digest,
     }
     return "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())

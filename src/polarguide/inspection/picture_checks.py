@@ -1,4 +1,4 @@
-"""Checks that the pictures alone carry: pairs of angles, encoding, exposure, saturation, noise, polarization."""
+"""Checks that need only the pictures: pair sums, encoding, exposure, saturation, noise, polarization."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ import numpy as np
 from polarguide.capture import checks
 from polarguide.capture.view import FULL_CODE, listed
 from polarguide.inspection.capture import Capture
+from polarguide.inspection.measurements import POLARIZED, ViewMeasurements
 from polarguide.inspection.orders import PAIRINGS, swaps
-from polarguide.inspection.readings import POLARIZED, Readings
 from polarguide.inspection.verdict import Check, Verdict
 
 PAIR_ERROR = 0.05
-"""Median |I0 + I90 - I45 - I135| / S0 of a view above which its pictures do not belong together."""
+"""Median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent."""
 ENCODED, DECODED = (-0.12, -0.25), (0.1, 0.2)
-"""Curvatures (see ``capture.checks.curvature``) from which on encoding looks and is wrong: concave, convex."""
+"""Curvatures (``capture.checks.curvature``) for a warning and for wrong: concave, convex."""
 UNEQUAL, VERY_UNEQUAL = 0.01, 0.04
-"""Departures of the pair ratio from 1. A picture exposed 5 % longer gives 0.025; real sensors have about 0.02."""
+"""Deviations of the pair ratio from 1. A picture exposed 5 % longer gives 0.025; real sensors have about 0.02."""
 UNSTEADY = 0.01
-"""Departure of a view's pair ratio from the capture's."""
+"""Deviation of a view's pair ratio from the capture's."""
 SATURATED, BLOWN = 0.05, 0.3
-"""Shares of saturated pixels: of one view to be looked at; of a capture that is spoilt."""
+"""Shares of saturated pixels: of one view that gets a warning; of a capture that is wrong."""
 LITTLE, ALMOST_NONE = 0.05, 0.005
 """Shares of polarized pixels."""
 NOISY = 0.03
 """Noise of one intensity as a share of S0 / 2: three times its DoLP noise is then 0.13."""
 
 
-def pairing_of(capture: Capture) -> int | None:
-    """Which pictures are perpendicular by their sums, a position in ``PAIRINGS``; None if it cannot be told."""
+def find_pairing(capture: Capture) -> int | None:
+    """The pairs of perpendicular pictures by their sums, an index into ``PAIRINGS``; None if they do not decide."""
     residuals = np.array([view.measures.residuals for view in capture.views])
     residuals = residuals[residuals.max(axis=1) > 0]
     if len(residuals) == 0:
@@ -41,36 +41,38 @@ def pairing_of(capture: Capture) -> int | None:
     return best if medians[best] < 0.5 * float(others.min()) else None
 
 
-def picture_checks(capture: Capture, readings: Sequence[Readings], pairing: int | None) -> list[Check]:
-    """All checks of this file, in the order in which they are shown."""
+def picture_checks(
+    capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None
+) -> list[Check]:
+    """All checks of this file, in their order on the page."""
     return [
-        _pairs(capture, readings, pairing),
+        _pairs(capture, measurements, pairing),
         _encoding(capture, pairing),
-        _exposure(readings, pairing),
-        _saturation(capture, readings),
-        _noise(readings),
-        _polarization(readings),
+        _exposure(measurements, pairing),
+        _saturation(capture, measurements),
+        _noise(measurements),
+        _polarization(measurements),
     ]
 
 
-def _pairs(capture: Capture, readings: Sequence[Readings], pairing: int | None) -> Check:
-    key, title = "pair_sums", "Four angles belong together"
-    error = float(np.median([r.sum_error for r in readings]))
+def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
+    key, title = "pair_sums", "Consistency of the four angles"
+    error = float(np.median([r.sum_error for r in measurements]))
     figures = {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])}
     if pairing is not None and pairing > 0:
         return Check(
             key, title, "wrong",
             f"The pair sums agree only if {swaps(PAIRINGS[pairing])}.",
-            "Rename the files, or let --fix do it once the whole order is decided.", figures=figures,
+            "Rename the files; once the whole order is decided, --fix does it.", figures=figures,
         )  # fmt: skip
-    off = tuple(r.view for r in readings if r.sum_error > PAIR_ERROR)
+    off = tuple(r.view for r in measurements if r.sum_error > PAIR_ERROR)
     if off:
-        verdict: Verdict = "wrong" if 2 * len(off) > len(readings) else "warning"
+        verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) else "warning"
         return Check(
             key, title, verdict,
             f"I0 + I90 and I45 + I135 differ by more than {PAIR_ERROR:.0%} of S0 in {len(off)} views "
             f"({listed(list(off))}).",
-            "Look whether something moved or the light changed between the shots, or files were mixed up.",
+            "Check whether something moved or the light changed between the shots, or whether files were exchanged.",
             off, figures,
         )  # fmt: skip
     said = f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median)."
@@ -78,10 +80,10 @@ def _pairs(capture: Capture, readings: Sequence[Readings], pairing: int | None) 
 
 
 def _encoding(capture: Capture, pairing: int | None) -> Check:
-    key, title = "encoding", "Linear files"
+    key, title = "encoding", "Linear encoding"
     slope = checks.curvature([view.measures for view in capture.views])
     if slope is None or pairing not in (None, 0):
-        why = "too little is polarized" if slope is None else "the pictures are paired wrongly"
+        why = "too few pixels are polarized" if slope is None else "the pictures are paired wrongly"
         return Check(key, title, "n/a", f"The curvature of the response cannot be measured: {why}.")
     figures = {"curvature": slope}
     said = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
@@ -89,16 +91,16 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
     if not low:
         return Check(key, title, "ok", said, figures=figures)
     remedy = (
-        "The files look display-encoded (gamma): export linear ones, or read them with --transfer srgb."
+        "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb."
         if slope < 0
-        else "The files look linear but are decoded (or have a curve of their own): try --transfer linear."
+        else "The files seem linear but are decoded (or have another tone curve): try --transfer linear."
     )
     return Check(key, title, "wrong" if high else "warning", said, remedy, figures=figures)
 
 
-def _exposure(readings: Sequence[Readings], pairing: int | None) -> Check:
+def _exposure(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
     key, title = "exposure", "Equal exposure of the angles"
-    known = [r for r in readings if r.pair_ratio is not None]
+    known = [r for r in measurements if r.pair_ratio is not None]
     if not known or pairing not in (None, 0):
         return Check(key, title, "n/a", "The pair sums cannot be compared.")
     ratio = float(np.median([r.pair_ratio for r in known]))
@@ -109,26 +111,26 @@ def _exposure(readings: Sequence[Readings], pairing: int | None) -> Check:
     remedy = ""
     if abs(ratio - 1) > UNEQUAL:
         verdict = "wrong" if abs(ratio - 1) > VERY_UNEQUAL else "warning"
-        said += f" If one picture alone is off, it is by {2 * abs(ratio - 1):.0%}."
+        said += f" If only one picture deviates, it does by {2 * abs(ratio - 1):.0%}."
         remedy = (
             "Let prepare estimate the gains (it does by default), or measure them on unpolarized light and give "
-            "--calibration. Which of the four is off the pair sums cannot tell."
+            "--calibration. The pair sums do not show which of the four deviates."
         )
     if off:
         verdict = "warning" if verdict == "ok" else verdict
         said += f" It differs by more than {UNSTEADY:.0%} in {len(off)} views ({listed(list(off))})."
-        remedy = remedy or "Look for automatic exposure, flicker, or something that moved between the shots."
+        remedy = remedy or "Look for automatic exposure, flicker, or motion between the shots."
     return Check(key, title, verdict, said, remedy, off, figures)
 
 
-def _saturation(capture: Capture, readings: Sequence[Readings]) -> Check:
+def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> Check:
     key, title = "saturation", "Saturation"
-    shares = [r.saturated for r in readings]
-    lost = [r.saturated + r.invalid for r in readings]
+    shares = [r.saturated for r in measurements]
+    lost = [r.saturated + r.invalid for r in measurements]
     figures = {
         "saturated": float(np.mean(shares)),
         "worst": max(shares),
-        "invalid": float(np.mean([r.invalid for r in readings])),
+        "invalid": float(np.mean([r.invalid for r in measurements])),
     }
     largest = max(view.peak for view in capture.views)
     if capture.bits == 16 and 0 < largest < (FULL_CODE + 1) // 16:
@@ -136,51 +138,54 @@ def _saturation(capture: Capture, readings: Sequence[Readings]) -> Check:
             key, title, "wrong", f"No value of the 16-bit files exceeds {largest}.",
             "The data were not scaled to 16 bits: multiply the values, or run prepare with --bits.", figures=figures,
         )  # fmt: skip
-    off = tuple(r.view for r, share in zip(readings, lost, strict=True) if share > SATURATED)
+    off = tuple(r.view for r, share in zip(measurements, lost, strict=True) if share > SATURATED)
     said = (
         f"{np.mean(shares):.1%} of the pixels are at full scale or black, at most {max(shares):.1%} in a view; "
-        f"{figures['invalid']:.1%} are declared invalid."
+        f"{figures['invalid']:.1%} are marked invalid."
     )
     if not off:
         return Check(key, title, "ok", said, figures=figures)
     verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "warning"
     return Check(
         key, title, verdict, f"{said} Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))}).",
-        "Polarization is lost there, and these pixels are left out: expose shorter, keep lamps out of the picture.",
+        "These pixels carry no polarization and are excluded: expose shorter, keep lamps out of the picture.",
         off, figures,
     )  # fmt: skip
 
 
-def _noise(readings: Sequence[Readings]) -> Check:
+def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
     key, title = "noise", "Noise"
-    share, bright = (float(np.median([getattr(r, k) for r in readings])) for k in ("noise_share", "bright"))
-    off = tuple(r.view for r in readings if r.noise_share > NOISY or r.bright < 0.01)
+    share, bright = (
+        float(np.median([getattr(r, k) for r in measurements])) for k in ("noise_share", "bright")
+    )
+    off = tuple(r.view for r in measurements if r.noise_share > NOISY or r.bright < 0.01)
     said = (
-        f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), which makes a DoLP "
-        f"of {3 * 2**0.5 * share / 2:.3f} three times its noise; "
-        f"the brightest percent of the values reaches {bright:.0%} of full scale."
+        f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), so that a DoLP "
+        f"of {3 * 2**0.5 * share / 2:.3f} is three times its noise; "
+        f"the 99th percentile of the values is {bright:.0%} of full scale."
     )
     figures = {"noise_share": share, "bright": bright}
     if not off:
         return Check(key, title, "ok", said, figures=figures)
-    verdict: Verdict = "wrong" if 2 * len(off) > len(readings) and bright < 0.01 else "warning"
+    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < 0.01 else "warning"
     return Check(
         key, title, verdict, f"{said} Dark or noisy: {len(off)} views ({listed(list(off))}).",
-        "Expose longer, with the lowest gain; average several shots.", off, figures,
+        "Use a longer exposure at the lowest gain, or average several shots.", off, figures,
     )  # fmt: skip
 
 
-def _polarization(readings: Sequence[Readings]) -> Check:
-    key, title = "low_dolp", "Enough polarization"
-    share = float(np.median([r.polarized for r in readings]))
-    median = float(np.median([r.dolp[0] for r in readings]))
-    said = f"{share:.0%} of the pixels have a DoLP over {POLARIZED:g} beyond their noise; "
+def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
+    key, title = "low_dolp", "Strength of polarization"
+    share = float(np.median([r.polarized for r in measurements]))
+    median = float(np.median([r.dolp[0] for r in measurements]))
+    said = f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
     said += f"the median DoLP is {median:.3f}."
     figures = {"polarized": share, "median_dolp": median}
     if share >= LITTLE:
         return Check(key, title, "ok", said, figures=figures)
     return Check(
         key, title, "wrong" if share < ALMOST_NONE else "warning", said,
-        "Polarization says little here. Look at surfaces at a slant (50 to 65 degrees), from lower views; check that "
-        "the filter is a linear polarizer the right way round and that exposure was fixed.", figures=figures,
+        "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from lower "
+        "views; check that the filter is a linear polarizer, the right way round, and that the exposure was fixed.",
+        figures=figures,
     )  # fmt: skip

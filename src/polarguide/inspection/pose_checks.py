@@ -1,4 +1,4 @@
-"""Checks of the poses: do they explain the pictures, and do they leave gaps."""
+"""Checks of the poses: epipolar errors, and gaps in the coverage."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from polarguide.inspection.epipolar import epipolar_errors, view_errors
 from polarguide.inspection.verdict import Check, Verdict
 
 TYPICAL_PX, VIEW_PX = 2.0, 2.0
-"""Median epipolar errors in stored pixels above which a capture, and one view of it, are to be looked at."""
+"""Median epipolar errors in stored pixels above which a capture, or one view of it, gets a warning."""
 STANDS_OUT = 2.5
-"""... provided the view is this many times worse than the median view."""
+"""A view also has to be this many times worse than the median view."""
 GAP_DEG = 25.0
 FEW_VIEWS = 20
 
 
 def pose_check(capture: Capture) -> Check:
-    """Whether the poses explain the pictures."""
+    """Check whether feature matches agree with the poses."""
     key, title = "poses", "Pose quality"
     if capture.model is None:
         return Check(
@@ -35,7 +35,7 @@ def pose_check(capture: Capture) -> Check:
         return Check(
             key, title, "n/a" if not missing else "warning",
             f"Too few features match between neighboring views to judge the poses. {len(missing)} views have none.",
-            "Structure from motion needs texture that stays put." if missing else "", missing,
+            "Structure from motion needs static texture." if missing else "", missing,
             {"views": {}, "without_pose": len(missing)},
         )  # fmt: skip
     typical = float(np.median(list(errors.values())))
@@ -59,7 +59,7 @@ def pose_check(capture: Capture) -> Check:
 
 
 def coverage_check(capture: Capture) -> Check:
-    """Whether the views leave no gap."""
+    """Check whether neighboring views are close enough to each other."""
     key, title = "coverage", "Coverage"
     cameras = [view.camera for view in capture.posed if view.camera is not None]
     if len(cameras) < 2:
@@ -75,20 +75,20 @@ def coverage_check(capture: Capture) -> Check:
     figures = {"views": len(seen), "median_step_deg": float(np.median(nearest)),
                "largest_step_deg": float(nearest.max()), "half_angle_deg": spread}  # fmt: skip
     said = (
-        f"{len(seen)} views, {np.median(nearest):.0f}° from the next one (median; at most {nearest.max():.0f}°), "
-        f"within {spread:.0f}° of their middle direction."
+        f"{len(seen)} views, {np.median(nearest):.0f}° from the nearest view (median; at most {nearest.max():.0f}°), "
+        f"within {spread:.0f}° of their mean direction."
     )
     lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
     if lonely or len(seen) < FEW_VIEWS:
         return Check(
             key, title, "warning", said,
-            "Reconstruction is unsure across gaps: add views, neighbors 15 degrees or less apart.", lonely, figures,
+            "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.", lonely, figures,
         )  # fmt: skip
     return Check(key, title, "ok", said, figures=figures)
 
 
 def _nearest_to_axes(centers: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The place nearest to all optical axes (least squares)."""
+    """The point nearest to all optical axes (least squares), [3]."""
     across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
     return np.asarray(
         np.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)[:, 0], rcond=None)[0]

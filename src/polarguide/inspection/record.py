@@ -44,7 +44,7 @@ def inspection_record(found: Inspection) -> dict[str, Any]:
             "verdict": found.verdict,
             "checks": [check.record() for check in found.checks],
             "angles": found.angles.record(),
-            "views": [reading.record() for reading in found.readings],
+            "views": [measured.record() for measured in found.measurements],
         }
     )
     return record

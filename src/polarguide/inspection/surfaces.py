@@ -1,8 +1,9 @@
-"""Evidence from surface normals: specular light is polarized across the plane of incidence, diffuse light in it.
+"""Evidence on the angles from surface normals.
 
-The normals come from a short training on the photographs alone, which no order of the four pictures changes. The
-AoLP agrees with their azimuth modulo a quarter turn; which quarter it is, only pixels decide that must be specular,
-because their degree of polarization exceeds what diffuse light has at their zenith.
+Specular light is polarized perpendicular to the plane of incidence, diffuse light parallel to it. The normals come from
+a short training on the photographs alone, which do not depend on the order of the four pictures. The AoLP agrees with
+their azimuth modulo 90 degrees; the multiple of 90 degrees follows from certainly specular pixels, whose DoLP exceeds
+that of diffuse light at their zenith.
 """
 
 from __future__ import annotations
@@ -18,21 +19,20 @@ from torch.nn.functional import interpolate
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.inspection.capture import InspectedView
-from polarguide.inspection.clusters import cells, cluster_sums
-from polarguide.inspection.likelihood import DEGREES, Evidence
+from polarguide.inspection.likelihood import DEGREES, Evidence, spatial_cells, sum_by_cluster
 from polarguide.inspection.orders import PAIRINGS, SENSES
 
 SOURCE = "normals of a short training"
 SAMPLES = 400
-"""Pixels of a view that are looked at, far enough apart."""
+"""Largest number of pixels that are sampled in a view."""
 ZENITH_MARGIN = math.radians(15.0)
-"""How far a rendered zenith may be off for a pixel to count as one that must be specular."""
+"""Error of a rendered zenith up to which a pixel still counts as certainly specular."""
 LEAST_ZENITH = math.radians(15.0)
 LEAST_DOLP = 0.03
 FEWEST = 500
 LEAST_INLIERS, LARGEST_ERROR, LEAST_CONCENTRATION = 0.5, math.radians(10.0), 0.25
-"""When normals are good enough: share of the pixels that agree, error of the normals there, and length of the mean of
-``exp(4 i (AoLP - azimuth))``, which is 1 for perfect agreement modulo a quarter turn and 0 for none."""
+"""Limits for usable normals: share of pixels that agree, error of the normals there, and length of the mean of
+``exp(4 i (AoLP - azimuth))``, which is 1 for perfect agreement modulo 90 degrees and 0 for none."""
 _SPECULAR = 0.95
 _NORMAL_ERRORS = tuple(math.radians(angle) for angle in (3.0, 6.0, 10.0, 16.0))
 _INLIERS = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
@@ -40,11 +40,12 @@ _INLIERS = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What is known of the surface in one view.
+    """The surface that one view sees.
 
     Attributes:
-        camera: at the size of the following.
-        normal: [H, W, 3] unit, camera axes, facing the camera. depth: [H, W]. known: [H, W] bool, where both are good.
+        camera: at the size of the maps.
+        normal: unit normals in camera axes that face the camera, [H, W, 3]. depth: camera z, [H, W].
+        known: whether normal and depth are reliable, [H, W] bool.
     """
 
     camera: Camera
@@ -54,11 +55,12 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Pixels:
-    """Pixels with a normal and a polarization, all [N] but for ``place`` [N, 3] (world).
+class SurfaceSamples:
+    """Pixels with a normal and a measured polarization.
 
     Attributes:
-        aolp, dolp: measured. azimuth, zenith: of the normal. noise: standard deviation of the DoLP.
+        aolp, dolp: measured, [N]. noise: standard deviation of the DoLP, [N].
+        azimuth, zenith: angles of the normal in radians, [N]. position: in the world, [N, 3].
     """
 
     aolp: Tensor
@@ -66,21 +68,23 @@ class Pixels:
     noise: Tensor
     azimuth: Tensor
     zenith: Tensor
-    place: Tensor
+    position: Tensor
 
-    def must_be_specular(self, index: float) -> Tensor:
-        """[N] bool: polarized more than diffuse light can be at this zenith."""
+    def certainly_specular(self, index: float) -> Tensor:
+        """Whether the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
         most = optics.diffuse_dolp((self.zenith + ZENITH_MARGIN).clamp(max=math.pi / 2), index)
         return self.dolp > most + 2 * self.noise
 
 
-def surface_pixels(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0, seed: int = 0) -> Pixels:
-    """Pixels of all views that have a good normal and certain polarization; at most 400 a view.
+def sample_surfaces(
+    pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0, seed: int = 0
+) -> SurfaceSamples:
+    """Sample pixels with a reliable normal and significant polarization, at most 400 per view.
 
     Args:
-        pairs: views and their surfaces, which may be smaller pictures.
-        pairing: which pictures are perpendicular, a position in ``PAIRINGS``.
-        seed: of the choice of pixels.
+        pairs: views and their surfaces, whose maps may be smaller than the pictures.
+        pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
+        seed: of the random sampling.
     """
     order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
     generator = torch.Generator().manual_seed(seed)
@@ -99,29 +103,31 @@ def surface_pixels(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int 
         good &= (degree > LEAST_DOLP) & (degree > 3 * spread)
         chosen = good.flatten().nonzero()[:, 0]
         chosen = chosen[torch.randperm(len(chosen), generator=generator)[:SAMPLES]]
-        place = surface.camera.to_world(rays / rays[..., 2:] * surface.depth[..., None])
-        place = place + surface.camera.center.float()
+        position = surface.camera.to_world(rays / rays[..., 2:] * surface.depth[..., None])
+        position = position + surface.camera.center.float()
         rows = (optics.aolp(stokes), degree, spread, optics.azimuth(surface.normal, rays), zenith)
-        flat = torch.stack([*(row.flatten() for row in rows), *place.reshape(-1, 3).unbind(-1)])
+        flat = torch.stack([*(row.flatten() for row in rows), *position.reshape(-1, 3).unbind(-1)])
         found.append(flat[:, chosen])
     rows_found = torch.cat(found, dim=1) if found else torch.zeros(8, 0)
     aolp, dolp, noise_of, azimuth, zenith_of = rows_found[:5].unbind(0)
-    return Pixels(aolp, dolp, noise_of, azimuth, zenith_of, rows_found[5:].T)
+    return SurfaceSamples(aolp, dolp, noise_of, azimuth, zenith_of, rows_found[5:].T)
 
 
-def surface_evidence(pixels: Pixels, index: float) -> Evidence:
-    """Score all zeros and both senses by the normals.
+def normal_evidence(pixels: SurfaceSamples, index: float) -> Evidence:
+    """Log-likelihoods of all zeros and both senses, given the normals.
 
-    A pixel's doubled angle between AoLP and azimuth follows a mixture: a von Mises lobe about the perpendicular, one
-    about the parallel, and a floor. Both lobes weigh the same, except that a pixel that must be specular has nearly
-    all in the first. The width follows from the error of the normals over the sine of the zenith and the noise of the
-    AoLP; that error and the floor are fitted where they explain most.
+    Twice a pixel's angle between AoLP and azimuth follows a mixture: a von Mises distribution about the perpendicular,
+    one about the parallel, and a uniform one. The first two have equal weights; for certainly specular pixels the first
+    has nearly all. Their width follows from the error of the normals over the sine of the zenith and from the noise of
+    the AoLP; that error and the uniform share are fitted by maximum likelihood.
     """
     count = len(pixels.aolp)
     if count < FEWEST:
-        note = f"Only {count} pixels have a good normal and certain polarization; {FEWEST} are needed."
+        note = (
+            f"Only {count} pixels have a reliable normal and significant polarization; {FEWEST} are needed."
+        )
         return Evidence(SOURCE, torch.zeros(1, len(SENSES), DEGREES), count, False, note)
-    must = pixels.must_be_specular(index)
+    must = pixels.certainly_specular(index)
     coarse = torch.arange(0, DEGREES, 4)
     fits = [
         (float(_log_likelihood(pixels, must, coarse, error, inliers).sum(dim=0).max()), error, inliers)
@@ -132,15 +138,15 @@ def surface_evidence(pixels: Pixels, index: float) -> Evidence:
     values = _log_likelihood(pixels, must, torch.arange(DEGREES), error, inliers)
     coherent = _concentration(pixels)
     note = (
-        f"{count} pixels, {int(must.sum())} of which must be specular; the AoLP of {inliers:.0%} agrees with the "
+        f"{count} pixels, {int(must.sum())} of which are certainly specular; the AoLP of {inliers:.0%} agrees with the "
         f"normals, whose error is about {math.degrees(error):.0f}° (agreement modulo 90°: {coherent:.2f} of 1)."
     )
     usable = inliers >= LEAST_INLIERS and error <= LARGEST_ERROR and coherent >= LEAST_CONCENTRATION
-    return Evidence(SOURCE, cluster_sums(values, cells(pixels.place)), count, usable, note)
+    return Evidence(SOURCE, sum_by_cluster(values, spatial_cells(pixels.position)), count, usable, note)
 
 
-def _concentration(pixels: Pixels) -> float:
-    """How well AoLP and azimuth agree modulo a quarter turn, for the better sense and the best zero, in [0, 1]."""
+def _concentration(pixels: SurfaceSamples) -> float:
+    """Agreement of AoLP and azimuth modulo 90 degrees, for the better sense and the best zero, in [0, 1]."""
     lengths = []
     for sense in SENSES:
         angle = 4 * (sense * pixels.aolp - pixels.azimuth)
@@ -148,8 +154,10 @@ def _concentration(pixels: Pixels) -> float:
     return max(lengths)
 
 
-def _log_likelihood(pixels: Pixels, must: Tensor, zeros: Tensor, error: float, inliers: float) -> Tensor:
-    """[N, 2, Z] log-density of the pixels' angles for both senses and zeros [Z] in degrees."""
+def _log_likelihood(
+    pixels: SurfaceSamples, must: Tensor, zeros: Tensor, error: float, inliers: float
+) -> Tensor:
+    """Log-density of the pixels' angles for both senses and zeros [Z] in degrees, [N, 2, Z]."""
     aolp_noise = pixels.noise / (2 * pixels.dolp)
     variance = (error / torch.sin(pixels.zenith)) ** 2 + aolp_noise**2
     concentration = (1 / (4 * variance)).clamp(max=200.0)[:, None]

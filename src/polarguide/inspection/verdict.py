@@ -1,4 +1,4 @@
-"""Verdicts: what an inspection says of one property of a capture, and what to do about it."""
+"""The result of a check: verdict, finding and remedy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 Verdict = Literal["ok", "warning", "wrong", "n/a"]
 ORDER: tuple[Verdict, ...] = ("n/a", "ok", "warning", "wrong")
-"""From what says nothing to what is worst."""
+"""From no verdict to the worst."""
 
 
 @dataclass(frozen=True)
@@ -18,12 +18,12 @@ class Check:
 
     Attributes:
         key: its name in ``inspection.json``.
-        title: its name for people.
-        verdict: "ok"; "warning" where a person should decide; "wrong"; "n/a" where the capture cannot carry the check.
-        finding: what was found, a sentence or two.
-        remedy: what to do; empty where there is nothing to do.
-        views: the views it is about, where it is not about all.
-        figures: the numbers behind it.
+        title: its heading for people.
+        verdict: "ok"; "warning" where a person should decide; "wrong"; "n/a" where the check cannot be made.
+        finding: the result, one or two sentences.
+        remedy: the advice; empty if nothing is to be done.
+        views: the views concerned; empty for all.
+        figures: the numbers that the verdict rests on.
     """
 
     key: str
@@ -53,7 +53,7 @@ def worst(checks: Iterable[Check]) -> Verdict:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON types: floats rounded to six digits, not finite ones null."""
+    """A value as JSON types: floats rounded to six digits, null where they are not finite."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -82,7 +82,7 @@ class FilterSource:
         """The transfer of the capture, from a few views spread over it."""
         asked = self._settings
         notes: list[str] = []
-        transfer = asked.transfer
+        transfer: str = asked.transfer
         if transfer == "auto" and len(self._raw) == len(self.paths):
             transfer = "linear"
             notes.append("Transfer linear: camera raw, developed without tone curve, alike for all shots.")

@@ -63,7 +63,7 @@ class MosaicSource:
             )
         self._settings = settings
         self._raw = RawFormat(settings.width, settings.height, settings.packing)
-        self._dark_path = None if settings.dark_frame is None else Path(settings.dark_frame)
+        self._dark_path = settings.dark_frame
         files = index_files(root, RAW_SUFFIXES)
         if self._dark_path is not None:
             dark = os.path.realpath(self._dark_path)

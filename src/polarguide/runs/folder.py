@@ -105,8 +105,7 @@ def _check_types(record: Any) -> None:
 
 def recipe_data(recipe: Recipe) -> dict[str, Any]:
     """All values of a recipe as plain JSON types."""
-    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(recipe)))
-    return plain
+    return recipe.data()
 
 
 
@@ -135,7 +134,7 @@ def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu
         with safe_open(path, framework="pt") as file:
             names = list(file.keys())
             tensors: dict[str, Tensor] = {key: file.get_tensor(key).to(device) for key in names}
-        return TrainingState.from_tensors(tensors, recipe.rates, recipe.environment_rates)
+        return TrainingState.from_tensors(tensors, recipe)
     except (SafetensorError, KeyError, ValueError) as error:
         raise PolarguideError(
             path,

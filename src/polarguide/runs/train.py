@@ -80,8 +80,7 @@ def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int, look: Look 
     finally:
         interrupt.restore()
     if leads:
-        shading = trainer.recipe.shading(trainer.settings.refractive_index)
-        write_run_ply(out / PLY, trainer.state, shading)
+        write_run_ply(out / PLY, trainer.state, trainer.shading)
 
 
 def _save(trainer: Trainer, out: Path) -> None:
@@ -109,7 +108,7 @@ def watched(trainer: Trainer, host: str, port: int) -> Iterator[Look]:
     viewer = Viewer(
         lambda: shown_training(trainer),
         photographs(scene),
-        lit=trainer.state.environment is not None,
+        shading=trainer.shading,
         trains=True,
         host=host,
         port=port,

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from polarguide.errors import PolarguideError
-from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals, unit
+from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals
 from polarguide.synth.noise import fractal
 from polarguide.synth.solid import solid
+from polarguide.vectors import unit_array as unit
 
 
 def sphere(radius: float = 1.0, detail: int = 96) -> Mesh:

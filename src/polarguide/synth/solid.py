@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.synth.mesh import Array, Mesh, unit
+from polarguide.synth.mesh import Array, Mesh
 from polarguide.synth.nets import surface_nets
 from polarguide.synth.parts import part_distance
+from polarguide.vectors import unit_array as unit
 
 NEWTON_STEPS = 2
 COARSE = 4

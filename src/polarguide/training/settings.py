@@ -1,4 +1,4 @@
-"""What the user chooses about a training, and what each of its steps tells."""
+"""What the user chooses about a training, and what each of its steps reports."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TrainSettings:
 
 @dataclass(frozen=True, eq=False)
 class StepReport:
-    """What a step tells the progress display.
+    """What a step reports to the progress display.
 
     Attributes:
         step, stage, gaussians: plain values.

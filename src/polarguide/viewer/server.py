@@ -13,7 +13,7 @@ from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.scene_frame import scene_frame
-from polarguide.shading.deferred import Shading
+from polarguide.shading.model import ShadingModel
 from polarguide.viewer.frusta import Photograph
 from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.session import Session
@@ -39,7 +39,7 @@ class Viewer:
     Args:
         current: returns the scene as it is now.
         photographs: of the scene by name, at least one; sessions start at the first one.
-        lit: whether the recipe learns an environment light. trains: whether the panel can pause a training.
+        shading: model of the recipe. trains: whether the panel can pause a training.
         host, port: address to listen at; another port is used if this one is taken.
         title: plain text.
 
@@ -52,7 +52,7 @@ class Viewer:
         current: Callable[[], Shown],
         photographs: Mapping[str, Photograph],
         *,
-        lit: bool,
+        shading: ShadingModel,
         trains: bool = False,
         host: str = LOOPBACK[0],
         port: int = 8080,
@@ -63,8 +63,8 @@ class Viewer:
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self._current, self._photographs = current, photographs
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
-        turns = lit and isinstance(current().shading, Shading)
-        self._options = PanelOptions(lit, turns, tuple(photographs), trains)
+        turns = shading.radiance_cubemap is not None
+        self._options = PanelOptions(shading.layers, turns, tuple(photographs), trains)
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._wake = threading.Event()

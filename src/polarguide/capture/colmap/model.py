@@ -69,7 +69,7 @@ class ColmapModel:
             )
         return _camera_of(self.folder, images[0], self._cameras[images[0].camera_id])
 
-    def sightings(self, views: Sequence[str]) -> Tensor:
+    def observations(self, views: Sequence[str]) -> Tensor:
         """Which of the views each point was triangulated from, [M, V] bool; all False where no tracks are stored."""
         columns = {view: column for column, view in enumerate(views)}
         by_id = {

@@ -1,4 +1,4 @@
-"""What is read off the pictures of one view: exposure, noise, four-angle consistency, polarization."""
+"""Measure one view: exposure, noise, consistency of the four angles, polarization."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from polarguide import optics
 from polarguide.inspection.capture import InspectedView
 
 DARK = 1.0 / 256.0
-"""Mean intensity below which a pixel is too dark to say something."""
+"""Mean intensity below which a pixel is too dark to be used."""
 POLARIZED = 0.05
-"""DoLP from which on a pixel counts as polarized."""
+"""DoLP from which a pixel counts as polarized."""
 _QUANTILE_SAMPLES = 200_000
 
 
 @dataclass(frozen=True)
-class Readings:
-    """Figures of one view. Shares are of all pixels for the first four, of the usable ones for the others.
+class ViewMeasurements:
+    """Measurements of one view. ``saturated``, ``invalid`` and ``dark`` are shares of all pixels, others of the usable.
 
     Attributes:
         view: its name.
         bright: 99th percentile of the intensities, in [0, 1].
-        saturated, invalid, dark: shares of pixels with an angle at full scale (or black in all), declared invalid by
+        saturated, invalid, dark: shares of pixels with an angle at full scale (or black in all), marked invalid by
             the capture, and darker than 1/256.
         noise: median standard deviation of the noise of one intensity (mean over the colors), after averaging down.
         noise_share: the same, as a share of S0 / 2.
-        pair_ratio: median of (I0 + I90) / (I45 + I135); None where too little is bright enough.
+        pair_ratio: median of (I0 + I90) / (I45 + I135); None where too few pixels are bright enough.
         sum_error: median of |I0 + I90 - I45 - I135| / S0.
         dolp: quantiles 0.5 and 0.99 of the DoLP.
         polarized: share with a DoLP over 0.05 and over three times its noise.
-        above_limit: share with a DoLP over the most that diffuse light can have by three times its noise.
+        above_limit: share with a DoLP over the limit of diffuse light by three times its noise.
     """
 
     view: str
@@ -54,7 +54,7 @@ class Readings:
         return {**vars(self), "dolp": {"median": self.dolp[0], "p99": self.dolp[1]}}
 
 
-def read_view_figures(view: InspectedView, index: float) -> Readings:
+def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     """Measure one view.
 
     Args:
@@ -69,7 +69,7 @@ def read_view_figures(view: InspectedView, index: float) -> Readings:
     noise = optics.intensity_noise(gray)
     bright = _quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
     saturated, invalid = (float(mask.float().mean()) for mask in (view.saturated, view.invalid))
-    nothing = Readings(
+    nothing = ViewMeasurements(
         view.name,
         bright,
         saturated,
@@ -102,6 +102,6 @@ def read_view_figures(view: InspectedView, index: float) -> Readings:
 
 
 def _quantile(values: Tensor, q: float) -> float:
-    """Quantile of the values, of every so-manieth where there are very many."""
+    """Quantile of the values; of a regular subset where there are very many."""
     step = max(1, values.numel() // _QUANTILE_SAMPLES)
     return float(torch.quantile(values.flatten()[::step], q))

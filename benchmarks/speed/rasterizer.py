@@ -1,7 +1,7 @@
 """The CPU rasterizer's speed: milliseconds, pixel-Gaussian pairs a second, and the share of the processor's peak.
 
 The peak is measured in the same run (independent fused multiply-adds, widest instruction set, all threads). A pair
-counts 150 flop for both passes, 50 of them forward. Run it alone: ``python benchmarks/rasterizer.py``.
+counts 150 flop for both passes, 50 of them forward. Run it alone: ``python benchmarks/speed/rasterizer.py``.
 """
 
 from __future__ import annotations

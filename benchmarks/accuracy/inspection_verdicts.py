@@ -1,6 +1,6 @@
-"""What ``polarguide inspect`` says of scenes whose faults are planted.
+"""What ``polarguide inspect`` finds in scenes whose faults are planted.
 
-    python benchmarks/inspection_verdicts.py SCENE [SCENE ...]
+    python benchmarks/accuracy/inspection_verdicts.py SCENE [SCENE ...]
 
 The eight orders that keep the pairs, a zero turned by 10 degrees, gamma-encoded files, one angle exposed 5 % longer,
 and pictures overexposed three times are made from each scene in memory, and judged by points seen in several views and
@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration, oriented
-from polarguide.inspection.angle_checks import order_check, weigh, zero_check
+from polarguide.color import srgb_encode_array
+from polarguide.inspection.angle_checks import combine_evidence, order_check, zero_check
 from polarguide.inspection.capture import Capture, read_capture
+from polarguide.inspection.measurements import measure_view
 from polarguide.inspection.orders import ORDERS
-from polarguide.inspection.picture_checks import pairing_of, picture_checks
+from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.points import point_evidence
-from polarguide.inspection.readings import read_view_figures
 from polarguide.polarizer import ANGLES
 
 Change = Callable[[NDArray[np.float32]], NDArray[np.float32]]
@@ -57,12 +58,6 @@ def misnamed(files: tuple[int, int, int, int]) -> Change:
     return lambda values: values[[ANGLES.index(angle) for angle in files]]
 
 
-def encoded(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.where(
-        values <= 0.0031308, 12.92 * values, 1.055 * np.maximum(values, 1e-9) ** (1 / 2.4) - 0.055
-    )
-
-
 def exposed(place: int) -> Change:
     """One picture exposed 5 % longer."""
     gains = np.ones((4, 1, 1, 1), np.float32)
@@ -70,17 +65,17 @@ def exposed(place: int) -> Change:
     return lambda values: values * gains
 
 
-def angles_line(capture: Capture, index: float) -> str:
-    pairing = pairing_of(capture) or 0
-    evidence, _ = point_evidence(capture.posed, capture.model, index, pairing)
-    angles = weigh([evidence], pairing)
+def angles_line(capture: Capture, refractive_index: float) -> str:
+    pairing = find_pairing(capture) or 0
+    evidence, _ = point_evidence(capture.posed, capture.model, refractive_index, pairing)
+    angles = combine_evidence([evidence], pairing)
     order, zero = order_check(angles), zero_check(angles)
-    if angles.odds is None:
+    if angles.posterior is None:
         return f"order {order.verdict}: {evidence.note}"
-    best = ORDERS[angles.odds.best].files()
+    best = ORDERS[angles.posterior.best].files()
     return (
-        f"order {order.verdict:5} {','.join(map(str, best)):14} p {max(angles.odds.probabilities):.4f}  "
-        f"zero {zero.verdict:5} {angles.odds.offset:+.2f} +- {angles.odds.offset_error:.2f}"
+        f"order {order.verdict:5} {','.join(map(str, best)):14} p {max(angles.posterior.probabilities):.4f}  "
+        f"zero {zero.verdict:5} {angles.posterior.offset:+.2f} +- {angles.posterior.offset_error:.2f}"
     )
 
 
@@ -94,26 +89,26 @@ def main() -> None:
     torch.set_num_threads(1)
     for path in arguments.scenes:
         capture = read_capture(path)
-        index = capture.refractive_index or 1.5
+        refractive_index = capture.refractive_index or 1.5
         plants: dict[str, Change] = {
             "untouched": lambda values: values,
-            "gamma": encoded,
+            "gamma": srgb_encode_array,
             **{f"5 % at {ANGLES[k]}": exposed(k) for k in range(4)},
             "overexposed x3": lambda values: values * 3,
         }
         for name, change in plants.items():
             planted = altered(capture, change)
-            readings = [read_view_figures(view, index) for view in planted.views]
-            found = picture_checks(planted, readings, pairing_of(planted))
+            measurements = [measure_view(view, refractive_index) for view in planted.views]
+            found = picture_checks(planted, measurements, find_pairing(planted))
             flagged = [f"{check.key} {check.verdict}" for check in found if check.verdict != "ok"]
             print(f"{path.name:9} {name:15} {', '.join(flagged) or 'all ok'}", flush=True)
         if arguments.pictures_only:
             continue
         for order in ORDERS:
-            line = angles_line(altered(capture, misnamed(order.files())), index)
+            line = angles_line(altered(capture, misnamed(order.files())), refractive_index)
             print(f"{path.name:9} {','.join(map(str, order.files())):15} {line}", flush=True)
         print(
-            f"{path.name:9} {'zero at 10':15} {angles_line(altered(capture, turned(10.0)), index)}",
+            f"{path.name:9} {'zero at 10':15} {angles_line(altered(capture, turned(10.0)), refractive_index)}",
             flush=True,
         )
 

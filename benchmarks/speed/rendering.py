@@ -1,7 +1,8 @@
 """What rendering all layers costs against plain Gaussian splatting of the same Gaussians.
 
 Every test view is drawn in turn as color alone and as all layers, with and without depth; the ratio is taken within
-each turn, so that a slow moment of the machine meets both. Run it alone: ``python benchmarks/rendering.py RUN...``.
+each turn, so that a slow moment of the machine meets both. Run it alone:
+``python benchmarks/speed/rendering.py RUN...``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import torch
 from polarguide import _native
 from polarguide.capture import View
 from polarguide.cli.common import OpenRun, open_run
-from polarguide.shading.deferred import render
+from polarguide.shading.gbuffer import render
 
 ROUNDS = 7
 

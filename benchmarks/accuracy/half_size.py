@@ -4,7 +4,7 @@ The pictures of a capture are taken for what a sensor of their size would have s
 are mosaicked with shot noise, developed at half size, and compared with the means over the cells. Errors are means
 over views: of the DoLP where S0 exceeds 0.1, of the AoLP in degrees where the true DoLP exceeds 0.1, too.
 
-    python benchmarks/half_size.py CAPTURE [--every 12]
+    python benchmarks/accuracy/half_size.py CAPTURE [--every 12]
 """
 
 from __future__ import annotations

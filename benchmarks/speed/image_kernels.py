@@ -1,7 +1,7 @@
-"""Speed of the picture and color kernels against their plain-torch twins, in one run on this machine.
+"""Speed of the picture and color kernels against their reference implementations in plain torch.
 
 Each figure is milliseconds, forward and backward together: the median and, in brackets, the minimum over the
-repeats. The two sides take turns, so a busy machine slows both. ``python benchmarks/image_kernels.py``.
+repeats. The two sides take turns, so a busy machine slows both. ``python benchmarks/speed/image_kernels.py``.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def photometric_pair(width: int, height: int) -> tuple[Callable[[], None], Calla
     prediction = (torch.rand(height, width, 3) * 1.1).requires_grad_()
     target = torch.rand(height, width, 3)
     sides = (photometric_loss, photometric_loss_reference)
-    ours, twin = (forward_backward(f, [prediction], target) for f in sides)
-    return ours, twin
+    ours, reference = (forward_backward(f, [prediction], target) for f in sides)
+    return ours, reference
 
 
 def cubemap_pair(resolution: int, count: int) -> tuple[Callable[[], None], Callable[[], None]]:
@@ -52,8 +52,8 @@ def cubemap_pair(resolution: int, count: int) -> tuple[Callable[[], None], Calla
     sphere = torch.cat((grid, 1 - grid.square().sum(-1, keepdim=True)), dim=-1).reshape(-1, 3)[:count]
     directions = (sphere + 0.02 * torch.randn(count, 3)).requires_grad_()
     sides = (cubemap_lookup, cubemap_lookup_reference)
-    ours, twin = (forward_backward(f, [texture, directions]) for f in sides)
-    return ours, twin
+    ours, reference = (forward_backward(f, [texture, directions]) for f in sides)
+    return ours, reference
 
 
 def harmonics_pair(count: int, degree: int) -> tuple[Callable[[], None], Callable[[], None]]:
@@ -63,8 +63,8 @@ def harmonics_pair(count: int, degree: int) -> tuple[Callable[[], None], Callabl
         return lambda m, d, r: function(m, torch.zeros(3), d, r, degree)
 
     leaves = [t.requires_grad_() for t in (means, dc, rest)]
-    ours, twin = (forward_backward(bound(f), leaves) for f in (evaluate_sh, evaluate_sh_reference))
-    return ours, twin
+    ours, reference = (forward_backward(bound(f), leaves) for f in (evaluate_sh, evaluate_sh_reference))
+    return ours, reference
 
 
 def milliseconds(sides: tuple[Callable[[], None], ...], repeats: int, seconds: float) -> list[list[float]]:
@@ -102,12 +102,12 @@ def main() -> None:
         print(
             f"\n{_native.simd()}, {_native.thread_count()} threads, torch {torch.get_num_threads()} threads"
         )
-        print("| operation | ours ms | twin ms | ratio |\n|---|---|---|---|")
+        print("| operation | ours ms | reference ms | ratio |\n|---|---|---|---|")
         for name, sides in operations.items():
-            ours, twin = milliseconds(sides, arguments.repeats, arguments.seconds)
-            a, b = statistics.median(ours), statistics.median(twin)
+            ours, reference = milliseconds(sides, arguments.repeats, arguments.seconds)
+            a, b = statistics.median(ours), statistics.median(reference)
             print(
-                f"| {name} | {a:.2f} ({min(ours):.2f}) | {b:.2f} ({min(twin):.2f}) | {b / a:.1f} |",
+                f"| {name} | {a:.2f} ({min(ours):.2f}) | {b:.2f} ({min(reference):.2f}) | {b / a:.1f} |",
                 flush=True,
             )
 

@@ -5,9 +5,9 @@ takes the one color that its filter passes, and its four samples are the four an
 what ``prepare`` has to put back is exactly what a sensor leaves out; unlike one, all angles of a cell lie in one place
 (hence ``--no-register``). Values are 12-bit in 16-bit PNG files.
 
-    python benchmarks/simulated_mosaics.py CAPTURE MOSAICS
+    python benchmarks/accuracy/simulated_mosaics.py CAPTURE MOSAICS
     polarguide prepare MOSAICS --out SCENE --sensor IMX250MYR --no-register
-    python benchmarks/pose_error.py SCENE CAPTURE
+    python benchmarks/accuracy/pose_error.py SCENE CAPTURE
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How far an exported mesh lies from the true surface: its depth on test views against the ground truth.
 
-    python benchmarks/mesh_depth.py RUN MESH.ply
+    python benchmarks/accuracy/mesh_depth.py RUN MESH.ply
 
 Needs trimesh with a ray engine (``pip install embreex``). Errors are in percent of the scene's extent, 1.1 times the
 largest distance of a camera from the cameras' mean; "rendered" is the depth of the Gaussians themselves, alpha blended.

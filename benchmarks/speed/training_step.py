@@ -2,7 +2,7 @@
 
 A fixed number of Gaussians (no densification), steps 100 to 400 on a scene's training views. The rasterizer is
 timed around its two native calls; the rest is harmonics, loss, optimizer and autograd. Run it alone:
-``python benchmarks/training_step.py SCENE --downscale 2 --gaussians 20800``.
+``python benchmarks/speed/training_step.py SCENE --downscale 2 --gaussians 20800``.
 """
 
 from __future__ import annotations
@@ -95,12 +95,12 @@ def main() -> None:
     native = _native.Rasterizer
     native.forward, native.backward = rasterizer.timed(native.forward), rasterizer.timed(native.backward)
     trainer = Trainer(scene, recipe, TrainSettings(arguments.steps, 0), choose_backend("cpu"))
-    rows = []
+    times = []
     for _ in range(arguments.steps):
         begin = time.perf_counter()
         trainer.step()
-        rows.append((time.perf_counter() - begin, rasterizer.take()))
-    counted = [(1e3 * whole, 1e3 * raster) for whole, raster in rows[skipped:]]
+        times.append((time.perf_counter() - begin, rasterizer.take()))
+    counted = [(1e3 * whole, 1e3 * raster) for whole, raster in times[skipped:]]
     camera = scene.train_views[0].camera
     print(
         f"{scene.name}, {camera.width} x {camera.height}, {len(trainer.state.gaussians):,} Gaussians, "

@@ -2,7 +2,7 @@
 
     npm install three @sparkjsdev/spark          # anywhere; say where with --node-modules
     pip install 'polarguide[browser,export]'
-    python benchmarks/spark.py RUN --node-modules DIR --format ply
+    python benchmarks/accuracy/spark.py RUN --node-modules DIR --format ply
 
 For each test view it prints PSNR against the final layer: of the file in Spark, and of the diffuse layer alone, which
 is what a file without baked reflections would show at best.

@@ -10,13 +10,16 @@ from typing import Any
 
 import pytest
 
-from polarguide.cli import compare as verb
 from polarguide.cli.app import run
+from polarguide.experiments import compare as comparing
 from polarguide.experiments.collect import BESIDE_OTHERS, collect
 from polarguide.experiments.jobs import Job
+from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
+from polarguide.experiments.worker import Scoring, Training
+from polarguide.progress import Reporter
 from polarguide.recipes import recipe_named
-from polarguide.training.trainer import TrainSettings
+from polarguide.training.settings import TrainSettings
 
 Planned = tuple[Comparison, list[SceneEntry], PlannedRun]
 
@@ -28,14 +31,7 @@ def planned(demo_scene: Path, tmp_path: Path) -> Planned:
         scenes=(demo_scene,),
         recipes=(recipe_named("polarguide-stokes"),),
         settings=TrainSettings(40, 0),
-        seeds=1,
-        downscale=4,
-        transfer="linear",
-        device="cpu",
-        jobs=1,
-        threads=1,
-        speed=True,
-        report_views=0,
+        options=CompareOptions(downscale=4, device="cpu", jobs=1, speed=True, report_views=0),
         out=tmp_path,
     )
     scenes = scene_entries(question)
@@ -52,27 +48,31 @@ def score(folder: Path, **changes: Any) -> None:
 
 def test_a_new_run_is_trained_and_scored(planned: Planned) -> None:
     question, _, only = planned
-    train, scoring = verb._job(question, only, alone=True).commands
-    assert train[:4] == ("train", str(question.scenes[0]), "--out", str(only.folder))
-    assert "--resume" not in train
-    assert scoring[:3] == ("eval", str(only.folder), "--speed")
+    train, scoring = comparing._job(question, only, alone=True).tasks
+    assert isinstance(train, Training)
+    assert (train.scene, train.folder) == (str(question.scenes[0]), str(only.folder))
+    assert (train.settings, train.downscale, train.transfer) == (question.settings, 4, "linear")
+    assert not train.resume
+    assert scoring == Scoring(folder=str(only.folder), speed=True, device="cpu", threads=1)
     assert not only.folder.exists()
 
 
 def test_beside_others_no_speed_is_measured_and_that_is_remembered(planned: Planned) -> None:
     question, _, only = planned
-    _, scoring = verb._job(question, only, alone=False).commands
-    assert "--no-speed" in scoring
+    _, scoring = comparing._job(question, only, alone=False).tasks
+    assert isinstance(scoring, Scoring)
+    assert not scoring.speed
     assert (only.folder / BESIDE_OTHERS).exists()
 
 
 def test_a_run_is_gone_on_with_where_it_stopped(planned: Planned, trained: Path) -> None:
     question, _, only = planned
     shutil.copytree(trained, only.folder)
-    assert [words[0] for words in verb._job(question, only, alone=True).commands] == ["eval"]
+    assert [type(task) for task in comparing._job(question, only, alone=True).tasks] == [Scoring]
     (only.folder / "point_cloud.ply").unlink()
-    train, _ = verb._job(question, only, alone=True).commands
-    assert train[-1] == "--resume"
+    train, _ = comparing._job(question, only, alone=True).tasks
+    assert isinstance(train, Training)
+    assert train.resume
 
 
 def test_seconds_count_only_alone(planned: Planned, trained: Path) -> None:
@@ -91,8 +91,18 @@ def test_seconds_count_only_alone(planned: Planned, trained: Path) -> None:
     assert record["error"] is None
 
 
+class Warnings(Reporter):
+    """Collects warnings."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def warn(self, text: str) -> None:
+        self.said.append(text)
+
+
 def test_speed_times_what_was_not_timed(
-    planned: Planned, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    planned: Planned, trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     question, _, only = planned
     shutil.copytree(trained, only.folder)
@@ -102,11 +112,13 @@ def test_speed_times_what_was_not_timed(
         assert parallel == 1
         asked.extend(jobs)
 
-    monkeypatch.setattr(verb, "run_jobs", instead)
+    monkeypatch.setattr(comparing, "run_jobs", instead)
     score(only.folder, fps=60.0)
-    verb._time(question, [only])
+    reporter = Warnings()
+    comparing._time(question, [only], reporter)
     assert asked == []
     score(only.folder)
-    verb._time(question, [only])
-    assert [job.commands for job in asked] == [(("eval", str(only.folder), "--speed", "--device", "cpu"),)]
-    assert "no speed for 1 runs" in capsys.readouterr().out
+    comparing._time(question, [only], reporter)
+    scoring = Scoring(folder=str(only.folder), speed=True, device="cpu", threads=1)
+    assert [job.tasks for job in asked] == [(scoring,)]
+    assert [text[:19] for text in reporter.said] == ["no speed for 1 runs"]

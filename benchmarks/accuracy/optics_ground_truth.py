@@ -1,6 +1,6 @@
 """What the polarization optics achieve on rendered scenes with known normals and layers.
 
-Usage: python benchmarks/optics_ground_truth.py SCENES_DIR [--scenes spheres cup ...] [--index 1.5]
+Usage: python benchmarks/accuracy/optics_ground_truth.py SCENES_DIR [--scenes spheres cup ...] [--refractive-index 1.5]
 
 Each scene folder holds ``polar/VIEW_ANGLE.png`` (linear, 16 bits), ``gt/VIEW.npz`` (world ``normal``,
 ``mask``, and ``specular`` and ``diffuse`` in units of S0), ``sparse/0`` (COLMAP text) and ``split.json`` with
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.camera import Camera
+from polarguide.color import shown
 
 THRESHOLD = 0.05
 WATER_INDEX = 1.33
@@ -78,11 +79,8 @@ def read_view(scene: Path, name: str, camera: Camera) -> View:
 
 def psnr(layer: Tensor, ground_truth: Tensor, mask: Tensor) -> float:
     """PSNR in dB of a layer as shown (S/2, sRGB) over the mask."""
-    shown = []
-    for linear in (layer[mask] / 2, ground_truth[mask] / 2):
-        linear = linear.clamp(0, 1)
-        shown.append(torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
-    return -10 * math.log10(float(((shown[0] - shown[1]) ** 2).mean()))
+    difference = shown(layer[mask] / 2) - shown(ground_truth[mask] / 2)
+    return -10 * math.log10(float((difference**2).mean()))
 
 
 def angle(a: Tensor, b: Tensor) -> Tensor:
@@ -95,20 +93,20 @@ def fold(difference: Tensor, period: float) -> Tensor:
     return torch.rad2deg(((difference + period / 2) % period - period / 2).abs())
 
 
-def score(view: View, index: float) -> dict[str, float]:
+def score(view: View, refractive_index: float) -> dict[str, float]:
     """All figures of one view."""
     luminance = optics.luminance(view.stokes)
     degree, true_zenith = optics.dolp(luminance), optics.zenith(view.normals, view.rays)
     pixels = view.mask & optics.polarization_mask(luminance, threshold=THRESHOLD)
     model = optics.luminance(
-        optics.predicted_stokes(view.specular, view.diffuse, view.normals, view.rays, index)
+        optics.predicted_stokes(view.specular, view.diffuse, view.normals, view.rays, refractive_index)
     )
     azimuth_error = fold(optics.aolp(luminance) - optics.azimuth(view.normals, view.rays), math.pi / 2)[
         pixels
     ]
     aolp_error = fold(optics.aolp(luminance) - optics.aolp(model), math.pi)[pixels]
-    exact = optics.exact_separation(view.stokes, view.normals, view.rays, index)
-    cue_zenith = optics.diffuse_zenith(degree, index)
+    exact = optics.exact_separation(view.stokes, view.normals, view.rays, refractive_index)
+    cue_zenith = optics.diffuse_zenith(degree, refractive_index)
     result = {
         "median DoLP": float(degree[view.mask].median()),
         "azimuth error modulo 90, mean": float(azimuth_error.mean()),
@@ -121,33 +119,38 @@ def score(view: View, index: float) -> dict[str, float]:
         "specular PSNR exact": psnr(exact.specular, view.specular, view.mask),
         "diffuse PSNR exact": psnr(exact.diffuse, view.diffuse, view.mask),
         "specular PSNR paper, true zenith": psnr(
-            optics.paper_separation(view.stokes, true_zenith, index).specular, view.specular, view.mask
+            optics.paper_separation(view.stokes, true_zenith, refractive_index).specular,
+            view.specular,
+            view.mask,
         ),
         "specular PSNR paper": psnr(
-            optics.paper_separation(view.stokes, cue_zenith, index).specular, view.specular, view.mask
+            optics.paper_separation(view.stokes, cue_zenith, refractive_index).specular,
+            view.specular,
+            view.mask,
         ),
         "specular PSNR of nothing": psnr(torch.zeros_like(view.specular), view.specular, view.mask),
     }
     for label, candidates in (
-        ("four", optics.paper_candidates(luminance, view.rays, index)),
-        ("six", optics.physical_candidates(luminance, view.rays, index)),
+        ("four", optics.paper_candidates(luminance, view.rays, refractive_index)),
+        ("six", optics.physical_candidates(luminance, view.rays, refractive_index)),
     ):
         error = angle(optics.disambiguate(candidates, view.normals).normal, view.normals)[pixels]
         result[f"best of {label}, mean"] = float(error.mean())
         result[f"best of {label}, median"] = float(error.median())
-    return result | color_scores(view, true_zenith, index)
+    return result | color_scores(view, true_zenith, refractive_index)
 
 
-def color_scores(view: View, true_zenith: Tensor, index: float) -> dict[str, float]:
+def color_scores(view: View, true_zenith: Tensor, refractive_index: float) -> dict[str, float]:
     """How often and how well the polarization of color differences tells the normal.
 
     The half turn that it leaves open is resolved by the true normal, as in the other rows.
     """
-    told = optics.chromatic_normals(view.stokes, index)
-    where = view.mask & told.decided
-    turn = fold(told.azimuth - optics.azimuth(view.normals, view.rays), math.pi)
+    found = optics.chromatic_normals(view.stokes, refractive_index)
+    where = view.mask & found.decided
+    turn = fold(found.azimuth - optics.azimuth(view.normals, view.rays), math.pi)
     two = torch.stack(
-        [optics.normal_from_angles(told.zenith, told.azimuth + t, view.rays) for t in (0.0, math.pi)], dim=-2
+        [optics.normal_from_angles(found.zenith, found.azimuth + t, view.rays) for t in (0.0, math.pi)],
+        dim=-2,
     )
     error = angle(optics.disambiguate(two, view.normals).normal, view.normals)[where]
     wrong = (turn > 45) & where & (true_zenith > math.radians(15))
@@ -166,17 +169,17 @@ def main() -> None:
     )
     parser.add_argument("scenes_dir", type=Path)
     parser.add_argument("--scenes", nargs="+", default=["spheres", "cup", "car", "water"])
-    parser.add_argument("--index", type=float, help=f"default: 1.5, and {WATER_INDEX} for water")
+    parser.add_argument("--refractive-index", type=float, help=f"default: 1.5, and {WATER_INDEX} for water")
     arguments = parser.parse_args()
-    if arguments.index is not None and not arguments.index > 1:
-        parser.error(f"--index: expected more than 1, found {arguments.index}")
+    if arguments.refractive_index is not None and not arguments.refractive_index > 1:
+        parser.error(f"--refractive-index: expected more than 1, found {arguments.refractive_index}")
     columns: dict[str, dict[str, float]] = {}
     for name in arguments.scenes:
         scene = arguments.scenes_dir / name
-        index = arguments.index or (WATER_INDEX if name == "water" else 1.5)
+        refractive_index = arguments.refractive_index or (WATER_INDEX if name == "water" else 1.5)
         cameras = read_cameras(scene / "sparse" / "0")
         tests = json.loads((scene / "split.json").read_text())["test"]
-        scores = [score(read_view(scene, view, cameras[view]), index) for view in tests]
+        scores = [score(read_view(scene, view, cameras[view]), refractive_index) for view in tests]
         columns[name] = {key: float(np.mean([s[key] for s in scores])) for key in scores[0]}
     print("| |", " | ".join(columns), "|\n|---|" + "---|" * len(columns))
     for key in next(iter(columns.values())):

@@ -10,15 +10,17 @@ from typing import Any
 
 import pytest
 
-from polarguide.cli.ablate import ablated
 from polarguide.cli.app import run
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.sources import scoring_digest
 from polarguide.experiments import plan as plans
+from polarguide.experiments.ablate import ablated
+from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
+from polarguide.options import SceneOptions
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
 from polarguide.runs.folder import recipe_data
-from polarguide.training.trainer import TrainSettings
+from polarguide.training.settings import TrainSettings
 
 SETTINGS = TrainSettings(40, 0)
 ENTRY = SceneEntry(Path("cup"), "cup", "digest", 9, ("v0",))
@@ -26,18 +28,13 @@ ENTRY = SceneEntry(Path("cup"), "cup", "digest", 9, ("v0",))
 
 def asked(**changes: Any) -> Comparison:
     """A comparison of two recipes."""
+    names = [field.name for field in dataclasses.fields(CompareOptions)]
+    options = {name: changes.pop(name) for name in names if name in changes}
     values: dict[str, Any] = {
         "scenes": (Path("cup"),),
         "recipes": (recipe_named("3dgs"), recipe_named("polarguide:without-normals")),
         "settings": SETTINGS,
-        "seeds": 2,
-        "downscale": 1,
-        "transfer": "linear",
-        "device": "cpu",
-        "jobs": 1,
-        "threads": 1,
-        "speed": False,
-        "report_views": 3,
+        "options": CompareOptions(**{"seeds": 2, "device": "cpu", "jobs": 1, **options}),
         "out": Path("out"),
     }
     return Comparison(**{**values, **changes})
@@ -65,6 +62,7 @@ def test_the_same_question_has_the_same_folders() -> None:
     [
         {"settings": TrainSettings(41, 0)},
         {"settings": TrainSettings(40, 0, 1.33)},
+        {"settings": TrainSettings(40, 0, views_per_step=2)},
         {"downscale": 2},
         {"transfer": "srgb"},
     ],
@@ -73,10 +71,15 @@ def test_another_question_has_other_folders(changes: dict[str, Any]) -> None:
     assert not set(folders(**changes)) & set(folders())
 
 
+def test_seeds_count_up_from_that_of_the_settings() -> None:
+    runs = plan_runs(asked(settings=TrainSettings(40, 3)), [ENTRY])
+    assert [run.settings.seed for run in runs] == [3, 3, 4, 4]
+
+
 def test_another_scene_recipe_value_or_program_has_another_key(monkeypatch: pytest.MonkeyPatch) -> None:
     def key(scene: str = "s", recipe: dict[str, Any] | None = None, code: str = "c", seed: int = 0) -> str:
         data = recipe_data(RECIPES["3dgs"]) if recipe is None else recipe
-        return run_key(scene, data, TrainSettings(40, seed), downscale=1, transfer="linear", code=code)
+        return run_key(scene, data, TrainSettings(40, seed), SceneOptions(), code=code)
 
     changed = recipe_data(dataclasses.replace(RECIPES["3dgs"], ssim_weight=0.3))
     keys = [key(), key(scene="t"), key(recipe=changed), key(code="d"), key(seed=1)]
@@ -138,10 +141,10 @@ def test_ablations_by_name() -> None:
     assert every == ("polarguide", *(recipe.name for recipe in ABLATIONS["polarguide"]))
     some = ablated("polarguide", ("without-mask", "polarguide:only-normals"))
     assert some == ("polarguide", "polarguide:only-normals", "polarguide:without-mask")
-    with pytest.raises(PolarguideError, match="--only: expected one of only-normals"):
+    with pytest.raises(PolarguideError, match="only: expected one of only-normals"):
         ablated("polarguide", ("without-luck",))
     with pytest.raises(
-        PolarguideError, match=r"--base: expected a recipe with ablations: .*polarguide.*, found 3dgs"
+        PolarguideError, match=r"base: expected a recipe with ablations: .*polarguide.*, found 3dgs"
     ):
         ablated("3dgs")
 
@@ -150,15 +153,15 @@ def test_ablations_by_name() -> None:
     ("arguments", "said"),
     [
         (["--recipes", "magic"], "recipe: expected one of"),
-        (["--recipes", "3dgs", "3dgs"], "--recipes: expected every name once"),
+        (["--recipes", "3dgs", "3dgs"], "recipes: expected every name once"),
         (["--recipes", "3dgs", "--steps", "0"], "--steps: expected 1 or more"),
-        (["--recipes", "3dgs", "--seeds", "0"], "--seeds: expected 1 or more"),
-        (["--recipes", "3dgs", "--threads", "0"], "--threads: expected 1 or more"),
-        (["--recipes", "3dgs", "--jobs", "-1"], "--jobs: expected"),
-        (["--recipes", "3dgs", "--report-views", "-1"], "--report-views: expected"),
+        (["--recipes", "3dgs", "--seeds", "0"], "seeds: expected 1 or more"),
+        (["--recipes", "3dgs", "--threads", "0"], "threads: expected 1 or more"),
+        (["--recipes", "3dgs", "--jobs", "-1"], "jobs: expected"),
+        (["--recipes", "3dgs", "--report-views", "-1"], "report_views: expected"),
         (["--recipes", "3dgs", "--refractive-index", "5"], "--refractive-index"),
         (["--recipes", "3dgs", "--device", "cuda"], "--device cuda"),
-        (["--recipes", "3dgs", "--downscale", "0"], "--downscale"),
+        (["--recipes", "3dgs", "--downscale", "0"], "downscale: expected"),
     ],
 )
 def test_refusals(

@@ -1,4 +1,4 @@
-"""Where the normal error of runs is: ``python benchmarks/normal_errors.py RUN...`` (scenes with ground truth).
+"""Where the normal error of runs is: ``python benchmarks/accuracy/normal_errors.py RUN...`` (scenes with ground truth).
 
 Foreground pixels of the held-out views are parted into those within two pixels of the foreground's border or of a jump
 of the true normals (neighbors more than 26 degrees apart), and the rest, by degree of polarization. For each part: its

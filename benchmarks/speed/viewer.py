@@ -1,7 +1,8 @@
 """Pictures a second of the viewer while the camera moves: drawn, encoded, and sent to a browser that does nothing.
 
-``python benchmarks/viewer.py RUN [--gaussians 50000] [--size 480x360]``; run it alone. The camera goes along an orbit,
-one pose a picture; the size is held. The Gaussians are a random choice of the run's (or all of them, some twice).
+``python benchmarks/speed/viewer.py RUN [--gaussians 50000] [--size 480x360]``; run it alone. The camera goes along an
+orbit, one pose a picture; the size is held. The Gaussians are a random choice of the run's (or all of them, some
+twice).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What an exported PLY loses: its display colors, blended as other viewers do, against our final picture.
 
-    python benchmarks/baked_splats.py RUN [RUN/export/splats.ply]
+    python benchmarks/accuracy/baked_splats.py RUN [RUN/export/splats.ply]
 
 Means over the test views, of shown pictures, in dB: of the file, and of the diffuse layer alone. Without a second
 argument it takes the PLY that training wrote, which is the same.

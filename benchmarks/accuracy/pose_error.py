@@ -3,7 +3,7 @@
 The two models are brought together by the similarity that fits the camera centers best in the least-squares sense
 (Umeyama 1991). Positions are relative to the diagonal of the reference's camera path, so that no unit is needed.
 
-    python benchmarks/pose_error.py SCENE REFERENCE
+    python benchmarks/accuracy/pose_error.py SCENE REFERENCE
 """
 
 from __future__ import annotations
