@@ -16,7 +16,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 TRAINED_BY = ("training/trainer.py", "capture/reader.py", "raster/backends.py")
 """What trains, and what makes its scene and its backend. With all that they import, they decide the result."""
-SCORED_BY = ("cli/evaluate.py",)
+SCORED_BY = ("evaluation/evaluate.py",)
 """What decides, beside that, the numbers of a finished training."""
 APART = ("recipes", "__init__.py")
 """Below the package, what is not followed: recipes, and the package's own names, which open all of it."""
