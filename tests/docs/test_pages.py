@@ -101,8 +101,18 @@ def test_every_recipe_is_described_and_every_named_one_exists():
     assert named - known == set()
 
 
+def parameters():
+    """Names of parameters and fields that an option can stand for: of verbs, and of the dataclasses that they read."""
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(text_of(path))):
+            if isinstance(node, ast.arg):
+                yield node.arg
+            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                yield node.target.id
+
+
 def test_options_exist():
-    words = set(re.findall(r"\w+", "\n".join(text_of(p) for p in PACKAGE.rglob("*.py"))))
+    words = set(parameters())
     unknown = {}
     for path in TEXTS:
         for option in re.findall(r"(?<![\w-])--([a-z][a-z-]+)", text_of(path)):

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
-from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -16,6 +12,7 @@ from polarguide.cli.console import console
 from polarguide.cli.job_progress import JobReporter
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
+from polarguide.system import signals_as_interrupts
 from polarguide.training.settings import TrainSettings
 
 if TYPE_CHECKING:
@@ -75,18 +72,3 @@ def print_results(results: Results, out: Path) -> None:
             found=f"that {len(failed)} failed ({errors})",
             remedy="What there is has been written. Remove the cause and give the same command again.",
         )
-
-
-@contextlib.contextmanager
-def signals_as_interrupts() -> Iterator[None]:
-    """SIGTERM and SIGHUP act like Ctrl-C."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    old = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)

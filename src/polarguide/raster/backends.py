@@ -1,19 +1,18 @@
-"""The one place where a backend is chosen."""
+"""The choice of a backend."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from polarguide import _native
 from polarguide.errors import PolarguideError
+from polarguide.options import DeviceName
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
 from polarguide.raster.interface import Rasterize
-
-DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 class Backend(NamedTuple):
@@ -23,7 +22,9 @@ class Backend(NamedTuple):
     rasterize: Rasterize
 
 
-def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = print) -> Backend:
+def choose_backend(
+    name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = lambda _: None
+) -> Backend:
     """The backend for ``--device``: ``auto`` takes the GPU where there is one and gsplat is installed.
 
     Args:
