@@ -18,8 +18,8 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import polarguide
-from polarguide.cli.app import run
 from polarguide import errors
+from polarguide.cli.app import run
 from polarguide.export import points
 from polarguide.gaussians.ply import read_ply
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
