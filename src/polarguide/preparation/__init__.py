@@ -1,4 +1,4 @@
-"""Camera files -> a scene folder: what ``polarguide prepare`` does."""
+"""Prepare a scene folder from camera files (``polarguide prepare``)."""
 
 from polarguide.preparation.prepare import Prepared, prepare_scene
 from polarguide.preparation.settings import ORIGINS, PrepareSettings

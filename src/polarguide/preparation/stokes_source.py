@@ -1,4 +1,4 @@
-"""A published dataset whose files are Stokes vectors: the four intensities are made from them."""
+"""Picture source: Stokes vectors of a published dataset, converted to four intensities."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import oriented
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.datasets import Dataset, fitted_mask
+from polarguide.capture.datasets import Dataset, resized_mask
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import Developed
+from polarguide.preparation.source import DevelopedView
 
 PAIR_SUMS = (
     "n/a: the four intensities were made from Stokes vectors, so that I0 + I90 = I45 + I135 by construction"
@@ -26,10 +26,10 @@ _SAMPLES = 20_000
 
 
 class StokesSource:
-    """Stokes vectors, in any unit and without a full scale."""
+    """Stokes vectors in any unit, without a full scale."""
 
     def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
-        """Take a dataset that has ``light``; the sense of its angles counts where the settings name none."""
+        """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
         self.kind = dataset.name
         self.cameras = dataset.cameras
         self._dataset = dataset
@@ -47,7 +47,7 @@ class StokesSource:
         return self._dataset.paths
 
     def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
-        """One scale for the whole capture, and what it costs; every file is read once.
+        """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
 
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
         else twice this one does, and what exceeds it clips.
@@ -57,7 +57,7 @@ class StokesSource:
         for number, view in enumerate(self.views, 1):
             stokes, _ = self._stokes(view)
             finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
-            intensities = behind(np.where(finite[..., None], stokes, 0))
+            intensities = analyzer_intensities(np.where(finite[..., None], stokes, 0))
             peak = intensities.max(axis=(0, 3))
             peaks.append(peak.ravel()[:: max(1, peak.size // _SAMPLES)])
             largest = max(largest, float(peak.max()))
@@ -96,18 +96,18 @@ class StokesSource:
             "notes": notes,
         }
 
-    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
-        """Read one view: scale, four intensities, the sense of the angles."""
+    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+        """Read one view, scale it, form the four intensities and correct the sense of the angles."""
         stokes, clipped = self._stokes(view)
         finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
         scaled = np.where(finite[..., None], stokes, 0) * np.float32(measured["scale"])
-        intensities = behind(scaled)
+        intensities = analyzer_intensities(scaled)
         # Rounding of the scale may leave the largest intensity a hair above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
-        turned = oriented(np.clip(intensities, 0.0, 1.0), self._calibration)
-        return Developed(
-            intensities=turned,
+        rotated = oriented(np.clip(intensities, 0.0, 1.0), self._calibration)
+        return DevelopedView(
+            intensities=rotated,
             invalid=clipped | ~finite,
             geometry=Geometry((width, height), (0, 0), 1, (width, height)),
             record={
@@ -115,16 +115,16 @@ class StokesSource:
                 "negative_share": round(float((intensities < 0).mean()), 6),
                 "invalid_share": round(float((clipped | ~finite).mean()), 6),
             },
-            mask=fitted_mask(self._dataset, view, (height, width)),
+            mask=resized_mask(self._dataset, view, (height, width)),
         )
 
     def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        assert self._dataset.light is not None
-        light = self._dataset.light(view)
-        return light.stokes, light.clipped
+        assert self._dataset.read_stokes is not None
+        image = self._dataset.read_stokes(view)
+        return image.stokes, image.clipped
 
 
-def behind(stokes: NDArray[np.float32]) -> NDArray[np.float32]:
+def analyzer_intensities(stokes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Intensities (S0 + S1 cos 2a + S2 sin 2a) / 2 at 0, 45, 90 and 135 degrees: [3, ...] -> [4, ...]."""
     s0, s1, s2 = stokes
     return np.asarray(np.stack([s0 + s1, s0 + s2, s0 - s1, s0 - s2]) / 2, np.float32)

@@ -1,1 +1,1 @@
-"""COLMAP models: the only room that knows pycolmap."""
+"""COLMAP models and COLMAP itself: the only package that imports pycolmap."""
