@@ -1,7 +1,9 @@
 # make demo    train, score and render the demo scene that ships with the package
-# make dataset    render the five scenes of docs/dataset.md into scenes/ (hours on few cores; goes on where it stopped),
+# make dataset    render the five scenes of docs/how-to/synthesize.md into scenes/ (hours on few cores; goes on where it stopped),
 #                 check the files of those that are finished, and print a SHA-256 of each
-# make test    linter, formatter, types and tests, on the package as it is installed
+# make test    linter, formatter, types and tests, on the package as it is installed;
+#                 its last lines say what was skipped, and how to change that
+# make docs    build the documentation into build/docs; a warning is an error
 # make cross-check    compile the kernels for aarch64 (needs aarch64-linux-gnu-g++ and cmake)
 # make gpu-check    build, test and measure on a machine with a GPU; in parts: call it again until it says complete
 # make gpu-pack SCENE=.../spheres    what gpu-check needs on a machine without a network, into gpu-pack/
@@ -9,17 +11,20 @@
 #
 # Needs Python 3.10 or newer with its venv module, a C++17 compiler and make; everything else is fetched from PyPI.
 #   PYTHON=python3.12     the interpreter of the environment (read when .venv is created)
+#   PYTEST='-n 0 -k name'  options of the tests, which run on all cores, at most 8
 
 PYTHON ?= python3
+PYTEST ?= -n auto --maxprocesses 8 --dist loadfile
 
 VENV := .venv
 BIN := $(VENV)/bin
+SPLAT_TRANSFORM := build/node/splat-transform@2.7.1
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints-cpu.txt
 # Directories are listed too: their time changes when a file is removed.
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
 
-.PHONY: demo dataset test cross-check gpu-check gpu-pack clean
+.PHONY: demo dataset test docs cross-check gpu-check gpu-pack clean
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
 
@@ -31,11 +36,20 @@ SCENES := figure kit car cup water
 dataset: $(VENV)/.installed-synth
 	set -e; for scene in $(SCENES); do $(BIN)/polarguide synth $$scene --out scenes/$$scene --size 256x192; done
 
-test: $(VENV)/.installed-test
+test: $(VENV)/.installed-test $(SPLAT_TRANSFORM)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PYTEST)
+
+# Another program that reads what we export. Tests that need it are skipped where it cannot be installed.
+$(SPLAT_TRANSFORM):
+	@npm install --prefix build/node --no-save --no-fund --no-audit --silent --ignore-scripts --engine-strict \
+		@playcanvas/$(@F) && touch $@ || echo "$(@F) was not installed: it takes npm, and node 18 or newer"
+
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -W --keep-going -n -q -j auto -d build/doctrees docs build/docs
+	@echo "The documentation starts at build/docs/index.html"
 
 cross-check: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/native/test_cross_compilation.py
@@ -59,6 +73,11 @@ $(VENV)/.installed-synth: $(SOURCES) | $(VENV)/pyvenv.cfg
 $(VENV)/.installed-test: $(SOURCES) | $(VENV)/pyvenv.cfg
 	@echo "Building and installing polarguide and its test tools into $(VENV); the first time takes minutes."
 	$(PIP_INSTALL) '.[test]'
+	@touch $(VENV)/.installed $@
+
+$(VENV)/.installed-docs: $(SOURCES) | $(VENV)/pyvenv.cfg
+	@echo "Building and installing polarguide and Sphinx into $(VENV); the first time takes minutes."
+	$(PIP_INSTALL) '.[docs]'
 	@touch $(VENV)/.installed $@
 
 $(VENV)/pyvenv.cfg:

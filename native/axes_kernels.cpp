@@ -17,7 +17,7 @@ struct Axis {
 };
 
 // The shortest axis under the rotation of a quaternion (w, x, y, z) of any length, turned outward. Without branches,
-// which nothing could foresee: with e the chosen axis and u = (x, y, z) it is e + 2 / |q|^2 (u u.e + w u x e - e u.u).
+// which could not be predicted: with e the chosen axis and u = (x, y, z) it is e + 2 / |q|^2 (u u.e + w u x e - e u.u).
 inline Axis outward_axis(const AxesArgs &a, int64_t i) {
     const float *q = a.quaternions + 4 * i, *s = a.log_scales + 3 * i, *m = a.means + 3 * i;
     const float w = q[0], x = q[1], y = q[2], z = q[3];

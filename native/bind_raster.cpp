@@ -18,10 +18,11 @@ using namespace polarguide;
 
 namespace {
 
-GaussianInputs inputs(const Array &means, const Array &quats, const Array &scales, const Array &opacities,
+GaussianInputs inputs(const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
                       const Array &features) {
     int64_t n = int64_t(means.ndim() ? means.shape(0) : 0);
-    expect_shape(means, "means", {n, 3}), expect_shape(quats, "quats", {n, 4}), expect_shape(scales, "scales", {n, 3});
+    expect_shape(means, "means", {n, 3}), expect_shape(quaternions, "quaternions", {n, 4});
+    expect_shape(scales, "scales", {n, 3});
     expect_shape(opacities, "opacities", {n});
     if (features.ndim() != 2) throw std::invalid_argument("features: expected two axes [N, D]");
     int d = int(features.shape(1));
@@ -29,7 +30,7 @@ GaussianInputs inputs(const Array &means, const Array &quats, const Array &scale
     if (d < 1 || d > max_channels)
         throw std::invalid_argument("features: expected 1 to " + std::to_string(max_channels) + " channels, found " +
                                     std::to_string(d));
-    return {n, d, means.data(), quats.data(), scales.data(), opacities.data(), features.data()};
+    return {n, d, means.data(), quaternions.data(), scales.data(), opacities.data(), features.data()};
 }
 
 struct Wrapped {
@@ -60,9 +61,9 @@ void bind_raster(nb::module_ &module) {
             nb::arg("near_plane"), nb::arg("permutation"), nb::arg("statistic_channels"))
         .def(
             "forward",
-            [](Wrapped &self, const Array &means, const Array &quats, const Array &scales, const Array &opacities,
+            [](Wrapped &self, const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
                const Array &features, Array out, Array alpha, Array radius, bool count_pairs) {
-                GaussianInputs in = inputs(means, quats, scales, opacities, features);
+                GaussianInputs in = inputs(means, quaternions, scales, opacities, features);
                 expect_shape(features, "features", {in.count, self.channels});
                 expect_shape(out, "out", {self.height, self.width, self.channels});
                 expect_shape(alpha, "alpha", {self.height, self.width});
@@ -70,27 +71,28 @@ void bind_raster(nb::module_ &module) {
                 nb::gil_scoped_release release;
                 self.rasterizer.forward(in, out.data(), alpha.data(), radius.data(), count_pairs);
             },
-            nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
+            nb::arg("means"), nb::arg("quaternions"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
             nb::arg("out"), nb::arg("alpha"), nb::arg("radius"), nb::arg("count_pairs") = false)
         .def(
             "backward",
-            [](Wrapped &self, const Array &means, const Array &quats, const Array &scales, const Array &opacities,
+            [](Wrapped &self, const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
                const Array &features, const Array &out, const Array &grad_out, const Array &grad_alpha, Array d_means,
-               Array d_quats, Array d_scales, Array d_opacities, Array d_features, std::optional<Array> statistic) {
-                GaussianInputs in = inputs(means, quats, scales, opacities, features);
+               Array d_quaternions, Array d_scales, Array d_opacities, Array d_features,
+               std::optional<Array> statistic) {
+                GaussianInputs in = inputs(means, quaternions, scales, opacities, features);
                 for (const Array *a : {&out, &grad_out})
                     expect_shape(*a, "out or its gradient", {self.height, self.width, self.channels});
                 expect_shape(grad_alpha, "grad_alpha", {self.height, self.width});
-                inputs(d_means, d_quats, d_scales, d_opacities, d_features);
+                inputs(d_means, d_quaternions, d_scales, d_opacities, d_features);
                 expect_shape(d_means, "d_means", {in.count, 3});
                 if (statistic) expect_shape(*statistic, "statistic", {in.count, 2});
                 nb::gil_scoped_release release;
                 self.rasterizer.backward(in, out.data(), grad_out.data(), grad_alpha.data(),
-                                         {d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(),
+                                         {d_means.data(), d_quaternions.data(), d_scales.data(), d_opacities.data(),
                                           d_features.data(), statistic ? statistic->data() : nullptr});
             },
-            nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
-            nb::arg("out"), nb::arg("grad_out"), nb::arg("grad_alpha"), nb::arg("d_means"), nb::arg("d_quats"),
+            nb::arg("means"), nb::arg("quaternions"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
+            nb::arg("out"), nb::arg("grad_out"), nb::arg("grad_alpha"), nb::arg("d_means"), nb::arg("d_quaternions"),
             nb::arg("d_scales"), nb::arg("d_opacities"), nb::arg("d_features"), nb::arg("statistic").none())
         .def_prop_ro("pairs", [](const Wrapped &self) { return self.rasterizer.pairs(); },
                      "Contributing pixel-Gaussian pairs of the last forward pass that counted them.")

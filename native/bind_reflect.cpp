@@ -15,14 +15,14 @@ namespace {
 using MaybeArray = std::optional<Array>;
 constexpr int64_t item_chunk = 2048;
 
-ReflectArgs reflect_args(const Array &features, const Array &rays, bool fresnel, bool local, float index) {
+ReflectArgs reflect_args(const Array &features, const Array &rays, bool fresnel, bool local, float refractive_index) {
     const int64_t n = features.ndim() == 2 ? int64_t(features.shape(0)) : 0;
     const int64_t channels = features.ndim() == 2 ? int64_t(features.shape(1)) : 0;
     expect_shape(features, "features", {n, channels}), expect_shape(rays, "rays", {n, 3});
     if (channels < (local ? 10 : 7))
         throw std::invalid_argument("features: expected base color, normal, strength and what the shading reads");
     ReflectArgs a{};
-    a.channels = int(channels), a.fresnel = fresnel, a.local = local, a.index = index;
+    a.channels = int(channels), a.fresnel = fresnel, a.local = local, a.refractive_index = refractive_index;
     a.features = features.data(), a.rays = rays.data();
     return a;
 }
@@ -54,9 +54,9 @@ void bind_reflect(nb::module_ &module) {
         nb::arg("features"), nb::arg("rays"), nb::arg("directions"), "Rays mirrored at the blended normals.");
     module.def(
         "reflect_layers",
-        [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float index,
+        [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,
            Array final_picture, Array specular, Array diffuse, Array reflection) {
-            ReflectArgs a = reflect_args(features, rays, fresnel, local, index);
+            ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index);
             const int64_t n = int64_t(rays.shape(0));
             expect_shape(seen, "seen", {n, 3}), expect_shape(final_picture, "final", {n, 3});
             expect_shape(specular, "specular", {n, 3}), expect_shape(diffuse, "diffuse", {n, 3});
@@ -65,14 +65,14 @@ void bind_reflect(nb::module_ &module) {
             a.diffuse = diffuse.data(), a.reflection = reflection.data();
             run(POLARGUIDE_DISPATCH(reflect_layers), a, n);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("index"),
+        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
         nb::arg("final"), nb::arg("specular"), nb::arg("diffuse"), nb::arg("reflection"), "The layers of the picture.");
     module.def(
         "reflect_backward_layers",
-        [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float index,
+        [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,
            MaybeArray grad_final, MaybeArray grad_specular, MaybeArray grad_diffuse, MaybeArray grad_reflection,
            Array grad_seen, Array grad_features) {
-            ReflectArgs a = reflect_args(features, rays, fresnel, local, index);
+            ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index);
             const int64_t n = int64_t(rays.shape(0));
             expect_shape(seen, "seen", {n, 3}), expect_shape(grad_seen, "grad_seen", {n, 3});
             expect_shape(grad_features, "grad_features", {n, a.channels});
@@ -83,7 +83,7 @@ void bind_reflect(nb::module_ &module) {
             a.seen = seen.data(), a.grad_seen = grad_seen.data(), a.grad_features = grad_features.data();
             run(POLARGUIDE_DISPATCH(reflect_backward_layers), a, n);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("index"),
+        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
         nb::arg("grad_final").none(), nb::arg("grad_specular").none(), nb::arg("grad_diffuse").none(),
         nb::arg("grad_reflection").none(), nb::arg("grad_seen"), nb::arg("grad_features"),
         "Fills the gradients by the look-up and, but for what comes through the look-up, by the features.");

@@ -69,7 +69,7 @@ POLARGUIDE_DECLARE(void mirrored_forward(const AxesArgs &a, int64_t begin, int64
 struct ReflectArgs {
     int channels;
     bool fresnel, local; // Fresnel's weight and exponential light, or the lerp and the logistic function
-    float index;
+    float refractive_index;
     const float *features; // [P,D]
     const float *rays;     // [P,3] unit
     const float *seen;     // [P,3]

@@ -1,4 +1,4 @@
-// EWA projection of the Gaussians, the tiles they touch, and the way back from screen gradients to 3D ones.
+// EWA projection of the Gaussians, the tiles they touch, and the gradients of both.
 #include "raster.h"
 #include "simd.h"
 
@@ -44,7 +44,7 @@ POLARGUIDE_INLINE bool project_one(const ProjectArgs &p, int64_t g, Projection *
         o->t[i] = R[3 * i] * m[0] + R[3 * i + 1] * m[1] + R[3 * i + 2] * m[2] + cam.translation[i];
     const float z = o->t[2];
     if (!(z > cam.near_plane) || !(p.opacities[g] >= minimum_opacity)) return false;
-    const float *q = p.quats + 4 * g;
+    const float *q = p.quaternions + 4 * g;
     o->norm = sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
     const float unit = 1.0f / (o->norm > 1e-12f ? o->norm : 1e-12f);
     for (int i = 0; i < 4; ++i) o->q[i] = q[i] * unit;
@@ -144,7 +144,8 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
 namespace {
 
 // From gradients of the 2D mean and conic to those of the 3D mean, quaternion and scales.
-POLARGUIDE_INLINE void pull_back(const PinholeCamera &cam, const Projection &o, const float *grad, float *mean, float *quat, float *scale) {
+POLARGUIDE_INLINE void project_one_backward(const PinholeCamera &cam, const Projection &o, const float *grad, float *mean,
+                                            float *quaternion, float *scale) {
     // conic = inverse of [[a, b], [b, c]]: gradient of the covariance is -conic G conic.
     const float inverse = 1.0f / o.determinant;
     const float ka = o.c * inverse, kb = -o.b * inverse, kc = o.a * inverse;
@@ -204,7 +205,7 @@ POLARGUIDE_INLINE void pull_back(const PinholeCamera &cam, const Projection &o, 
     dq[3] = 2 * (w * (dr[3] - dr[1]) + x * (dr[2] + dr[6]) + y * (dr[5] + dr[7]) - 2 * z * (dr[0] + dr[4]));
     const float along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;
     const float unit = 1.0f / (o.norm > 1e-12f ? o.norm : 1e-12f);
-    for (int i = 0; i < 4; ++i) quat[i] = (dq[i] - along * o.q[i]) * unit;
+    for (int i = 0; i < 4; ++i) quaternion[i] = (dq[i] - along * o.q[i]) * unit;
 }
 
 } // namespace
@@ -214,7 +215,8 @@ void project_backward(const ProjectBackwardArgs &args, int64_t begin, int64_t en
     const int d = args.channels, stride = d + instance_extra;
     float sum[max_channels + instance_extra + lanes];
     for (int64_t g = begin; g < end; ++g) {
-        float *mean = args.grad_means + 3 * g, *quat = args.grad_quats + 4 * g, *scale = args.grad_scales + 3 * g;
+        float *mean = args.grad_means + 3 * g, *scale = args.grad_scales + 3 * g;
+        float *quaternion = args.grad_quaternions + 4 * g;
         float *features = args.grad_features + g * args.channels_real;
         const int64_t first = args.instance_begin[g], last = args.instance_begin[g + 1];
         for (int i = 0; i < stride; ++i) sum[i] = 0.0f;
@@ -228,11 +230,11 @@ void project_backward(const ProjectBackwardArgs &args, int64_t begin, int64_t en
         if (args.statistic) args.statistic[2 * g] = grad[6], args.statistic[2 * g + 1] = grad[7];
         Projection o;
         if (first < last && project_one(p, g, &o)) {
-            pull_back(p.camera, o, grad, mean, quat, scale);
+            project_one_backward(p.camera, o, grad, mean, quaternion, scale);
             continue;
         }
         for (int i = 0; i < 3; ++i) mean[i] = scale[i] = 0.0f;
-        for (int i = 0; i < 4; ++i) quat[i] = 0.0f;
+        for (int i = 0; i < 4; ++i) quaternion[i] = 0.0f;
     }
 }
 

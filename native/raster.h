@@ -1,6 +1,6 @@
 // Splatting of 3D Gaussians with D feature channels: the data that passes between the stages.
 //
-// Definition (the same as the plain-torch twin, src/polarguide/raster/reference.py): EWA projection with a 0.3 px^2
+// Definition (as of the reference implementation, src/polarguide/raster/reference.py): EWA projection with a 0.3 px^2
 // blur, alpha = min(0.99, opacity * exp(-quadratic / 2)), contributions below 1/255 are dropped, a pixel ends before
 // the Gaussian that would bring its transmittance under 1e-4, Gaussians in order of camera depth (ties: by index).
 #pragma once
@@ -24,7 +24,7 @@ struct PinholeCamera {
 
 struct ProjectArgs {
     int64_t count;
-    const float *means, *quats, *scales, *opacities; // [N,3] [N,4] [N,3] [N]
+    const float *means, *quaternions, *scales, *opacities; // [N,3] [N,4] [N,3] [N]
     PinholeCamera camera;
     // Out. `screen` rows: x, y (pixels), A, B, C, L with log2(alpha) = A dx^2 + B dx dy + C dy^2 + L.
     float *screen;  // [N,6]
@@ -69,7 +69,7 @@ struct ProjectBackwardArgs {
     const int32_t *permutation;
     const int64_t *instance_begin; // [N + 1]
     const float *grad_instances;
-    float *grad_means, *grad_quats, *grad_scales, *grad_opacities, *grad_features;
+    float *grad_means, *grad_quaternions, *grad_scales, *grad_opacities, *grad_features;
     float *statistic; // [N,2] or null
 };
 

@@ -128,7 +128,7 @@ template <class F> void Rasterizer::for_tiles(F &&body) {
 void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs) {
     screen_.resize(in.count * screen_values), depth_.resize(in.count), box_.resize(in.count * 4);
     transmittance_.resize(int64_t(camera_.width) * camera_.height);
-    ProjectArgs project_args{in.count, in.means, in.quats, in.scales, in.opacities, camera_,
+    ProjectArgs project_args{in.count, in.means, in.quaternions, in.scales, in.opacities, camera_,
                              screen_.get(), depth_.get(), radius, box_.get()};
     auto project_chunk = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(project)(project_args, b, e); };
     parallel_chunks(in.count, gaussian_chunk, project_chunk);
@@ -152,11 +152,13 @@ void Rasterizer::backward(const GaussianInputs &in, const float *out, const floa
     if (!gradients.statistic) args.statistic_channels = 0;
     for_tiles([&](int64_t tile, const RasterScratch &s) { POLARGUIDE_DISPATCH(raster_backward)(args, tile, s); });
     ProjectBackwardArgs back{};
-    back.forward = {in.count, in.means, in.quats, in.scales, in.opacities, camera_, nullptr, nullptr, nullptr, nullptr};
+    back.forward = {in.count, in.means, in.quaternions, in.scales, in.opacities, camera_,
+                    nullptr, nullptr, nullptr, nullptr};
     back.channels = channels_, back.channels_real = in.channels, back.permutation = permutation_.data();
     back.instance_begin = instance_begin_.get(), back.grad_instances = rows.get();
-    back.grad_means = gradients.means, back.grad_quats = gradients.quats, back.grad_scales = gradients.scales;
-    back.grad_opacities = gradients.opacities, back.grad_features = gradients.features;
+    back.grad_means = gradients.means, back.grad_quaternions = gradients.quaternions;
+    back.grad_scales = gradients.scales, back.grad_opacities = gradients.opacities;
+    back.grad_features = gradients.features;
     back.statistic = gradients.statistic;
     auto chunk = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(project_backward)(back, b, e); };
     parallel_chunks(in.count, gaussian_chunk, chunk);

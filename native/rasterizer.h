@@ -23,7 +23,7 @@ template <class T> class Buffer {
 struct GaussianInputs {
     int64_t count;
     int channels;
-    const float *means, *quats, *scales, *opacities, *features;
+    const float *means, *quaternions, *scales, *opacities, *features;
 };
 
 class Rasterizer {
@@ -32,7 +32,7 @@ class Rasterizer {
     Rasterizer(const PinholeCamera &camera, std::vector<int32_t> permutation, int statistic_channels);
     void forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs);
     struct Gradients {
-        float *means, *quats, *scales, *opacities, *features, *statistic; // statistic may be null
+        float *means, *quaternions, *scales, *opacities, *features, *statistic; // statistic may be null
     };
     void backward(const GaussianInputs &in, const float *out, const float *grad_out, const float *grad_alpha,
                   const Gradients &gradients);

@@ -28,8 +28,8 @@ inline Mirror mirror_at(const ReflectArgs &a, int64_t i) {
 }
 
 // Unpolarized power reflectance at cos i = c in [0, 1], and its derivative.
-inline float reflectance(float c, float index, float *slope) {
-    const float n2 = index * index, t = sqrtf(n2 - 1.0f + c * c), p = n2 * c, dt = c / t;
+inline float reflectance(float c, float refractive_index, float *slope) {
+    const float n2 = refractive_index * refractive_index, t = sqrtf(n2 - 1.0f + c * c), p = n2 * c, dt = c / t;
     const float s_sum = 1.0f / (c + t), p_sum = 1.0f / (p + t), rs = (c - t) * s_sum, rp = (p - t) * p_sum;
     // ((a - t) / (a + t))' = 2 (a' t - a t') / (a + t)^2
     *slope = rs * 2.0f * (t - c * dt) * s_sum * s_sum + rp * 2.0f * (n2 * t - p * dt) * p_sum * p_sum;
@@ -79,7 +79,7 @@ void reflect_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
         const float *base = a.features + a.channels * i, strength = base[6];
         const Light l = light_at(a, i);
         float slope, weight = strength, kept = 1.0f - strength;
-        if (a.fresnel) weight = strength * reflectance(facing(mirror_at(a, i).along), a.index, &slope), kept = 1.0f;
+        if (a.fresnel) weight = strength * reflectance(facing(mirror_at(a, i).along), a.refractive_index, &slope), kept = 1.0f;
         for (int k = 0; k < 3; ++k) {
             const float specular = weight * l.value[k], diffuse = kept * base[k];
             a.specular[3 * i + k] = specular, a.diffuse[3 * i + k] = diffuse;
@@ -98,7 +98,7 @@ void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
         const Light l = light_at(a, i);
         float slope = 0.0f, share = 1.0f, kept = 1.0f - strength;
         Mirror m;
-        if (a.fresnel) m = mirror_at(a, i), share = reflectance(facing(m.along), a.index, &slope), kept = 1.0f;
+        if (a.fresnel) m = mirror_at(a, i), share = reflectance(facing(m.along), a.refractive_index, &slope), kept = 1.0f;
         float by_weight = 0.0f, by_kept = 0.0f;
         for (int k = 0; k < 3; ++k) {
             const float final_picture = a.grad_final ? a.grad_final[3 * i + k] : 0.0f;

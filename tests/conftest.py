@@ -1,17 +1,31 @@
-"""For all tests: the demo scene; and one thread for torch, because tensors are small here."""
+"""For all tests: the demo scene, one thread for torch, and closing lines that say what was skipped and why.
 
+The reason of a skip names what is missing and, behind an arrow, the command that brings it.
+"""
+
+import os
+import signal
+from collections import Counter
 from pathlib import Path
 
 import pytest
+
+# Tensors are small here, and threads that wait by spinning slow every test that runs beside them.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import torch
 from tiny import make_busy_recipe, make_scene
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.cli.app import run
+from polarguide.options import SceneOptions, SessionOptions
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 
 torch.set_num_threads(1)
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as a shell starts what runs in its background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 STEPS = 40
 SHORT = ("--downscale", "4", "--steps", str(STEPS), "--threads", "1")
@@ -27,7 +41,13 @@ def demo_scene() -> Path:
 def trained(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder. Tests read it and leave it as it is."""
     out = tmp_path_factory.mktemp("trained") / "run"
-    assert run(["train", str(demo_scene), "--out", str(out), *SHORT]) == 0
+    polarguide.train(
+        demo_scene,
+        out,
+        settings=TrainSettings(STEPS),
+        reading=SceneOptions(downscale=4),
+        session=SessionOptions(threads=1),
+    )
     return out
 
 
@@ -45,3 +65,20 @@ def tiny_scene() -> Scene:
 @pytest.fixture
 def busy_recipe() -> Recipe:
     return make_busy_recipe()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """What was skipped, by reason, the most frequent first."""
+    reasons = Counter(skip_reason(report) for report in terminalreporter.stats.get("skipped", ()))
+    if reasons:
+        terminalreporter.section("skipped, and the command that changes it")
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count} skipped: {reason}")
+
+
+def skip_reason(report: pytest.TestReport | pytest.CollectReport) -> str:
+    """The reason of a skip, with the command for a package that could not be imported."""
+    assert isinstance(report.longrepr, tuple)
+    reason = str(report.longrepr[2]).removeprefix("Skipped: ")
+    lacking = reason.startswith("could not import") and " -> " not in reason
+    return f"{reason} -> pip install '.[test]'" if lacking else reason

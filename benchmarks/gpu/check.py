@@ -235,9 +235,9 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         lines.append("| share outside rasterizer, SSIM, optimizer | " + " | ".join(shares) + " |")
     for part in ("train-demo", "train-spheres", "train-long"):
         if found := results[part]:
-            told = f"{found['steps']:,} of {found['of']:,} steps in {found['minutes']:.1f} minutes"
+            progress = f"{found['steps']:,} of {found['of']:,} steps in {found['minutes']:.1f} minutes"
             lines.append(
-                f"\n{part}: {told}, {found['gaussians']:,} Gaussians, PSNR {number(found['psnr'])} dB"
+                f"\n{part}: {progress}, {found['gaussians']:,} Gaussians, PSNR {number(found['psnr'])} dB"
             )
     return "\n".join(lines)
 

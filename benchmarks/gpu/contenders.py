@@ -12,9 +12,9 @@ from torch import Tensor
 from polarguide.capture import Scene
 from polarguide.color import srgb_encode
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
-from polarguide.raster import Backend
+from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
-from polarguide.shading.deferred import render
+from polarguide.shading.gbuffer import render
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
@@ -31,12 +31,12 @@ def steady(name: str) -> Recipe:
 
 
 def split_to(state: TrainingState, count: int, seed: int = 0) -> dict[str, Tensor]:
-    """Rows of ``count`` Gaussians: each of a trained state many times, drawn from itself and smaller by as much."""
-    rows, generator = state.gaussians.snapshot(), torch.Generator().manual_seed(seed)
-    present = len(rows["means"])
+    """Parameters of ``count`` Gaussians: many smaller copies of those of a trained state, drawn from each."""
+    parameters, generator = state.gaussians.snapshot(), torch.Generator().manual_seed(seed)
+    present = len(parameters["means"])
     pick = torch.arange(count) % present
     copies = count / present
-    chosen = {name: t[pick.to(t.device)] for name, t in rows.items()}
+    chosen = {name: t[pick.to(t.device)] for name, t in parameters.items()}
     drawn = torch.randn(count, 3, generator=generator).to(chosen["means"])
     # On flat Gaussians, so that a surface stays one: less far along the shortest axis would be no different.
     chosen["means"] = chosen["means"] + 0.5 * drawn * chosen["log_scales"].exp()
@@ -54,25 +54,23 @@ class Ours:
         self.stage = self.trainer.schedule.at(BEGIN).stage
         assert self.stage.reflection
         assert self.stage.densify
-        self._shading = recipe.shading(1.5)
         self._turn = 0
 
     def forward(self) -> None:
         """What a step renders."""
         trainer, state = self.trainer, self.trainer.state
-        assert state.environment is not None
         render(
             state.gaussians,
             trainer._view_of(state.step + self._next()).camera,
             trainer.backend.rasterize,
-            environment=state.environment.parameters,
-            shading=self._shading,
+            shading=trainer.shading,
+            light=state.light,
             depth=True,
         )
 
     def look(self) -> None:
         """Forward and backward, with all losses."""
-        self.trainer._look(self._next(), self.stage, True)
+        self.trainer._backpropagate(self._next(), self.stage, True)
 
     def step(self) -> None:
         """A whole step."""
@@ -83,40 +81,34 @@ class Ours:
         """A picture of a trained scene: the final one, or all layers."""
         trainer, state = self.trainer, self.trainer.state
         view = trainer._view_of(state.step + self._next())
-        environment = state.environment.parameters if state.environment else None
-        rasterize, shading = trainer.backend.rasterize, self._shading
         render(
             state.gaussians,
             view.camera,
-            rasterize,
-            environment=environment,
-            shading=shading,
+            trainer.backend.rasterize,
+            shading=trainer.shading,
+            light=state.light,
             normals=layers,
             depth=layers,
         )
 
     def parts(self) -> dict[str, Any]:
         """The rasterizer, SSIM and the optimizer of a step by themselves, as calls."""
-        trainer, rows = self.trainer, self.trainer.state.gaussians
+        trainer, gaussians = self.trainer, self.trainer.state.gaussians
         view = trainer._view_of(trainer.state.step)
-        leaves = [
-            rows["means"],
-            rows["quaternions"],
-            rows["log_scales"].exp(),
-            torch.sigmoid(rows["opacity_logits"]),
-        ]
-        leaves = [t.detach().requires_grad_() for t in leaves]
-        features = torch.rand(len(rows), 8, device=leaves[0].device).requires_grad_()
+        inputs = Splats(
+            gaussians["means"],
+            gaussians["quaternions"],
+            gaussians["log_scales"].exp(),
+            torch.sigmoid(gaussians["opacity_logits"]),
+            torch.rand(len(gaussians), 8, device=gaussians["means"].device),
+        )
+        splats = Splats(*(t.detach().requires_grad_() for t in inputs))
         shown = trainer._shown_photograph(view).picture
         prediction = shown.clone().requires_grad_()
 
         def raster() -> None:
-            from polarguide.raster import ScreenStatistic
-
-            picture = trainer.backend.rasterize(
-                *leaves, features, view.camera, statistic=ScreenStatistic((0, 1, 2))
-            )
-            torch.autograd.grad((picture.features.sum() + picture.alpha.sum()), (*leaves, features))
+            picture = trainer.backend.rasterize(splats, view.camera, statistic=ScreenStatistic((0, 1, 2)))
+            torch.autograd.grad((picture.features.sum() + picture.alpha.sum()), splats)
 
         def ssim() -> None:
             weights = self.stage.weights
@@ -124,7 +116,7 @@ class Ours:
                 torch.autograd.grad(photometric_loss(prediction, shown), prediction)
 
         def optimizer() -> None:
-            for t in rows.trained():
+            for t in gaussians.trained():
                 t.grad = torch.zeros_like(t)
             trainer._optimize()
 
@@ -138,32 +130,30 @@ class Ours:
 class Plain:
     """Plain 3D Gaussian splatting by gsplat's own ``rasterization``, harmonics included."""
 
-    def __init__(self, scene: Scene, rows: dict[str, Tensor], device: torch.device) -> None:
+    def __init__(self, scene: Scene, parameters: dict[str, Tensor], device: torch.device) -> None:
         self._gsplat = importlib.import_module("gsplat")
         rates = RECIPES["3dgs"].rates
-        self.rows = Gaussians({name: rows[name] for name in CORE_SHAPES}, rates)
+        self.gaussians = Gaussians({name: parameters[name] for name in CORE_SHAPES}, rates)
         self._views = []
         for view in scene.train_views:
-            camera, matrix = view.camera, torch.eye(4, dtype=torch.float64)
-            matrix[:3, :3], matrix[:3, 3] = camera.rotation, camera.translation
-            intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+            camera = view.camera
             shown = srgb_encode(view.photograph().clamp(0, 1)).to(device)
-            poses = (t[None].to(device, torch.float32) for t in (matrix, intrinsics))
+            poses = (t[None].to(device, torch.float32) for t in (camera.world_to_camera, camera.intrinsics))
             self._views.append((*poses, camera.width, camera.height, shown))
-        self._pull = torch.zeros(len(self.rows), device=device)
+        self._pull = torch.zeros(len(self.gaussians), device=device)
         self._turn = 0
 
     def forward(self) -> tuple[Tensor, dict[str, Any], Tensor]:
-        """A picture, what gsplat tells of it, and the photograph."""
+        """A picture, what gsplat reports about it, and the photograph."""
         self._turn = (self._turn + 1) % len(self._views)
         viewmat, intrinsics, width, height, shown = self._views[self._turn]
-        rows = self.rows
-        picture, _, told = self._gsplat.rasterization(
-            rows["means"],
-            rows["quaternions"],
-            rows["log_scales"].exp(),
-            torch.sigmoid(rows["opacity_logits"]),
-            torch.cat((rows["sh_dc"][:, None], rows["sh_rest"]), dim=1),
+        gaussians = self.gaussians
+        picture, _, details = self._gsplat.rasterization(
+            gaussians["means"],
+            gaussians["quaternions"],
+            gaussians["log_scales"].exp(),
+            torch.sigmoid(gaussians["opacity_logits"]),
+            torch.cat((gaussians["sh_dc"][:, None], gaussians["sh_rest"]), dim=1),
             viewmat,
             intrinsics,
             width,
@@ -171,19 +161,19 @@ class Plain:
             sh_degree=3,
             packed=False,
         )
-        return picture[0], told, shown
+        return picture[0], details, shown
 
     def look(self) -> None:
         """Forward and backward, and the statistic of the density control."""
-        picture, told, shown = self.forward()
-        told["means2d"].retain_grad()
+        picture, details, shown = self.forward()
+        details["means2d"].retain_grad()
         photometric_loss(picture, shown).backward()
-        self._pull += told["means2d"].grad[0].norm(dim=-1)
+        self._pull += details["means2d"].grad[0].norm(dim=-1)
 
     def step(self) -> None:
         """A whole step."""
         self.look()
-        self.rows.step()
+        self.gaussians.step()
 
     @torch.no_grad()
     def frame(self) -> None:

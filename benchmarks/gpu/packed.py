@@ -16,7 +16,7 @@ SUFFIX = ".scene.npz"
 
 
 def save_scene(scene: Scene, path: Path) -> None:
-    """Write a scene without its truth. Pictures are kept exactly, as differences along rows."""
+    """Write a scene without its ground truth. Pictures are kept exactly, as differences along rows."""
     arrays: dict[str, Any] = {
         "points": scene.points.numpy(),
         "point_colors": scene.point_colors.numpy(),

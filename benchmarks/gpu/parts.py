@@ -28,7 +28,7 @@ from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
-from polarguide.shading.deferred import render
+from polarguide.shading.gbuffer import render
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer, TrainSettings
 
@@ -91,12 +91,10 @@ def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
 @torch.no_grad()
 def mean_psnr(scene: Scene, state: TrainingState, backend: Backend) -> float:
     """Mean over the test views, in decibels."""
-    environment, values = state.environment, []
+    shading, values = RECIPE.shading.bind(1.5), []
     for view in scene.test_views:
-        light = environment.parameters if environment else None
-        shading = RECIPE.shading(1.5)
         picture = render(
-            state.gaussians, view.camera, backend.rasterize, environment=light, shading=shading
+            state.gaussians, view.camera, backend.rasterize, shading=shading, light=state.light
         ).final
         values.append(psnr(picture, view.photograph(), ~view.invalid))
     return sum(values) / len(values)
@@ -112,7 +110,7 @@ def bench(job: Job, scene: Scene, state: TrainingState) -> dict[str, Any]:
     """Ours against plain gsplat on the same Gaussians."""
     device, few = job.backend.device, job.tiny
     repeats, warm_up = (2, 1) if few else (40, max(10, len(scene.train_views) + 2))
-    begin_rows = state.gaussians.snapshot()
+    initial = state.gaussians.snapshot()
 
     def timed(call: Callable[[], object]) -> float:
         return milliseconds(call, device, repeats=repeats, warm_up=warm_up)
@@ -136,7 +134,7 @@ def bench(job: Job, scene: Scene, state: TrainingState) -> dict[str, Any]:
     if device.type != "cuda" or not has_gsplat():
         found["plain"] = None
         return found
-    plain = Plain(scene, begin_rows, device)
+    plain = Plain(scene, initial, device)
     forward, look, whole = timed(plain.forward), timed(plain.look), timed(plain.step)
     found["plain"] = {
         "forward_ms": forward,
@@ -174,8 +172,8 @@ def stress(job: Job) -> dict[str, Any]:
     """A million Gaussians at 1224 x 1024."""
     count, size = (20_000, (160, 128)) if job.tiny else (1_000_000, (1224, 1024))
     state = trained(job, "spheres")
-    rows = Gaussians(split_to(state, count), RECIPE.rates)
-    state = TrainingState(0, rows, state.environment, DensityStatistics(count, 1, job.backend.device))
+    gaussians = Gaussians(split_to(state, count), RECIPE.rates)
+    state = TrainingState(0, gaussians, state.environment, DensityStatistics(count, 1, job.backend.device))
     return bench(job, enlarged(job.scene("spheres"), *size, views=8), state)
 
 

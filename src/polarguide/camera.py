@@ -10,10 +10,13 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from polarguide.vectors import unit
+from polarguide.vectors import unit, unit_array
 
 
 @lru_cache(maxsize=4)
@@ -70,6 +73,19 @@ class Camera:
         """Camera center in the world, [3] float64."""
         return -self.rotation.T @ self.translation
 
+    @property
+    def intrinsics(self) -> Tensor:
+        """Focal lengths and principal point as a matrix, [3, 3] float64."""
+        matrix = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(matrix, dtype=torch.float64)
+
+    @property
+    def world_to_camera(self) -> Tensor:
+        """The pose as a matrix, [4, 4] float64."""
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
+        return matrix
+
     def pose(self, dtype: torch.dtype, device: torch.device) -> Pose:
         """The pose on a device, not to be written to. It is kept, so that a second rendering copies nothing there."""
         poses: dict[tuple[torch.dtype, torch.device], Pose] = self.__dict__.setdefault("_poses", {})
@@ -106,3 +122,27 @@ class Camera:
             cx=self.cx / factor,
             cy=self.cy / factor,
         )
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> tuple[Tensor, Tensor]:
+    """The pose of a camera that looks at a point.
+
+    Args:
+        eye: [3] center of the camera in the world.
+        target: [3] point on the optical axis, not ``eye``.
+        up: [3] direction that is upward in the picture, not parallel to the optical axis.
+
+    Returns:
+        World-to-camera rotation [3, 3] and translation [3], float64.
+    """
+    center = np.asarray(eye, np.float64)
+    forward = unit_array(np.asarray(target, np.float64) - center)
+    right = unit_array(np.cross(forward, np.asarray(up, np.float64)))
+    rotation = np.stack((right, np.cross(forward, right), forward))
+    return torch.from_numpy(rotation), torch.from_numpy(-rotation @ center)
+
+
+def quaternion(rotation: ArrayLike) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) of a rotation matrix [3, 3]; its sign is either."""
+    x, y, z, w = Rotation.from_matrix(np.asarray(rotation)).as_quat().tolist()
+    return w, x, y, z

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,7 +34,7 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
     Raises:
         PolarguideError: the file cannot be read, or ``decode`` refuses it.
     """
-    return decode(read_file(path), kind, path, remedy=remedy)
+    return decode(read_file(path, remedy=remedy), kind, path, remedy=remedy)
 
 
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:
@@ -54,7 +56,10 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         record = msgspec.convert(value, kind)
         _require_finite(msgspec.to_builtins(record, enc_hook=str), where, remedy)
     except msgspec.ValidationError as error:
-        raise _fault(str(error), value, kind, where, remedy) from None
+        field, expected, found = _fault(str(error), value, kind)
+        raise PolarguideError(
+            f"{where} ({field})" if field else where, expected=expected, found=found, remedy=remedy
+        ) from None
     except (ValueError, RecursionError) as error:
         raise PolarguideError(
             where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
@@ -62,13 +67,40 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
     return record
 
 
+def option_name(field: str) -> str:
+    """The command line's option that sets a field."""
+    return "--" + field.replace("_", "-")
+
+
+def check_options(options: Any, name: Callable[[str], str] = option_name) -> None:
+    """Check the values of a dataclass against its annotations.
+
+    Args:
+        options: the dataclass. name: what messages call a field.
+
+    Raises:
+        PolarguideError: one has another type or is out of range.
+    """
+    remedy = "Correct the value."
+    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    for field, value in values.items():
+        _require_finite(value, name(field), remedy)
+    try:
+        msgspec.convert(values, type(options), dec_hook=lambda kind, value: kind(value))
+    except msgspec.ValidationError as error:
+        field, expected, found = _fault(str(error), values, type(options))
+        raise PolarguideError(
+            name(field.partition("[")[0]), expected=expected, found=found, remedy=remedy
+        ) from None
+
+
 def to_json(content: Any) -> bytes:
     """A record as the text of a JSON file."""
     return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
 
 
-def _fault(message: str, value: Any, kind: Any, where: object, remedy: str) -> PolarguideError:
-    """msgspec's message in plain words, with the value at its path."""
+def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
+    """Field, what was expected there and what was found, from a message of msgspec's."""
     what, _, path = message.partition(" - at `$")
     what, _, got = what.partition(", got ")
     path = path.rstrip("`")
@@ -89,10 +121,11 @@ def _fault(message: str, value: Any, kind: Any, where: object, remedy: str) -> P
     elif what.startswith("Number out of range"):
         expected = "a number of usual size"
     elif what.startswith("Invalid enum value"):
-        expected = " or ".join(str(choice) for choice in _choices(form))
-    return PolarguideError(
-        f"{where} ({field})" if field else where, expected=expected, found=found, remedy=remedy
-    )
+        *others, last = map(str, _choices(form))
+        expected = f"{', '.join(others)} or {last}" if others else last
+    elif _limits(form) and not got:
+        expected = _limits(form)
+    return field, expected, found
 
 
 def shortened(value: Any, most: int = 100) -> str:
@@ -137,6 +170,20 @@ def _names(form: Any) -> list[str]:
 def _choices(form: Any) -> list[Any]:
     options = getattr(form, "types", (form,))
     return [choice for option in options for choice in getattr(option, "values", ())]
+
+
+def _limits(form: Any) -> str:
+    """The range of a number in words; empty where there is none."""
+    for option in getattr(form, "types", (form,)):
+        least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
+        if least is not None and most is not None:
+            return f"{least:.10g} to {most:.10g}"
+        words = (
+            (least, "{:.10g} or more"), (above, "above {:.10g}"), (most, "up to {:.10g}"), (below, "below {:.10g}"),
+        )  # fmt: skip
+        if any(limit is not None for limit, _ in words):
+            return " and ".join(text.format(limit) for limit, text in words if limit is not None)
+    return ""
 
 
 def _plain(text: str) -> str:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -17,3 +21,9 @@ def unit(vectors: Tensor, floor: float = 1e-6) -> Tensor:
     """Vectors [..., 3] divided by their length, or by ``floor`` where they are shorter; no NaN at zero."""
     squared = dot(vectors, vectors)
     return vectors * torch.rsqrt(squared.clamp(min=floor * floor))[..., None]
+
+
+def unit_array(vectors: NDArray[Any]) -> NDArray[np.float64]:
+    """``unit`` for NumPy arrays: vectors [..., 3] divided by their length; zero stays zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, 1e-300))

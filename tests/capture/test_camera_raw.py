@@ -16,7 +16,8 @@ from polarguide.capture.filter import camera_raw
 from polarguide.capture.filter.camera_raw import read_camera_raw
 from polarguide.capture.filter.exif import apply_orientation
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 PLAIN = PrepareSettings(poses="none", gains="none", align=False)
 UNIT = (1.0, 1.0, 1.0)

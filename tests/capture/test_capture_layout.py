@@ -11,6 +11,7 @@ from tiny_capture import TinyCapture, write_picture
 
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
+from polarguide.polarizer import ANGLES
 
 
 @pytest.mark.parametrize(
@@ -103,7 +104,7 @@ def test_files_that_are_passed_over_are_reported_once(capture: TinyCapture) -> N
 
 
 def test_view_names_may_contain_underscores_and_digits(capture: TinyCapture) -> None:
-    for angle in (0, 45, 90, 135):
+    for angle in ANGLES:
         capture.picture("v000", angle).rename(capture.picture("left_090", angle))
     images = capture.root / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text().replace("v000.png", "cam/left_090.jpeg"))

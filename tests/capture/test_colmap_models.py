@@ -13,6 +13,7 @@ from tiny_capture import NAMES, TinyCapture
 
 from polarguide.capture import load_scene, read_model
 from polarguide.errors import PolarguideError
+from polarguide.polarizer import ANGLES
 
 
 def model_folder(capture: TinyCapture) -> Path:
@@ -193,7 +194,7 @@ def test_picture_without_a_pose(capture: TinyCapture) -> None:
 
 
 def test_two_poses_of_one_name(capture: TinyCapture) -> None:
-    for angle in (0, 45, 90, 135):
+    for angle in ANGLES:
         capture.picture("v004", angle).unlink()
     edit(model_folder(capture) / "images.txt", "v004.png", "left/v005.jpg")
     fails(capture.root, "one posed image called v005", "found left/v005.jpg, v005.png")
@@ -201,7 +202,7 @@ def test_two_poses_of_one_name(capture: TinyCapture) -> None:
 
 def test_pose_without_pictures(capture: TinyCapture) -> None:
     for view in ("v002", "v006"):
-        for angle in (0, 45, 90, 135):
+        for angle in ANGLES:
             capture.picture(view, angle).unlink()
     scene = load_scene(capture.root)
     assert len(scene.views) == 7

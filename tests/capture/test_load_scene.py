@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from heard import Heard
 from tiny_capture import NAMES, TinyCapture
 
 from polarguide.capture import load_scene
@@ -136,9 +137,9 @@ def test_invalid_pixels_come_from_the_file_alone(capture: TinyCapture) -> None:
 
 
 def test_progress_counts_the_views(capture: TinyCapture) -> None:
-    calls: list[tuple[int, int]] = []
-    load_scene(capture.root, progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(done, 9) for done in range(1, 10)]
+    heard = Heard()
+    load_scene(capture.root, reporter=heard)
+    assert heard.tracked == [("reading tiny", 9, list(range(1, 10)))]
 
 
 def test_digest_follows_contents_and_names_but_not_the_place(capture: TinyCapture, tmp_path: Path) -> None:
@@ -189,12 +190,12 @@ def test_arguments_out_of_range(capture: TinyCapture, arguments: dict[str, objec
     [
         ("split.json", "{", r"split.json: expected a JSON file, found broken JSON"),
         ("split.json", "[]", r"split.json: expected a JSON object \{...\}, found \[\]"),
-        ("split.json", '{"tests": []}', r"split.json: expected \{\"test\".*found the keys tests"),
-        ("split.json", '{"test": [3]}', r"split.json: expected \{\"test\".*found"),
+        ("split.json", '{"tests": []}', r"split.json: expected the field test, found only tests\."),
+        ("split.json", '{"test": [3]}', r"split.json \(test\[0\]\): expected text, found 3.*\{\"test\""),
         ("split.json", '{"test": ["v000", "v0010"]}', r"split.json \(test\).*found 'v0010'.*v001"),
         ("scene.json", '{"refractive_index": 0.5}', r"scene.json \(refractive_index\).*above 1.*found 0.5"),
-        ("scene.json", '{"refractive_index": "glass"}', "found 'glass'"),
-        ("scene.json", '{"refractive_index": true}', "found True"),
+        ("scene.json", '{"refractive_index": "glass"}', 'found "glass"'),
+        ("scene.json", '{"refractive_index": true}', "a number or null, found true"),
         ("scene.json", "\ufeff\ufeff", "broken JSON"),
     ],
 )

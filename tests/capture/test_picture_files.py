@@ -19,6 +19,7 @@ from polarguide.capture import load_scene
 from polarguide.capture.formats.integrity import find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
 from polarguide.errors import PolarguideError
+from polarguide.polarizer import ANGLES
 
 tifffile = pytest.importorskip("tifffile", reason="tifffile writes the unusual TIFF files")
 
@@ -201,7 +202,7 @@ def test_a_folder_in_place_of_a_picture(capture: TinyCapture) -> None:
 
 
 def test_floating_point_pictures(capture: TinyCapture) -> None:
-    for angle in (0, 45, 90, 135):
+    for angle in ANGLES:
         capture.picture("v001", angle).unlink()
         path = capture.picture("v001", angle, ".tif")
         assert cv2.imwrite(str(path), np.zeros((10, 12, 3), np.float32))

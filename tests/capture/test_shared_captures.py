@@ -17,7 +17,7 @@ DEMO = Path(polarguide.__file__).parent / "data" / "demo"
 def shared(name: str) -> Path:
     path = SHARED / name
     if not path.is_dir():
-        pytest.skip(f"{name} is not beside the checkout (../shared)")
+        pytest.skip("no captures in ../shared -> ln -s FOLDER ../shared")
     return path
 
 

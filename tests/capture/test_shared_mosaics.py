@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from camera_files import read_invalid, read_polar
 
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 FOLDER = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "mosaic_mono"
 SETTINGS = PrepareSettings(sensor="IMX250MZR", poses="none")
 
 pytestmark = [
     pytest.mark.shared,
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="the mosaics are not beside the checkout (../shared)"),
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="no captures in ../shared -> ln -s FOLDER ../shared"),
 ]
 
 

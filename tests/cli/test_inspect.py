@@ -58,7 +58,7 @@ def inspected(root: Path, out: Path, *more: str) -> tuple[dict, str]:
 def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record, page = inspected(unposed, tmp_path / "out")
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
-    assert record["schema"] == 1
+    assert record["schema"] == 2
     assert record["scene"]["posed_views"] == 0
     for key in ("poses", "coverage", "angle_order", "handedness", "zero_offset"):
         assert verdicts.pop(key) == "n/a"
@@ -122,7 +122,7 @@ def test_fix_refuses_what_is_not_decided(
         (["--steps", "0"], "--steps"),
         (["--downscale", "-1"], "--downscale"),
         (["--refractive-index", "0.9"], "--refractive-index"),
-        (["--threads", "-1"], "--threads"),
+        (["--threads", "-1"], "threads"),
         (["--downscale", "5000"], "downscale"),
     ],
 )

@@ -11,7 +11,6 @@ import pytest
 
 from polarguide.cli.app import run
 
-ANGLES = (0, 45, 90, 135)
 CELL = ((90, 45), (135, 0))
 
 
@@ -61,8 +60,8 @@ def test_mosaics_to_a_trained_scene(
         ([], "--sensor: expected the sensor of raw mosaics"),
         (["--sensor", "IMX250MYR", "--order", "0,90"], "--order: expected four angles such as 90,45,0,135"),
         (["--sensor", "IMX250MYR", "--calibration", "none.json"], "none.json: expected a readable file"),
-        (["--sensor", "IMX250MYR", "--zero", "nan"], "expected a finite number of degrees"),
-        (["--sensor", "IMX250MYR", "--poses", "none", "--threads", "-1"], "--threads"),
+        (["--sensor", "IMX250MYR", "--zero", "nan"], "calibration (zero): expected a finite number"),
+        (["--sensor", "IMX250MYR", "--poses", "none", "--threads", "-1"], "threads"),
     ],
 )
 def test_one_line_for_a_mistake(

@@ -1,7 +1,6 @@
 """Exported splats read by a program that is not ours: PlayCanvas' ``splat-transform`` turns them into a PLY again.
 
-``npm install @playcanvas/splat-transform`` anywhere; its ``node_modules/.bin`` on the PATH, or named by
-``SPLAT_TRANSFORM``.
+``make test`` installs it where npm is; another one is found on the PATH, or named by ``SPLAT_TRANSFORM``.
 """
 
 from __future__ import annotations
@@ -18,9 +17,13 @@ from scipy.spatial import cKDTree
 from polarguide.cli.app import run
 from polarguide.gaussians.ply import read_ply
 
-PROGRAM = shutil.which(os.environ.get("SPLAT_TRANSFORM", "splat-transform"))
+PLACES = (
+    str(Path(__file__).resolve().parents[2] / "build/node/node_modules/.bin"),
+    os.environ.get("PATH", ""),
+)
+PROGRAM = shutil.which(os.environ.get("SPLAT_TRANSFORM", "splat-transform"), path=os.pathsep.join(PLACES))
 pytestmark = [
-    pytest.mark.skipif(PROGRAM is None, reason="splat-transform is not installed"),
+    pytest.mark.skipif(PROGRAM is None, reason="no splat-transform -> apt-get install nodejs npm; make test"),
     pytest.mark.slow,
 ]
 # Largest error of the median Gaussian. Harmonics have 4 bits in SPZ (steps of 1/8), and come from a palette in SOG.

@@ -8,7 +8,20 @@ import pytest
 import torch
 
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import ViewTarget, metrics, record, scores
+from polarguide.evaluation import ViewTarget, metrics, record, scores, table
+from polarguide.evaluation.table import HIGHEST_PSNR, VIEW_METRICS
+
+VIEW_KEYS = {metric.key for metric in VIEW_METRICS}
+AGAINST_GROUND_TRUTH = (
+    "psnr_foreground",
+    "psnr_reflective",
+    "normal_mae_deg",
+    "normal_within_11",
+    "specular_psnr",
+    "diffuse_psnr",
+    "specular_psnr_aligned",
+    "diffuse_psnr_aligned",
+)
 
 PROVENANCE = {
     "recipe": "polarguide",
@@ -69,12 +82,12 @@ def test_every_key_has_its_definition():
         "specular_psnr": metrics.decibels(
             float(metrics.layer_error(rendered.specular, ground_truth.specular, ground_truth.mask))
         ),
-        "specular_psnr_aligned": scores.PERFECT_PSNR,
-        "diffuse_psnr": scores.PERFECT_PSNR,
-        "diffuse_psnr_aligned": scores.PERFECT_PSNR,
+        "specular_psnr_aligned": HIGHEST_PSNR,
+        "diffuse_psnr": HIGHEST_PSNR,
+        "diffuse_psnr_aligned": HIGHEST_PSNR,
     }
     assert {key: got[key] for key in expected} == pytest.approx(expected)
-    assert set(got) == {*scores.MEAN_KEYS, "lpips_reason"}
+    assert set(got) == {*VIEW_KEYS, "lpips_reason"}
     assert len({round(expected[key], 6) for key in list(expected)[:7]}) == 7
 
 
@@ -95,8 +108,10 @@ def test_invalid_pixels_count_in_no_score():
 def test_what_is_missing_is_none():
     photograph, ground_truth = scene()
     plain = SimpleNamespace(final=photograph * 0.9, normal=None, specular=None, diffuse=None)
-    without_truth = score(photograph, None, None, plain)
-    assert {k for k in scores.MEAN_KEYS if without_truth[k] is not None} <= {"psnr", "ssim", "lpips"}
+    without_ground_truth = score(photograph, None, None, plain)
+    assert without_ground_truth["psnr"] is not None
+    for key in AGAINST_GROUND_TRUTH:
+        assert without_ground_truth[key] is None
     without_layers = score(photograph, None, ground_truth, plain)
     assert without_layers["psnr_reflective"] is not None
     for key in ("normal_mae_deg", "normal_within_11", "specular_psnr", "diffuse_psnr_aligned"):
@@ -189,7 +204,7 @@ def test_failed_write_leaves_the_old_file(tmp_path, views):
     path = tmp_path / "metrics.json"
     path.write_text("old")
     with pytest.raises(TypeError):
-        record.write_metrics(path, views=views, run={}, provenance={**PROVENANCE, "seed": object()})
+        record.write_metrics(path, views=views, run={}, provenance={**PROVENANCE, "note": object()})
     assert path.read_text() == "old"
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -205,26 +220,55 @@ def set_at(tree, path, value):
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "message"),
+    ("path", "value", "place", "expected", "found"),
     [
-        (("psnr",), KeyError, "m.json: psnr: expected a finite number or null, found 'no such key'"),
-        (("psnr",), math.inf, "m.json: psnr: expected a finite number or null, found inf"),
-        (("psnr",), 101.0, "m.json: psnr: expected at most 100.0 dB"),
-        (("fps",), "fast", "m.json: fps: expected a finite number or null, found 'fast'"),
-        (("steps",), True, "m.json: steps: expected a finite number or null, found True"),
-        (("views",), {}, "m.json: views: expected an object with at least one view"),
-        (("views", "v1"), 3, "m.json: views.v1: expected an object, found 3"),
-        (("views", "v2", "ssim"), KeyError, "m.json: views.v2: ssim"),
-        (("views", "v2", "lpips_reason"), None, "m.json: views.v2: lpips_reason: expected a reason"),
-        (("provenance", "seed"), KeyError, "m.json: provenance.seed: expected a value"),
-        (("provenance",), None, "m.json: provenance: expected an object, found None"),
+        (("psnr",), KeyError, "m.json", "the field psnr", ""),
+        (("psnr",), math.inf, "m.json (psnr)", "100", "Infinity"),
+        (("psnr",), 101.0, "m.json (psnr)", "100", "101.0"),
+        (("fps",), "fast", "m.json (fps)", "a number or null", '"fast"'),
+        (("fps",), math.nan, "m.json (fps)", "a finite number", "nan"),
+        (("steps",), True, "m.json (steps)", "a number or null", "true"),
+        (("views",), {}, "m.json (views)", "length >= 1", "{}"),
+        (("views", "v1"), 3, "m.json, view v1", "a JSON object", "3"),
+        (("views", "v2", "ssim"), KeyError, "m.json, view v2", "the field ssim", ""),
+        (("views", "v2", "ssim"), "x", "m.json, view v2 (ssim)", "a number or null", '"x"'),
+        (("views", "v2", "lpips_reason"), None, "m.json, view v2 (lpips_reason)", "a reason", "null"),
+        (("lpips_reason",), None, "m.json (lpips_reason)", "a reason", "null"),
+        (("provenance", "seed"), KeyError, "m.json (provenance)", "the field seed", ""),
+        (("provenance",), None, "m.json (provenance)", "a JSON object", "null"),
     ],
 )
-def test_schema_names_what_is_wrong(tmp_path, views, path, value, message):
+def test_schema_names_what_is_wrong(tmp_path, views, path, value, place, expected, found):
     for scored in views.values():
         scored.update(lpips=None, lpips_reason="not wanted here")
     good = record.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=dict(PROVENANCE))
     set_at(good, path, value)
     with pytest.raises(PolarguideError) as caught:
         record.validate_metrics(good, "m.json")
-    assert str(caught.value).startswith(message)
+    assert caught.value.where == place
+    assert expected in caught.value.expected
+    assert found in caught.value.found
+
+
+def test_a_record_is_read_from_its_run(tmp_path, views):
+    with pytest.raises(PolarguideError, match=r"metrics.json: expected the scores of a run, found none"):
+        record.read_metrics(tmp_path)
+    written = record.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=PROVENANCE)
+    assert record.read_metrics(tmp_path) == written
+    (tmp_path / "metrics.json").write_text(json.dumps(written | {"fps": math.nan}))
+    with pytest.raises(PolarguideError, match=r"metrics\.json"):
+        record.read_metrics(tmp_path)
+
+
+def test_shown_metrics_are_those_of_the_tables(views):
+    means = scores.summarize(views) | {"fps": 12.5, "gaussians": 1000, "normal_within_11": 0.25}
+    lines = table.shown_metrics(means)
+    assert [label for label, _ in lines] == [m.label for m in table.METRICS if m.shown == "tables"]
+    shown = dict(lines)
+    assert shown["PSNR"] == f"{means['psnr']:.3f} dB"
+    assert shown["normals within 11.25 deg"] == "0.250"
+    assert (shown["Gaussians"], shown["training"]) == ("1,000", "n/a")
+    assert shown["LPIPS"] == (f"n/a ({means['lpips_reason']})" if means["lpips"] is None else shown["LPIPS"])
+    only_scores = dict(table.shown_metrics(means | {"ssim": None}, scores_only=True))
+    assert not {"SSIM", "Gaussians", "FPS", "specular PSNR aligned"} & set(only_scores)
+    assert only_scores["PSNR"] == shown["PSNR"]

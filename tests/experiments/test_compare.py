@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 
 from polarguide.cli.app import run
+from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, plan_runs, scene_entries
 from polarguide.experiments.results import validate_results
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CHECKPOINT, LOG
-from polarguide.training.trainer import TrainSettings
+from polarguide.training.settings import TrainSettings
 
 pytestmark = pytest.mark.slow
 PATIENCE = 120.0
@@ -31,14 +32,7 @@ def planned_folders(scene: Path, out: Path) -> list[Path]:
         scenes=(scene,),
         recipes=(recipe_named("3dgs-dr"), recipe_named("3dgs")),
         settings=TrainSettings(200, 0),
-        seeds=1,
-        downscale=8,
-        transfer="linear",
-        device="auto",
-        jobs=1,
-        threads=1,
-        speed=False,
-        report_views=3,
+        options=CompareOptions(downscale=8),
         out=out,
     )
     return [planned.folder for planned in plan_runs(question, scene_entries(question))]

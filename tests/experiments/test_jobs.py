@@ -1,30 +1,36 @@
-"""Child processes, with a stand-in for the program that starts fast: failures stay alone, Ctrl-C loses nothing."""
+"""Child processes, with a stand-in for the worker that starts fast: failures stay alone, Ctrl-C loses nothing."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from polarguide.cli.job_progress import JobProgress, last_line
-from polarguide.experiments import jobs
-from polarguide.experiments.jobs import Child, Job, run_jobs
+from polarguide.cli.compare import signals_as_interrupts
+from polarguide.cli.job_progress import JobReporter
+from polarguide.experiments.jobs import Job, last_line, run_jobs
+from polarguide.experiments.worker import Scoring
+from polarguide.progress import Advance, Reporter
 
-# Says when it begins, does what its first word asks for, and says when it ends.
+# Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
 PROGRAM = """
-import pathlib, signal, sys, time
-verb, folder = sys.argv[1], pathlib.Path(sys.argv[2])
+import json, os, pathlib, signal, sys, time
+task = json.load(sys.stdin)
+verb, folder = task["device"], pathlib.Path(task["folder"])
 with open(folder / "did", "a") as did:
-    print(verb, *sys.argv[3:], file=did)
+    print(verb, task["threads"], os.environ["OMP_NUM_THREADS"], file=did)
 if verb == "fail":
-    print("a warning\\nerror: " + folder.name + " is broken.\\n", file=sys.stderr)
+    print("a warning\\n" + folder.name + " is broken.\\n", file=sys.stderr)
     sys.exit(2)
+if verb == "quiet":
+    sys.exit(3)
 if verb in ("wait", "deaf"):
     count = 0
     def asked(*_):
@@ -40,42 +46,64 @@ if verb in ("wait", "deaf"):
     sys.exit(130)
 time.sleep(0.2)
 """
+COMMAND = (sys.executable, "-S", "-c", PROGRAM)
 
 
 @pytest.fixture
-def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Job]:
+def job(tmp_path: Path) -> Callable[..., Job]:
     """Makes a job of the stand-in's verbs."""
-    monkeypatch.setattr(jobs, "PROGRAM", (sys.executable, "-S", "-c", PROGRAM))
 
     def make(name: str, *verbs: str) -> Job:
         folder = tmp_path / name
-        return Job(name, folder, tuple((verb, str(folder)) for verb in verbs), 10)
+        tasks = [Scoring(folder=str(folder), speed=False, device=verb, threads=3) for verb in verbs]  # type: ignore[arg-type]
+        return Job(name, folder, tuple(tasks), 10)
 
     return make
 
 
-class Watch:
-    """Notes what ``run_jobs`` reports."""
+class Watch(Reporter):
+    """Notes what ``run_jobs`` reports and calls something at each report."""
 
-    def __init__(self) -> None:
+    def __init__(self, at_report: Callable[[], None] = lambda: None) -> None:
         self.ended: dict[str, str | None] = {}
+        self.said: list[str] = []
+        self.open: set[str] = set()
         self.most = 0
+        self.overall: list[tuple[int, str]] = []
+        self._at_report = at_report
 
     def end(self, job: Job, error: str | None) -> None:
         self.ended[job.label] = error
 
-    def look(self, active: Sequence[Child]) -> None:
-        self.most = max(self.most, len(active))
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    @contextlib.contextmanager
+    def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
+        self.open.add(label)
+
+        def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+            assert label in self.open
+            self.most = max(self.most, len(self.open) - 1)
+            if label == "all":
+                self.overall.append((done, note))
+            self._at_report()
+
+        yield advance
+        self.open.remove(label)
 
 
 def test_a_failure_takes_no_other_job_down(job: Callable[..., Job]) -> None:
     watch = Watch()
-    todo = [job("a", "train", "eval"), job("b", "fail", "eval"), job("c", "train")]
-    run_jobs(todo, parallel=2, threads=3, on_end=watch.end, on_look=watch.look)
-    assert watch.ended == {"a": None, "b": "b is broken.", "c": None}
+    todo = [job("a", "train", "eval"), job("b", "fail", "eval"), job("c", "quiet")]
+    run_jobs(todo, parallel=2, reporter=watch, on_end=watch.end, command=COMMAND)
+    assert watch.ended == {"a": None, "b": "b is broken.", "c": "the process ended with status 3"}
+    assert set(watch.said) == {"done  a", "failed  b: b is broken.", f"failed  c: {watch.ended['c']}"}
     assert watch.most == 2
+    assert watch.open == set()
+    assert watch.overall[-1] == (30, "3/3 runs")
     did = [(j.folder / "did").read_text().split("\n")[:-1] for j in todo]
-    assert did == [["train --threads 3", "eval --threads 3"], ["fail --threads 3"], ["train --threads 3"]]
+    assert did == [["train 3 3", "eval 3 3"], ["fail 3 3"], ["quiet 3 3"]]
 
 
 def interrupt_when(ready: Callable[[], bool], times: int = 1) -> threading.Thread:
@@ -98,7 +126,7 @@ def test_ctrl_c_asks_every_child_once_and_waits(job: Callable[..., Job]) -> None
     watch, todo = Watch(), [job("a", "wait"), job("b", "wait"), job("c", "wait")]
     thread = interrupt_when(lambda: all((j.folder / "ready").exists() for j in todo[:2]))
     with pytest.raises(KeyboardInterrupt):
-        run_jobs(todo, parallel=2, threads=1, on_end=watch.end, on_look=watch.look)
+        run_jobs(todo, parallel=2, reporter=watch, on_end=watch.end, command=COMMAND)
     assert [(j.folder / "asked").read_text() for j in todo[:2]] == ["1", "1"]
     assert not todo[2].folder.exists()
     assert watch.ended == {}
@@ -106,28 +134,49 @@ def test_ctrl_c_asks_every_child_once_and_waits(job: Callable[..., Job]) -> None
 
 
 def test_a_second_ctrl_c_does_not_wait(job: Callable[..., Job]) -> None:
-    watch, deaf = Watch(), job("a", "deaf")
+    deaf = job("a", "deaf")
     begin = time.monotonic()
     thread = interrupt_when((deaf.folder / "ready").exists, times=2)
     with pytest.raises(KeyboardInterrupt):
-        run_jobs([deaf], parallel=1, threads=1, on_end=watch.end, on_look=watch.look)
+        run_jobs([deaf], parallel=1, reporter=Watch(), command=COMMAND)
     assert time.monotonic() - begin < 20
     assert not (deaf.folder / "asked").exists()
     thread.join()
 
 
-def test_sigterm_acts_like_ctrl_c_and_its_handler_is_put_back(job: Callable[..., Job]) -> None:
-    watch, before = Watch(), signal.getsignal(signal.SIGTERM)
+def test_an_error_of_the_reporter_leaves_no_child_at_work(job: Callable[..., Job]) -> None:
+    waiting = job("a", "wait")
 
-    def look(active: Sequence[Child]) -> None:
-        if active and (active[0].job.folder / "ready").exists():
+    def fail() -> None:
+        if (waiting.folder / "ready").exists():
+            raise RuntimeError("no display")
+
+    with pytest.raises(RuntimeError, match="no display"):
+        run_jobs([waiting], parallel=1, reporter=Watch(fail), command=COMMAND)
+    assert (waiting.folder / "asked").read_text() == "1"
+
+
+def test_sigterm_acts_like_ctrl_c_and_its_handler_is_put_back(job: Callable[..., Job]) -> None:
+    before, waiting = signal.getsignal(signal.SIGTERM), job("a", "wait")
+
+    def terminate() -> None:
+        if (waiting.folder / "ready").exists():
             os.kill(os.getpid(), signal.SIGTERM)
 
-    waiting = job("a", "wait")
-    with pytest.raises(KeyboardInterrupt):
-        run_jobs([waiting], parallel=1, threads=1, on_end=watch.end, on_look=look)
+    with pytest.raises(KeyboardInterrupt), signals_as_interrupts():
+        run_jobs([waiting], parallel=1, reporter=Watch(terminate), command=COMMAND)
     assert (waiting.folder / "asked").read_text() == "1"
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_the_library_installs_no_signal_handlers(job: Callable[..., Job]) -> None:
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    during = []
+    watch = Watch(lambda: during.append([signal.getsignal(number) for number in numbers]))
+    run_jobs([job("a", "eval")], parallel=1, reporter=watch, command=COMMAND)
+    assert during
+    assert all(handlers == before for handlers in during)
 
 
 def test_the_last_line_of_a_log(tmp_path: Path) -> None:
@@ -139,11 +188,12 @@ def test_the_last_line_of_a_log(tmp_path: Path) -> None:
     assert last_line(log) is None
 
 
-def test_the_display_shows_markup_in_names_as_it_is(
-    job: Callable[..., Job], capsys: pytest.CaptureFixture[str]
-) -> None:
-    odd = job("[red]cup[/]", "eval")
-    with JobProgress([odd]) as progress:
-        progress.look([])
-        progress.ended(odd, "no [bold]space[/] left")
+def test_the_display_shows_markup_in_names_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = JobReporter()
+    with reporter.track("all", 2) as everything, reporter.track("[red]cup[/]", 1) as one:
+        one(1, note="[bold]scoring[/]")
+        everything(1)
+        reporter.say("failed  [red]cup[/]: no [bold]space[/] left")
+    with reporter.track("again"):
+        pass
     assert "failed  [red]cup[/]: no [bold]space[/] left" in capsys.readouterr().out

@@ -8,7 +8,7 @@ import io
 import pytest
 from comparison_records import results, run, unfinished
 
-from polarguide.evaluation.table import COLUMNS, KEYS
+from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.aggregate import aggregate, cell_of
 from polarguide.experiments.tables import best_rows, blocks, csv_text, latex, latex_text, markdown, notes
 
@@ -90,7 +90,7 @@ def test_markdown() -> None:
     runs = [run("cup", "a", s, psnr=30.0 + s) for s in (0, 1)]
     runs += [run("cup", "b", s, psnr=29.0, normal_within_11=0.125) for s in (0, 1)]
     text = markdown(results(runs))
-    assert "| recipe | PSNR (dB) ↑ | within 11.25 deg (%) ↑ |" in text
+    assert "| recipe | PSNR (dB) ↑ | normals within 11.25 deg (%) ↑ |" in text
     assert "| `a` | **30.50** ± 0.71 | n/a |" in text
     assert "| `b` | 29.00 ± 0.00 | 12.5 ± 0.0 |" in text
     assert "LPIPS n/a: no weights." in text
@@ -108,7 +108,7 @@ def test_scene_and_error_text_cannot_break_markdown() -> None:
 def test_csv_has_every_column_in_full_precision() -> None:
     runs = [run("x, y", "a", 0, psnr=30.123456789), run("z", "a", 0, psnr=1.0)]
     rows = list(csv.DictReader(io.StringIO(csv_text(results(runs)))))
-    assert list(rows[0]) == ["scene", "recipe", "runs", *(f"{k}{e}" for k in KEYS for e in ("", "_spread"))]
+    assert list(rows[0]) == ["scene", "recipe", "runs", *(f"{k}{e}" for k in BY_KEY for e in ("", "_spread"))]
     assert (rows[0]["scene"], rows[0]["psnr"], rows[0]["ssim"]) == ("x, y", "30.123456789", "")
     assert [row["scene"] for row in rows] == ["x, y", "z", ""]
 

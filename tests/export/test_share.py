@@ -14,9 +14,21 @@ import pytest
 import torch
 from random_runs import KINDS, random_state, ring
 
-from polarguide.export.records import TEXELS, harmonics_steps, records, shading_kind
-from polarguide.export.share import LAYERS, LEFT_OUT, share_page
+from polarguide.export.records import harmonics_steps, records
+from polarguide.export.share import BAKED, baked_page, share_page
+from polarguide.gaussians.harmonics import evaluate_sh
+from polarguide.runs.point_cloud import gaussian_colors
+from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.model import PLAIN
 
+REFLECTING = ["final", "diffuse", "specular", "base", "strength", "normal"]
+LAYERS = {
+    "plain": ["final", "normal"],
+    "reflection": REFLECTING,
+    "local": REFLECTING,
+    "directional": ["final", "diffuse", "specular", "base", "normal"],
+}
+TEXELS = {"plain": 6, "reflection": 6, "local": 10, "directional": 4}
 EVIL = "</script><img src=x onerror=alert(1)>&\"'${0}$title"
 
 
@@ -25,7 +37,7 @@ def page(recipe: str = "3dgs-dr", name: str = "cup") -> str:
     cameras = {f"{name}{key}": camera for key, camera in ring().items()}
     return share_page(
         state.gaussians,
-        state.environment.parameters if state.environment else None,
+        state.light,
         shading,
         cameras,
         first=f"{name}v1",
@@ -88,22 +100,49 @@ def test_each_kind_of_shading_has_its_data(recipe: str) -> None:
     scripts = Reader(page(recipe)).scripts
     scene, kind = json.loads(scripts["scene"]), KINDS[recipe]
     assert scene["kind"] == kind
-    assert scene["layers"] == list(LAYERS[kind])  # type: ignore[index]
+    assert scene["layers"] == LAYERS[kind]
     planes = gzip.decompress(base64.b64decode(scripts["records"]))
-    assert len(planes) == 16 * TEXELS[kind] * scene["count"]  # type: ignore[index]
+    assert len(planes) == 16 * TEXELS[kind] * scene["count"]
     assert bool(scripts.get("light")) is (kind != "plain")
     assert bool(scripts.get("network")) is (kind == "directional")
 
 
-def test_an_unknown_shading_says_what_is_left_out() -> None:
-    class Other:
-        pass
+class Unknown(DeferredShading):
+    """A model that the page has no shaders for."""
 
+    def page(self, gaussians, light):
+        return None
+
+
+def test_a_model_without_shaders_is_baked_and_says_so() -> None:
     state, _ = random_state("3dgs-dr")
-    assert state.environment is not None
-    text = share_page(state.gaussians, state.environment.parameters, Other(), ring(), first="v0", title="t")  # type: ignore[arg-type]
-    assert LEFT_OUT in text
-    assert json.loads(Reader(text).scripts["scene"])["kind"] == "plain"
+    text = share_page(state.gaussians, state.light, Unknown(), ring(), first="v0", title="t")
+    assert BAKED in text
+    scripts = Reader(text).scripts
+    scene = json.loads(scripts["scene"])
+    assert (scene["kind"], scene["layers"]) == ("plain", LAYERS["plain"])
+    assert not scripts.get("light")
+    plain = share_page(state.gaussians, {}, PLAIN, ring(), first="v0", title="t")
+    assert Reader(plain).scripts["records"] != scripts["records"], "colors without reflections"
+
+
+def test_baked_harmonics_are_near_the_colors_that_they_stand_for() -> None:
+    state, shading = random_state("3dgs-dr")
+    even = {"texels": torch.full_like(state.light["texels"].detach(), 0.4)}
+    values = baked_page(state.gaussians, even, shading).values
+    directions = torch.nn.functional.normalize(
+        torch.randn(40, 3, generator=torch.Generator().manual_seed(2)), dim=-1
+    )
+    expected = gaussian_colors(state.gaussians, even, shading, directions)
+    found = torch.stack(
+        [
+            evaluate_sh(d.expand(len(expected), 3), torch.zeros(3), values["color"], values["harmonics"], 3)
+            for d in directions
+        ],
+        dim=1,
+    )
+    # Of degree 3 but for the cut at black, which harmonics only come near to.
+    assert float((found + 0.5 - expected).abs().mean()) < 0.02
 
 
 def test_the_same_run_gives_the_same_page() -> None:
@@ -113,9 +152,10 @@ def test_the_same_run_gives_the_same_page() -> None:
 @pytest.mark.parametrize("recipe", KINDS)
 def test_records_are_close_to_what_they_stand_for(recipe: str) -> None:
     state, shading = random_state(recipe)
-    kind = shading_kind(shading, lit=state.environment is not None)
-    assert kind == KINDS[recipe]
-    data = records(state.gaussians, kind).data
+    page = shading.page(state.gaussians, state.light)
+    assert page is not None
+    assert page.kind == KINDS[recipe]
+    data = records(state.gaussians, page.values).data
     seen = torch.sigmoid(state.gaussians["opacity_logits"].detach()) >= 1 / 255
     assert len(data) == int(seen.sum())
     means = data[:, :12].copy().view("<f4")

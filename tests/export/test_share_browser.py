@@ -21,7 +21,7 @@ from random_runs import KINDS, random_state, ring
 from polarguide.camera import Camera
 from polarguide.export.share import share_page, write_page
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.shading.deferred import render
+from polarguide.shading.gbuffer import render
 from polarguide.visualization.layers import layer_picture
 
 pytestmark = pytest.mark.slow
@@ -87,11 +87,12 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 def written(recipe: str, folder: Path) -> Path:
     state, shading = random_state(recipe)
-    light = state.environment.parameters if state.environment else None
     path = folder / f"{recipe}.html"
     write_page(
         path,
-        share_page(state.gaussians, light, shading, ring(), first="v0", title="<b>title</b>", caption="&"),
+        share_page(
+            state.gaussians, state.light, shading, ring(), first="v0", title="<b>title</b>", caption="&"
+        ),
     )
     return path
 
@@ -99,8 +100,7 @@ def written(recipe: str, folder: Path) -> Path:
 @torch.no_grad()
 def ours(recipe: str, layer: str, camera: Camera) -> np.ndarray:
     state, shading = random_state(recipe)
-    light = state.environment.parameters if state.environment else None
-    result = render(state.gaussians, camera, rasterize_cpu, environment=light, shading=shading)
+    result = render(state.gaussians, camera, rasterize_cpu, shading=shading, light=state.light)
     picture = layer_picture(result, layer, camera)
     assert picture is not None
     return picture

@@ -45,10 +45,10 @@ def test_colors_are_in_range_and_change_with_the_view(name: str) -> None:
 
 def test_a_directional_gaussian_shows_its_albedo_and_the_light_in_its_mirror() -> None:
     state, shading = random_state("ref-gs", COUNT)
-    assert state.environment is not None
-    rows, ray = state.gaussians, torch.tensor([[0.0, 0.6, 0.8]])
-    normals = shortest_axis_normals(rows["means"], rows["quaternions"], rows["log_scales"], torch.zeros(3))
+    gaussians, ray = state.gaussians, torch.tensor([[0.0, 0.6, 0.8]])
+    shape = (gaussians[name] for name in ("means", "quaternions", "log_scales"))
+    normals = shortest_axis_normals(*shape, torch.zeros(3))
     facing = torch.where(normals @ ray[0][:, None] > 0, -normals, normals)
-    linear = shading.colors(rows, state.environment.parameters, ray.expand(COUNT, 3), facing)
+    linear = shading.colors(gaussians, state.light, ray.expand(COUNT, 3), facing)
     expected = srgb_encode(linear.detach().clamp(0, 1))
     torch.testing.assert_close(shown_colors(state, shading, ray)[:, 0], expected)

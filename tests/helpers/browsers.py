@@ -21,8 +21,10 @@ PATIENCE = 240  # seconds; software rendering on a busy machine is slow
 def chromium() -> Iterator[Any]:
     """A browser with WebGL 2 by software; skips the test where there is none."""
     if CHROMIUM is None:
-        pytest.skip("no Chromium on this system")
-    playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+        pytest.skip("no Chromium -> apt-get install chromium")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="no Playwright -> pip install '.[browser]'"
+    )
     with playwright.sync_playwright() as running:
         browser = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
         yield browser

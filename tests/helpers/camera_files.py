@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from tiny_capture import encode_srgb, write_picture, write_text_model
 
-ANGLES = (0, 45, 90, 135)
+from polarguide.polarizer import ANGLES, malus
+
 COLOR = ("R90 R45 G90 G45", "R135 R0 G135 G0", "G90 G45 B90 B45", "G135 G0 B135 B0")
 MONO = ("90 45", "135 0")
 
@@ -47,9 +48,7 @@ def busy_light(height: int, width: int, seed: int) -> np.ndarray:
 
 def behind(stokes: np.ndarray, degrees: Iterable[float] = ANGLES) -> np.ndarray:
     """Intensities behind ideal analyzers, [len(degrees), H, W, 3]."""
-    s0, s1, s2 = stokes
-    turns = [2.0 * np.radians(angle) for angle in degrees]
-    return np.stack([(s0 + s1 * np.cos(turn) + s2 * np.sin(turn)) / 2 for turn in turns])
+    return np.stack([malus(stokes, np.radians(angle)) for angle in degrees])
 
 
 def mosaic(intensities: np.ndarray, pattern: tuple[str, ...], offset: tuple[int, int] = (0, 0)) -> np.ndarray:

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 
 from polarguide.inspection.capture import Capture, read_capture
-
-ANGLES = (0, 45, 90, 135)
+from polarguide.polarizer import ANGLES
 
 
 def soft_intensities(seed: int, size: tuple[int, int] = (60, 80)) -> np.ndarray:
@@ -45,13 +44,6 @@ def write_scene(
             stored = np.rint(picture[..., ::-1] * full).astype(np.uint16 if bits == 16 else np.uint8)
             assert cv2.imwrite(str(root / "polar" / f"{names.format(index)}_{angle:03d}.png"), stored)
     return root
-
-
-def encode(values: np.ndarray) -> np.ndarray:
-    """Linear -> sRGB."""
-    return np.where(
-        values <= 0.0031308, 12.92 * values, 1.055 * np.maximum(values, 1e-9) ** (1 / 2.4) - 0.055
-    )
 
 
 def gained(*gains: float) -> Callable[[np.ndarray], np.ndarray]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from polarguide.evaluation.table import KEYS
+from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.results import make_results
 
 
 def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:
     """A finished run with these metrics; all others are null."""
-    values = {**dict.fromkeys(KEYS), **metrics}
+    values = {**dict.fromkeys(c.key for c in COLUMNS), **metrics}
     return {
         "scene": scene,
         "recipe": recipe,

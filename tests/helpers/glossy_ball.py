@@ -16,6 +16,7 @@ from polarguide.capture import ColmapModel, checks
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.inspection.capture import InspectedView
 from polarguide.inspection.surfaces import Surface
+from polarguide.polarizer import ANGLES
 
 WIDTH, HEIGHT, INDEX = 72, 64, 1.5
 
@@ -65,7 +66,7 @@ def pictures_of(
     body = torch.where(hit, diffuse, 0.4)[..., None].expand(HEIGHT, WIDTH, 3)
     normal = torch.where(hit[..., None], normal, -camera.rays())
     stokes = optics.predicted_stokes(gloss, body, normal, camera.rays(), INDEX)
-    values = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in (0, 45, 90, 135)])
+    values = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in ANGLES])
     generator = torch.Generator().manual_seed(len(name) + ord(name[-1]))
     values = values + noise * torch.randn(values.shape, generator=generator)
     return with_intensities(
@@ -89,12 +90,10 @@ def with_intensities(view: InspectedView, values: np.ndarray) -> InspectedView:
     return dataclasses.replace(view, codes=torch.from_numpy(codes), measures=checks.measure(codes, usable))
 
 
-def mistaken(
-    view: InspectedView, *, files: tuple[int, ...] = (0, 45, 90, 135), zero: float = 0.0
-) -> InspectedView:
+def mistaken(view: InspectedView, *, files: tuple[int, ...] = ANGLES, zero: float = 0.0) -> InspectedView:
     """The view as an instrument with this zero and these file names would have stored it."""
     values = oriented(view.intensities().numpy(), Calibration(zero=-zero))
-    return with_intensities(view, values[[(0, 45, 90, 135).index(angle) for angle in files]])
+    return with_intensities(view, values[[ANGLES.index(angle) for angle in files]])
 
 
 def surfaces(views: tuple[InspectedView, ...]) -> list[tuple[InspectedView, Surface]]:

@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_a
 from torch.utils._pytree import tree_leaves, tree_map
 
 from polarguide.camera import Camera
-from polarguide.raster import Backend, Rasterized, ScreenStatistic
+from polarguide.raster import Backend, Rasterized, ScreenStatistic, Splats
 from polarguide.raster.cpu import rasterize_cpu
 
 # The second of its kind, so that what is kept for each device is kept for this one by itself.
@@ -123,20 +123,10 @@ class _Return(torch.autograd.Function):
         return _values(grad)
 
 
-def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    camera: Camera,
-    *,
-    statistic: ScreenStatistic | None = None,
-) -> Rasterized:
+def rasterize(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
     """The CPU's rasterizer for tensors there; pictures, gradients and the statistic are there, too."""
-    given = (means, quats, scales, opacities, features)
-    assert all(isinstance(t, _There) for t in given)
-    here = [_Bring.apply(t) for t in given]
+    assert all(isinstance(t, _There) for t in splats)
+    here = Splats(*(_Bring.apply(t) for t in splats))
     own = None if statistic is None else ScreenStatistic(statistic.channels)
     if own is not None and here[0].requires_grad:
 
@@ -146,7 +136,7 @@ def rasterize(
             statistic.gradient = _There(own.gradient)
 
         here[0].register_hook(fill)
-    found = rasterize_cpu(*here, camera, statistic=own)
+    found = rasterize_cpu(here, camera, statistic=own)
     return Rasterized(*(_Return.apply(t) for t in found))
 
 

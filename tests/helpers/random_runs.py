@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, look_at
 from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.recipes import RECIPES
 from polarguide.shading.model import ShadingModel
 from polarguide.training.state import Environment, TrainingState
-from polarguide.trajectory import looking
 
 KINDS = {"3dgs": "plain", "3dgs-dr": "reflection", "polarguide-stokes": "local", "ref-gs": "directional"}
 """A recipe for each kind of shading."""
@@ -27,7 +27,7 @@ def random_state(name: str, count: int = 300) -> tuple[TrainingState, ShadingMod
         return torch.randn(*shape, generator=generator)
 
     recipe = RECIPES[name]
-    rows = {
+    gaussians = {
         "means": 0.7 * normal(count, 3),
         "quaternions": normal(count, 4),
         "log_scales": 0.5 * normal(count, 3) - 2,
@@ -35,20 +35,21 @@ def random_state(name: str, count: int = 300) -> tuple[TrainingState, ShadingMod
         "sh_dc": 0.5 * normal(count, 3),
         "sh_rest": 0.1 * normal(count, 15, 3),
     }
-    light = None
-    if recipe.directional is not None:
-        rows |= recipe.directional.first_parameters(0.5 + 0.28 * rows["sh_dc"], generator)
-        light = recipe.directional.first_light_values(8, 0.5, generator)
-    elif recipe.reflects:
-        rows["strength_logits"] = normal(count)
-        light = {"texels": normal(6, 8, 8, 3)}
-    if recipe.local:
-        rows |= {"local_dc": 0.3 * normal(count, 3), "local_rest": 0.1 * normal(count, 15, 3)}
-        rows["outward"] = normal(count, 3)
-        rows["outward"][::5] = 0  # not seen by any view
-    environment = Environment(light, recipe.environment_rates) if light else None
-    state = TrainingState(0, Gaussians(rows, recipe.rates), environment, DensityStatistics(count))
-    return state, recipe.shading(1.5)
+    light: dict[str, Tensor] = {}
+    if recipe.shading.reflects:
+        model = replace(recipe.shading, environment_resolution=8, environment_spread=1.5)  # type: ignore[call-arg]
+        gaussians |= model.initial_parameters(0.5 + 0.28 * gaussians["sh_dc"], generator)
+        light = model.initial_light(generator)
+    for key, spread in {"strength_logits": 1.0, "local_dc": 0.3, "local_rest": 0.1}.items():
+        if key in gaussians:
+            gaussians[key] = spread * normal(*gaussians[key].shape)
+    if recipe.oriented:
+        gaussians["outward"] = normal(count, 3)
+        gaussians["outward"][::5] = 0  # not seen by any view
+    environment = Environment(light, recipe.light_rates) if light else None
+    trained = Gaussians(gaussians, recipe.learning_rates)
+    state = TrainingState(0, trained, environment, DensityStatistics(count))
+    return state, recipe.shading.bind(1.5)
 
 
 def ring(count: int = 6, distance: float = 4.0, width: int = 64, height: int = 48) -> dict[str, Camera]:
@@ -59,6 +60,6 @@ def ring(count: int = 6, distance: float = 4.0, width: int = 64, height: int = 4
     for k in range(count):
         angle = 2 * math.pi * k / count
         place = [distance * math.cos(angle), -0.3 * distance, distance * math.sin(angle)]
-        place_ = torch.tensor(place, dtype=torch.float64)
-        cameras[f"v{k}"] = looking(lens, place_, torch.zeros(3, dtype=torch.float64), -eye[1])
+        rotation, translation = look_at(place, (0.0, 0.0, 0.0), -eye[1])
+        cameras[f"v{k}"] = replace(lens, rotation=rotation, translation=translation)
     return cameras

@@ -9,26 +9,15 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.gaussians.geometry import quaternions_to_rotations
-from polarguide.raster import Rasterize, ScreenStatistic, rasterize_reference
+from polarguide.raster import Rasterize, ScreenStatistic, Splats, rasterize_reference
 from polarguide.raster.interface import MINIMUM_ALPHA
-
-
-class Gaussians(NamedTuple):
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    features: Tensor
-
-    def to(self, dtype: torch.dtype) -> Gaussians:
-        return Gaussians(*(t.detach().to(dtype) for t in self))
 
 
 class Outcome(NamedTuple):
     features: Tensor
     alpha: Tensor
     radii: Tensor
-    gradients: Gaussians
+    gradients: Splats
     statistic: Tensor | None
 
 
@@ -39,9 +28,9 @@ def looking_ahead(width: int, height: int, focal: float = 0.0) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, eye, zero)
 
 
-def round_gaussian(sigma: float, opacity: float, depth: float = 3.0) -> Gaussians:
+def round_gaussian(sigma: float, opacity: float, depth: float = 3.0) -> Splats:
     """One round Gaussian on the optical axis."""
-    return Gaussians(
+    return Splats(
         torch.tensor([[0.0, 0.0, depth]]),
         torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         torch.full((1, 3), sigma),
@@ -50,8 +39,8 @@ def round_gaussian(sigma: float, opacity: float, depth: float = 3.0) -> Gaussian
     )
 
 
-def repeated(gaussians: Gaussians, count: int) -> Gaussians:
-    return Gaussians(*(t.repeat(count, *[1] * (t.ndim - 1)) for t in gaussians))
+def repeated(splats: Splats, count: int) -> Splats:
+    return Splats(*(t.repeat(count, *[1] * (t.ndim - 1)) for t in splats))
 
 
 def posed(width: int, height: int) -> Camera:
@@ -63,7 +52,7 @@ def posed(width: int, height: int) -> Camera:
     return Camera(width, height, 1.1 * side, 0.9 * side, 0.52 * width, 0.47 * height, rotation, translation)
 
 
-def in_view(camera: Camera, count: int, channels: int, seed: int) -> Gaussians:
+def in_view(camera: Camera, count: int, channels: int, seed: int) -> Splats:
     """Float32 Gaussians of many shapes before a camera, none with a pixel near the cut-off 1/255."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -77,33 +66,33 @@ def in_view(camera: Camera, count: int, channels: int, seed: int) -> Gaussians:
     local = torch.stack((x, y, depth), dim=1)
     side = max(camera.width, camera.height)
     pixels = torch.exp(torch.log(torch.tensor(side / 3 + 1.0)) * uniform(count, 3))
-    gaussians = Gaussians(
+    inputs = (
         (local - camera.translation) @ camera.rotation,
         torch.randn(count, 4, generator=generator, dtype=torch.float64),
         pixels * (depth / side)[:, None],
         0.03 + 0.9 * uniform(count),
         torch.randn(count, channels, generator=generator, dtype=torch.float64),
-    ).to(torch.float32)
-    return _away_from_cut_off(gaussians, camera)
+    )
+    return _away_from_cut_off(Splats(*(t.to(torch.float32) for t in inputs)), camera)
 
 
-def _away_from_cut_off(gaussians: Gaussians, camera: Camera) -> Gaussians:
+def _away_from_cut_off(splats: Splats, camera: Camera) -> Splats:
     """Raise opacities a little until no pixel lies within 0.05 % of the alpha at which it is dropped."""
-    opacities = gaussians.opacities.clone()
+    opacities = splats.opacities.clone()
     for index in range(len(opacities)):
-        one = Gaussians(*(t[index : index + 1].double() for t in gaussians))
+        one = Splats(*(t[index : index + 1].double() for t in splats))
         for _ in range(30):
             raised = opacities[index : index + 1].double() * 1.0005
-            alpha = rasterize_reference(*one[:3], raised, one.features, camera).alpha / MINIMUM_ALPHA
+            alpha = rasterize_reference(one._replace(opacities=raised), camera).alpha / MINIMUM_ALPHA
             if not bool(((alpha > 0.99) & (alpha < 1.001)).any()):
                 break
             opacities[index] *= 1.0021
-    return gaussians._replace(opacities=opacities)
+    return splats._replace(opacities=opacities)
 
 
 def outcome(
     rasterize: Rasterize,
-    gaussians: Gaussians,
+    splats: Splats,
     camera: Camera,
     statistic: tuple[int, ...] | None = None,
     *,
@@ -111,16 +100,16 @@ def outcome(
     seed: int = 7,
 ) -> Outcome:
     """Forward pass, and backward pass of random output gradients (the same for every dtype)."""
-    inputs = [t.detach().to(dtype).requires_grad_() for t in gaussians]
+    inputs = Splats(*(t.detach().to(dtype).requires_grad_() for t in splats))
     watched = ScreenStatistic(statistic) if statistic is not None else None
-    picture = rasterize(*inputs, camera, statistic=watched)
+    picture = rasterize(inputs, camera, statistic=watched)
     generator = torch.Generator().manual_seed(seed)
     to_features = torch.randn(picture.features.shape, generator=generator)
     to_alpha = torch.randn(picture.alpha.shape, generator=generator)
     loss = (picture.features * to_features.to(picture.features)).sum()
     loss = loss + (picture.alpha * to_alpha.to(picture.alpha)).sum()
     loss.backward()
-    gradients = Gaussians(*(t.grad if t.grad is not None else torch.zeros_like(t) for t in inputs))
+    gradients = Splats(*(t.grad if t.grad is not None else torch.zeros_like(t) for t in inputs))
     return Outcome(
         picture.features.detach(),
         picture.alpha.detach(),
@@ -142,7 +131,7 @@ def differences(found: Outcome, expected: Outcome) -> dict[str, float]:
     named |= {
         f"gradient of {name}": pair
         for name, pair in zip(
-            Gaussians._fields, zip(found.gradients, expected.gradients, strict=True), strict=True
+            Splats._fields, zip(found.gradients, expected.gradients, strict=True), strict=True
         )
     }
     if expected.statistic is not None:

@@ -9,10 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, look_at
 from polarguide.capture import Scene, View
-from polarguide.raster import rasterize_reference
+from polarguide.raster import Splats, rasterize_reference
 from polarguide.recipes import RECIPES
+from polarguide.recipes.baselines import SHADING_3DGS_DR
 from polarguide.training.recipe import Recipe, Repeat, Stage, Weights
 
 WIDTH, HEIGHT, VIEWS, GAUSSIANS = 24, 20, 6, 40
@@ -21,12 +22,9 @@ STEPS = 60
 
 def circling(angle: float) -> Camera:
     """A camera at distance 4 from the origin, somewhat above it, that looks at it."""
-    center = torch.tensor([4 * math.cos(angle), -1.2, 4 * math.sin(angle)], dtype=torch.float64)
-    ahead = -center / center.norm()
-    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), ahead)
-    right = right / right.norm()
-    rotation = torch.stack((right, torch.linalg.cross(ahead, right), ahead))
-    return Camera(WIDTH, HEIGHT, 28.0, 28.0, WIDTH / 2, HEIGHT / 2, rotation, -rotation @ center)
+    center = (4 * math.cos(angle), -1.2, 4 * math.sin(angle))
+    pose = look_at(center, (0.0, 0.0, 0.0), (0.0, -1.0, 0.0))
+    return Camera(WIDTH, HEIGHT, 28.0, 28.0, WIDTH / 2, HEIGHT / 2, *pose)
 
 
 def polarized_codes(picture: Tensor, alpha: Tensor) -> Tensor:
@@ -48,17 +46,18 @@ def make_scene() -> Scene:
 
     means = torch.randn(GAUSSIANS, 3, generator=generator) * 0.5
     features = torch.cat((uniform(GAUSSIANS, 3), 0.8 * (uniform(GAUSSIANS, 2) - 0.5)), dim=1)
-    gaussians = (
+    splats = Splats(
         means,
         uniform(GAUSSIANS, 4) - 0.5,
         0.15 + 0.4 * uniform(GAUSSIANS, 3),
         0.5 + 0.4 * uniform(GAUSSIANS),
+        features,
     )
     nowhere = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     views = []
     for index in range(VIEWS):
         camera = circling(2 * math.pi * index / VIEWS)
-        picture = rasterize_reference(*gaussians, features, camera)
+        picture = rasterize_reference(splats, camera)
         codes = polarized_codes(picture.features, picture.alpha)
         views.append(View(f"v{index}", camera, codes, nowhere, nowhere))
     return Scene(
@@ -94,7 +93,7 @@ def make_busy_recipe() -> Recipe:
             Stage("final", 0.2, True, Weights(azimuth=0.3), on_enter=("refresh_priors",)),
         ),
         sh_fractions=(0.2, 0.4, 0.6),
-        environment_resolution=16,
+        shading=dataclasses.replace(SHADING_3DGS_DR, environment_resolution=16),
         initialization=dataclasses.replace(recipe.initialization, shell=50),
         densification=dataclasses.replace(
             recipe.densification,

@@ -10,7 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-ANGLES = (0, 45, 90, 135)
+from polarguide.polarizer import ANGLES
+
 HEIGHT, WIDTH = 10, 12
 NAMES = tuple(f"v{index:03d}" for index in range(9))
 

@@ -15,8 +15,7 @@ from polarguide.viewer.frusta import Photograph
 
 def shown(recipe: str = "polarguide-stokes") -> Shown:
     state, shading = random_state(recipe)
-    light = state.environment.parameters if state.environment else None
-    return Shown(state.gaussians, light, shading, rasterize_cpu, 3, f"{recipe}, a test")
+    return Shown(state.gaussians, state.light, shading, rasterize_cpu, 3, f"{recipe}, a test")
 
 
 def frame_of_scene() -> SceneFrame:
@@ -25,7 +24,7 @@ def frame_of_scene() -> SceneFrame:
 
 def photograph(name: str, camera: Camera, seen: Shown) -> Photograph:
     """A photograph of the scene as it is rendered, polarized along the rows of the picture."""
-    picture = seen.render(camera, seen.gaussians, seen.environment, depth=False).final.clamp(0, 0.6)
+    picture = seen.render(camera, depth=False).final.clamp(0, 0.6)
     factors = torch.tensor([1.3, 1.0, 0.7, 1.0])[:, None, None, None]
     codes = (factors * picture * 65535).round().to(torch.uint16)
     nowhere = torch.zeros(camera.height, camera.width, dtype=torch.bool)

@@ -17,6 +17,7 @@ from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.likelihood import OrderPosterior
 from polarguide.inspection.orders import ORDERS, PAIRINGS
+from polarguide.polarizer import ANGLES
 
 
 def decided(
@@ -39,7 +40,7 @@ def hashes(root: Path) -> dict[str, str]:
 def test_misnamed_files_get_their_names_back_byte_by_byte(tmp_path, order: int, pairing: int) -> None:
     right = write_scene(tmp_path / "right")
     files = ORDERS[order].files(PAIRINGS[pairing])
-    places = [(0, 45, 90, 135).index(angle) for angle in files]
+    places = [ANGLES.index(angle) for angle in files]
     root = write_scene(tmp_path / "wrong", lambda values: values[places])
     (root / "split.json").write_text('{"test": ["v0"]}')
     (root / "masks").mkdir()

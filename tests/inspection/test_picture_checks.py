@@ -6,13 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import encode, gained, one_view, write_scene
+from captures import gained, one_view, write_scene
+from tiny_capture import encode_srgb
 
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.measurements import measure_view
 from polarguide.inspection.orders import PAIRINGS
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.verdict import Check
+from polarguide.polarizer import ANGLES
 
 
 def checked(root: Path) -> dict[str, Check]:
@@ -36,12 +38,12 @@ def test_a_sound_capture_is_not_flagged(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (encode, {"encoding": "wrong"}),
+        (encode_srgb, {"encoding": "wrong"}),
         (lambda v: v**1.6, {"encoding": "wrong"}),
-        (gained(1.05, 1, 1, 1), {"exposure": "look"}),
-        (gained(1, 1.05, 1, 1), {"exposure": "look"}),
-        (gained(1, 1, 1.05, 1), {"exposure": "look"}),
-        (gained(1, 1, 1, 1.05), {"exposure": "look"}),
+        (gained(1.05, 1, 1, 1), {"exposure": "warning"}),
+        (gained(1, 1.05, 1, 1), {"exposure": "warning"}),
+        (gained(1, 1, 1.05, 1), {"exposure": "warning"}),
+        (gained(1, 1, 1, 1.05), {"exposure": "warning"}),
         (gained(1.008, 1, 1, 1), {}),
         (gained(1.13, 1, 1, 1), {"exposure": "wrong", "pair_sums": "wrong"}),
     ],
@@ -69,7 +71,7 @@ def test_saturation_is_flagged_with_its_views(tmp_path) -> None:
     root = write_scene(tmp_path / "s", lambda v: v * 0.9)
     one_view(root, lambda v: v * 2.2)
     check = checked(root)["saturation"]
-    assert check.verdict == "look"
+    assert check.verdict == "warning"
     assert check.views == ("v1",)
     assert checked(write_scene(tmp_path / "t", lambda v: v * 4))["saturation"].verdict == "wrong"
 
@@ -77,7 +79,7 @@ def test_saturation_is_flagged_with_its_views(tmp_path) -> None:
 def test_noise_is_flagged(tmp_path) -> None:
     rng = np.random.default_rng(0)
     found = checked(write_scene(tmp_path / "s", lambda v: v + rng.normal(0, 0.05, v.shape)))
-    assert found["noise"].verdict == "look"
+    assert found["noise"].verdict == "warning"
     assert found["noise"].figures["noise_share"] == pytest.approx(0.05 / np.sqrt(3) / 0.3, rel=0.35)
 
 
@@ -91,14 +93,14 @@ def test_one_view_with_another_exposure_is_named(tmp_path) -> None:
     root = write_scene(tmp_path / "s", views=5)
     one_view(root, gained(1.04, 1, 1, 1))
     check = checked(root)["exposure"]
-    assert check.verdict == "look"
+    assert check.verdict == "warning"
     assert check.views == ("v1",)
 
 
 @pytest.mark.parametrize("pairing", [1, 2])
 def test_files_of_another_pairing_are_named(tmp_path, pairing: int) -> None:
     files = PAIRINGS[pairing]
-    root = write_scene(tmp_path / "s", lambda v: v[[(0, 45, 90, 135).index(angle) for angle in files]])
+    root = write_scene(tmp_path / "s", lambda v: v[[ANGLES.index(angle) for angle in files]])
     found = checked(root)
     assert found["pair_sums"].verdict == "wrong"
     assert found["pair_sums"].figures["pairing"] == list(files)
@@ -111,5 +113,5 @@ def test_light_that_changed_between_the_shots_is_flagged(tmp_path) -> None:
     shade[0, 0, :, 0] += 0.3 * np.linspace(-1, 1, 80)
     one_view(root, lambda v: v * shade)
     check = checked(root)["pair_sums"]
-    assert check.verdict == "look"
+    assert check.verdict == "warning"
     assert check.views == ("v1",)

@@ -61,7 +61,7 @@ def posed(tmp_path) -> Capture:
 def test_the_bad_view_is_named(posed, monkeypatch) -> None:
     monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=4))
     check = pose_checks.pose_check(posed)
-    assert check.verdict == "look"
+    assert check.verdict == "warning"
     assert check.views == ("v04",)
     assert "v04 (6.0 px)" in check.finding
     monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=-1))
@@ -75,7 +75,7 @@ def test_views_without_a_pose_are_named(posed, monkeypatch) -> None:
     monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=-1))
     views = (dataclasses.replace(posed.views[0], camera=None), *posed.views[1:])
     check = pose_checks.pose_check(dataclasses.replace(posed, views=views))
-    assert check.verdict == "look"
+    assert check.verdict == "warning"
     assert check.views == ("v00",)
 
 
@@ -91,7 +91,7 @@ def test_without_a_model_there_is_nothing_to_judge(tmp_path) -> None:
 
 def test_gaps_and_few_views_are_named(posed, monkeypatch) -> None:
     check = pose_checks.coverage_check(posed)
-    assert check.verdict == "look"  # thirty degrees apart
+    assert check.verdict == "warning"  # thirty degrees apart
     assert len(check.views) == 12
     near = tuple(
         dataclasses.replace(view, camera=camera_at(0.2 * k, 0.3, 0)) for k, view in enumerate(posed.views)
@@ -100,7 +100,7 @@ def test_gaps_and_few_views_are_named(posed, monkeypatch) -> None:
     assert pose_checks.coverage_check(dataclasses.replace(posed, views=near)).verdict == "ok"
     far = (*near[:-1], dataclasses.replace(near[-1], camera=camera_at(3.6, 0.3, 0)))
     check = pose_checks.coverage_check(dataclasses.replace(posed, views=far))
-    assert (check.verdict, check.views) == ("look", ("v11",))
+    assert (check.verdict, check.views) == ("warning", ("v11",))
 
 
 def test_a_turned_camera_of_the_demo_stands_out(demo_scene) -> None:

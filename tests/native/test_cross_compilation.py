@@ -15,8 +15,10 @@ ELF_MACHINE_AARCH64 = 183
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(shutil.which(COMPILER) is None, reason=f"the compiler {COMPILER} is not installed"),
-    pytest.mark.skipif(shutil.which("cmake") is None, reason="cmake is not on the path"),
+    pytest.mark.skipif(
+        shutil.which(COMPILER) is None, reason=f"no {COMPILER} -> apt-get install g++-aarch64-linux-gnu"
+    ),
+    pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake -> apt-get install cmake"),
     pytest.mark.skipif(platform.machine() == "aarch64", reason="this machine is the target itself"),
 ]
 

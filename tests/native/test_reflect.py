@@ -1,4 +1,4 @@
-"""Deferred reflection: the native pass against its twin, forward and gradient."""
+"""Deferred reflection: the native pass against its reference implementation, forward and gradient."""
 
 import pytest
 import torch
@@ -7,15 +7,15 @@ from torch.testing import assert_close
 
 from polarguide import _native
 from polarguide.camera import Camera
-from polarguide.shading.deferred import Shading, reflect
+from polarguide.shading.deferred import DeferredShading, reflect_reference
 from polarguide.shading.native import reflect_native
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 8
 MODELS = [
-    Shading(),
-    Shading(blend="fresnel", index=1.4),
-    Shading(blend="fresnel", local=True),
-    Shading(local=True),
+    DeferredShading(),
+    DeferredShading(blend="fresnel", refractive_index=1.4),
+    DeferredShading(blend="fresnel", local=True),
+    DeferredShading(local=True),
 ]
 LAYERS = ("final", "specular", "diffuse", "reflection")
 
@@ -41,26 +41,26 @@ def buffers(spare: int = 1) -> tuple[Tensor, Tensor]:
     return features, texels
 
 
-def native(features: Tensor, texels: Tensor, shading: Shading) -> tuple[Tensor, ...]:
+def native(features: Tensor, texels: Tensor, shading: DeferredShading) -> tuple[Tensor, ...]:
     return reflect_native(
         features.flatten(0, 1),
         camera().world_rays().flatten(0, 1),
         texels,
         fresnel=shading.blend == "fresnel",
         local=shading.local,
-        index=shading.index,
+        refractive_index=shading.refractive_index,
     )
 
 
-def twin(features: Tensor, texels: Tensor, shading: Shading) -> tuple[Tensor, ...]:
+def reference(features: Tensor, texels: Tensor, shading: DeferredShading) -> tuple[Tensor, ...]:
     local = features[..., 7:10] if shading.local else None
-    layers = reflect(
+    layers = reflect_reference(
         features[..., :3], features[..., 3:6], features[..., 6], texels, camera(), shading, local
     )
     return tuple(layers[name].flatten(0, 1) for name in LAYERS)
 
 
-def with_gradients(function, shading: Shading, dtype: torch.dtype, wanted: tuple[int, ...]):
+def with_gradients(function, shading: DeferredShading, dtype: torch.dtype, wanted: tuple[int, ...]):
     leaves = [t.to(dtype).requires_grad_() for t in buffers()]
     layers = function(*leaves, shading)
     weights = torch.linspace(-1, 2, layers[0].numel(), dtype=dtype).reshape(layers[0].shape)
@@ -70,9 +70,11 @@ def with_gradients(function, shading: Shading, dtype: torch.dtype, wanted: tuple
 
 @pytest.mark.parametrize("wanted", [(0,), (1, 2), (0, 1, 2, 3), (3,)])
 @pytest.mark.parametrize("shading", MODELS, ids=str)
-def test_native_agrees_with_the_twin(simd: str, shading: Shading, wanted: tuple[int, ...]) -> None:
+def test_native_agrees_with_the_reference(
+    simd: str, shading: DeferredShading, wanted: tuple[int, ...]
+) -> None:
     found, gradients = with_gradients(native, shading, torch.float32, wanted)
-    exact, exact_gradients = with_gradients(twin, shading, torch.float64, wanted)
+    exact, exact_gradients = with_gradients(reference, shading, torch.float64, wanted)
     for name, mine, theirs in zip(LAYERS, found, exact, strict=True):
         assert_close(mine.double(), theirs, rtol=2e-4, atol=2e-4, msg=lambda m, name=name: f"{name}: {m}")
     by_features, by_features_exact = gradients[0].double(), exact_gradients[0]

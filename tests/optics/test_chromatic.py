@@ -135,7 +135,7 @@ def test_the_demo_scene_agrees_with_its_true_normals(demo_scene: Path) -> None:
 
 
 @pytest.mark.shared
-@pytest.mark.skipif(not SCENES.is_dir(), reason="the ground-truth scenes are not beside the checkout")
+@pytest.mark.skipif(not SCENES.is_dir(), reason="no captures in ../shared -> ln -s FOLDER ../shared")
 @pytest.mark.parametrize("name", ["spheres", "cup"])
 def test_shared_scenes_agree_with_their_true_normals(name: str) -> None:
     share, azimuth, zenith = angles_against_truth(SCENES / name, 1)

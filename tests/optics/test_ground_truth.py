@@ -23,7 +23,7 @@ SCENES = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 
 pytestmark = [
     pytest.mark.shared,
-    pytest.mark.skipif(not SCENES.is_dir(), reason="the ground-truth scenes are not beside the checkout"),
+    pytest.mark.skipif(not SCENES.is_dir(), reason="no captures in ../shared -> ln -s FOLDER ../shared"),
 ]
 
 

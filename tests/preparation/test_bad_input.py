@@ -18,7 +18,9 @@ from dataset_files import write_gnerp, write_neisf, write_nersp, write_pandora, 
 from polarguide import files
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.polarizer import ANGLES
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 PLAIN = PrepareSettings(poses="none", gains="none")
 MOSAIC = replace(PLAIN, sensor="IMX250MYR")
@@ -44,7 +46,7 @@ def write_dngs(root: Path) -> None:
     pytest.importorskip("tifffile")
     from raw_photographs import write_dng
 
-    for angle, values in zip((0, 45, 90, 135), behind(smooth_light()), strict=True):
+    for angle, values in zip(ANGLES, behind(smooth_light()), strict=True):
         write_dng(root / str(angle) / "v.dng", values)
 
 

@@ -25,12 +25,15 @@ from dataset_files import (
     write_pandora,
     write_pisr,
 )
+from heard import Heard
 
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.pictures import decode_mask
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, Reporter, prepare_scene
+from polarguide.polarizer import ANGLES
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 PLAIN = PrepareSettings(poses="none", gains="none")
 NAMES = {
@@ -42,18 +45,6 @@ NAMES = {
 }
 # PANDORA's files share an exponent between channels, GNeRP's pictures have 8 bits.
 TOLERANCE = {"pandora": 1e-2, "nersp": 2e-5, "neisf": 2e-5, "gnerp": 1e-2}
-
-
-class Heard(Reporter):
-    """Keeps what was said."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.said.append(text)
-
-    warn = say
 
 
 def summary(scene: Path) -> dict:
@@ -221,7 +212,7 @@ def test_pandora_may_count_from_zero(tmp_path: Path) -> None:
 def test_polanalyser_agrees_on_the_written_pictures(tmp_path: Path) -> None:
     """Degree and angle of polarization of the four written pictures, by an independent program."""
     reference = pytest.importorskip("polanalyser")
-    analyzers = [reference.polarizer(np.radians(angle)) for angle in (0, 45, 90, 135)]
+    analyzers = [reference.polarizer(np.radians(angle)) for angle in ANGLES]
     for name in ("pandora", "nersp"):
         write = {"pandora": write_pandora, "nersp": write_nersp}[name]
         prepare_scene(write(tmp_path / name), tmp_path / f"{name} out", PLAIN)

@@ -15,7 +15,8 @@ from tiny_capture import encode_srgb, write_picture
 
 from polarguide.capture.filter import estimate_shifts, orientation
 from polarguide.capture.filter.exif import apply_orientation
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 PLAIN = PrepareSettings(poses="none", gains="none", align=False, transfer="linear")
 CORNERS = ["top left", "top right", "bottom right", "bottom left"]

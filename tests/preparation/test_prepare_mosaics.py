@@ -22,7 +22,8 @@ from camera_files import (
 )
 
 from polarguide.capture.calibration import Calibration
-from polarguide.preparation import PrepareSettings, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 COLORED = PrepareSettings(sensor="IMX250MYR", poses="none", gains="none", demosaic="quarter")
 GRAY = replace(COLORED, sensor="IMX250MZR")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from camera_files import behind, smooth_light, write_shots
+from heard import Heard
 from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
@@ -16,21 +17,10 @@ from polarguide.capture.colmap import triangulate as points_module
 from polarguide.capture.colmap.visual_hull import sample_visual_hull
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, Reporter, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 FILTER = PrepareSettings(gains="none", align=False, transfer="linear")
-
-
-class Heard(Reporter):
-    """Keeps what was said."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.said.append(text)
-
-    warn = say
 
 
 def summary(scene: Path) -> dict:

@@ -24,28 +24,18 @@ from camera_files import (
     write_picture,
     write_shots,
 )
+from heard import Heard
 from relief import write_relief
 
 from polarguide.capture import load_scene
 from polarguide.capture.colmap.sfm import tone_mapped
 from polarguide.errors import PolarguideError
-from polarguide.preparation import PrepareSettings, Reporter, prepare_scene
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 
 MOSAIC = PrepareSettings(sensor="IMX250MYR", gains="none")
 FILTER = PrepareSettings(gains="none", align=False, transfer="linear")
 NAMES = ("v000", "v001", "v002")
-
-
-class Heard(Reporter):
-    """Keeps what was said."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.said.append(text)
-
-    warn = say
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import torch
 from raster_scenes import differences, in_view, outcome, posed
 
 from polarguide.errors import PolarguideError
-from polarguide.raster import ScreenStatistic, backends, choose_backend, cuda, rasterize_reference
+from polarguide.raster import ScreenStatistic, Splats, backends, choose_backend, cuda, rasterize_reference
 from polarguide.raster.cuda import load_gsplat, rasterize_cuda
 
 TOLERANCE = 2e-5
@@ -34,7 +34,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("channels", "statistic"), CASES)
-def test_pictures_gradients_and_statistics_are_those_of_the_twin(
+def test_pictures_gradients_and_statistics_are_those_of_the_reference(
     channels: int, statistic: tuple[int, ...] | None
 ) -> None:
     camera = posed(23, 21)
@@ -52,13 +52,13 @@ def test_a_statistic_costs_one_more_call_where_other_channels_are_there(
     channels: int, blended: list[int]
 ) -> None:
     camera = posed(16, 16)
-    inputs = [t.requires_grad_() for t in in_view(camera, 10, channels, seed=1)]
+    inputs = Splats(*(t.requires_grad_() for t in in_view(camera, 10, channels, seed=1)))
     statistic = ScreenStatistic((0, 1, 2))
-    rasterize_cuda(*inputs, camera, statistic=statistic).features.sum().backward()
+    rasterize_cuda(inputs, camera, statistic=statistic).features.sum().backward()
     assert gsplat_stand_in.calls == blended
     assert statistic.gradient is not None
     with torch.no_grad():
-        rasterize_cuda(*inputs, camera, statistic=statistic)
+        rasterize_cuda(inputs, camera, statistic=statistic)
     assert len(gsplat_stand_in.calls) == len(blended) + 1
 
 
@@ -112,7 +112,7 @@ def test_compiling_is_announced_while_it_happens(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (None, "no CUDA toolkit"),
         (RuntimeError("Error building extension 'gsplat_cuda':\nlong\nlog"), "Error building extension"),
@@ -121,10 +121,10 @@ def test_compiling_is_announced_while_it_happens(monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_a_failed_build_is_one_message_with_the_way_out(
-    monkeypatch: pytest.MonkeyPatch, content: object, told: str
+    monkeypatch: pytest.MonkeyPatch, content: object, message: str
 ) -> None:
     kernels(monkeypatch, content)
-    with pytest.raises(PolarguideError, match=told) as raised:
+    with pytest.raises(PolarguideError, match=message) as raised:
         load_gsplat(print)
     assert "--device cpu" in raised.value.remedy
     assert "\n" not in str(raised.value)

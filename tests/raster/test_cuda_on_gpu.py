@@ -1,4 +1,4 @@
-"""gsplat itself against the twin, on a GPU. Elsewhere ``test_cuda.py`` has what can be said without one."""
+"""gsplat against the reference implementation, on a GPU; ``test_cuda.py`` tests what needs none."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from importlib.metadata import version
 import pytest
 import torch
 from raster_scenes import (
-    Gaussians,
     Outcome,
     differences,
     in_view,
@@ -17,14 +16,16 @@ from raster_scenes import (
     round_gaussian,
 )
 
-from polarguide.raster import choose_backend, rasterize_reference
+from polarguide.raster import Splats, choose_backend, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, rasterize_cuda
 
 pytestmark = [
     pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA GPU"),
-    pytest.mark.skipif(not has_gsplat(), reason="gsplat is not installed"),
+    pytest.mark.skipif(
+        not torch.cuda.is_available(), reason="no CUDA GPU -> on a machine with one: make gpu-check"
+    ),
+    pytest.mark.skipif(not has_gsplat(), reason="no gsplat -> pip install '.[cuda]'"),
 ]
 
 # Norm of the difference over the norm, float32 with fast exponentials against float64.
@@ -32,7 +33,7 @@ TOLERANCES = {
     "features": 2e-5,
     "alpha": 2e-5,
     "gradient of means": 1e-3,
-    "gradient of quats": 1e-3,
+    "gradient of rotations": 1e-3,
     "gradient of scales": 1e-3,
     "gradient of opacities": 2e-4,
     "gradient of features": 1e-4,
@@ -45,19 +46,19 @@ def kernels() -> None:
     choose_backend("cuda")
 
 
-def there(gaussians: Gaussians) -> Gaussians:
-    return Gaussians(*(t.cuda() for t in gaussians))
+def there(gaussians: Splats) -> Splats:
+    return Splats(*(t.cuda() for t in gaussians))
 
 
 def here(found: Outcome) -> Outcome:
-    gradients = Gaussians(*(t.cpu() for t in found.gradients))
+    gradients = Splats(*(t.cpu() for t in found.gradients))
     statistic = None if found.statistic is None else found.statistic.cpu()
     return Outcome(found.features.cpu(), found.alpha.cpu(), found.radii.cpu(), gradients, statistic)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 6, 7, 8, 11, 32])
 @pytest.mark.parametrize("statistic", [None, (0,), (0, 1, 2), (1, 4)])
-def test_gsplat_agrees_with_the_twin(channels: int, statistic: tuple[int, ...] | None) -> None:
+def test_gsplat_agrees_with_the_reference(channels: int, statistic: tuple[int, ...] | None) -> None:
     if statistic and max(statistic) >= channels:
         statistic = tuple(range(channels))
     camera = posed(50, 37)
@@ -74,7 +75,7 @@ def test_a_large_picture_agrees_with_the_cpu() -> None:
     camera = posed(640, 480)
     small = in_view(posed(64, 48), 40, 8, seed=4)
     jitter = torch.randn(50 * 40, 3, generator=torch.Generator().manual_seed(0))
-    many = Gaussians(*(torch.cat([t] * 50) for t in small))
+    many = Splats(*(torch.cat([t] * 50) for t in small))
     many = many._replace(means=many.means + 0.3 * jitter, opacities=many.opacities * 0.3)
     found = here(outcome(rasterize_cuda, there(many), camera, (0, 1, 2)))
     expected = outcome(rasterize_cpu, many, camera, (0, 1, 2))
@@ -86,8 +87,8 @@ def test_a_large_picture_agrees_with_the_cpu() -> None:
 def test_alpha_is_capped_later_than_ours_in_the_first_version() -> None:
     """0.999 in 1.5.3, 0.99 in 1.6.0 and here: an opaque Gaussian hides more."""
     camera, opaque = looking_ahead(9, 9), round_gaussian(5.0, 0.9999)
-    assert float(rasterize_reference(*opaque, camera).alpha.max()) == pytest.approx(0.99, abs=1e-4)
-    found = rasterize_cuda(*there(opaque), camera).alpha
+    assert float(rasterize_reference(opaque, camera).alpha.max()) == pytest.approx(0.99, abs=1e-4)
+    found = rasterize_cuda(there(opaque), camera).alpha
     cap = 0.999 if version("gsplat").startswith("1.5") else 0.99
     assert float(found.max()) == pytest.approx(cap, abs=1e-4)
 

@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 from raster_scenes import (
-    Gaussians,
     difference,
     differences,
     in_view,
@@ -18,10 +17,10 @@ from raster_scenes import (
     round_gaussian,
 )
 
-from polarguide.raster import Rasterize, rasterize_reference
+from polarguide.raster import Rasterize, Splats, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 
-BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "twin"])
+BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "reference"])
 
 
 def finite(result: object) -> bool:
@@ -31,7 +30,7 @@ def finite(result: object) -> bool:
 
 @BOTH
 def test_no_gaussians_give_an_empty_picture(rasterize: Rasterize) -> None:
-    none = Gaussians(*(t[:0] for t in round_gaussian(1.0, 0.5)))
+    none = Splats(*(t[:0] for t in round_gaussian(1.0, 0.5)))
     result = outcome(rasterize, none, looking_ahead(20, 18), (0,))
     assert result.features.shape == (18, 20, 2)
     assert not result.features.any()
@@ -61,7 +60,7 @@ def test_gradients_are_zero_where_culled_and_right_elsewhere(rasterize: Rasteriz
     ahead = in_view(camera, 12, 3, seed=0)
     alone = outcome(rasterize, ahead, camera, (0, 1, 2))
     behind = ahead._replace(means=ahead.means * torch.tensor([1.0, 1.0, -1.0]))
-    mixed = Gaussians(*(torch.stack(pair, dim=1).flatten(0, 1) for pair in zip(behind, ahead, strict=True)))
+    mixed = Splats(*(torch.stack(pair, dim=1).flatten(0, 1) for pair in zip(behind, ahead, strict=True)))
     result = outcome(rasterize, mixed, camera, (0, 1, 2))
     torch.testing.assert_close(result.features, alone.features)
     for gradient, expected in zip(result.gradients, alone.gradients, strict=True):
@@ -89,9 +88,9 @@ def test_a_gaussian_that_covers_the_picture(rasterize: Rasterize, sigma: float) 
     result = outcome(rasterize, round_gaussian(sigma, 0.7), camera, (0, 1))
     assert finite(result)
     assert 0.68 < float(result.alpha.min()) <= float(result.alpha.max()) <= 0.7 + 1e-6
-    twin = outcome(rasterize_reference, round_gaussian(sigma, 0.7), camera, dtype=torch.float64)
-    assert difference(result.features, twin.features) < 1e-5
-    assert difference(result.gradients.features, twin.gradients.features) < 1e-5
+    reference = outcome(rasterize_reference, round_gaussian(sigma, 0.7), camera, dtype=torch.float64)
+    assert difference(result.features, reference.features) < 1e-5
+    assert difference(result.gradients.features, reference.gradients.features) < 1e-5
 
 
 @pytest.mark.parametrize("size", [1e9, 1e15, 1e30])
@@ -99,7 +98,7 @@ def test_scales_beyond_what_float32_can_square_do_not_break_the_picture(size: fl
     camera = looking_ahead(20, 20)
     good = in_view(camera, 10, 2, seed=1)
     huge = round_gaussian(size, 0.5)
-    result = outcome(rasterize_cpu, Gaussians(*(torch.cat(p) for p in zip(good, huge, strict=True))), camera)
+    result = outcome(rasterize_cpu, Splats(*(torch.cat(p) for p in zip(good, huge, strict=True))), camera)
     assert finite(result)
     assert 0 <= float(result.alpha.min()) <= float(result.alpha.max()) <= 1
 
@@ -133,7 +132,7 @@ def test_a_stack_of_opaque_gaussians_ends_early(count: int) -> None:
     assert all(not gradient[2:].any() for gradient in (*result.gradients, result.statistic))
 
 
-def test_early_ends_agree_with_the_twin() -> None:
+def test_early_ends_agree_with_the_reference() -> None:
     camera = posed(30, 26)
     gaussians = in_view(camera, 150, 4, seed=21)
     gaussians = gaussians._replace(opacities=gaussians.opacities.clamp(min=0.8, max=0.97))
@@ -170,7 +169,7 @@ def test_zero_quaternions_and_zero_scales_are_points() -> None:
     camera = looking_ahead(20, 20)
     gaussians = in_view(camera, 15, 3, seed=9)
     for changed in (
-        gaussians._replace(quats=0 * gaussians.quats),
+        gaussians._replace(rotations=0 * gaussians.rotations),
         gaussians._replace(scales=0 * gaussians.scales),
     ):
         found = outcome(rasterize_cpu, changed, camera)
@@ -185,7 +184,7 @@ def test_gaussians_across_the_near_plane() -> None:
     camera = looking_ahead(24, 24)
     depth = torch.tensor([-0.5, 0.0, 0.005, 0.00999, 0.0101, 0.02, 0.1, 0.5])
     count = len(depth)
-    gaussians = Gaussians(
+    gaussians = Splats(
         torch.stack((torch.linspace(-0.5, 0.5, count), 0.1 * torch.ones(count), depth), dim=1),
         torch.randn(count, 4, generator=torch.Generator().manual_seed(1)),
         torch.full((count, 3), 0.2),
@@ -208,8 +207,8 @@ def test_radii_are_zero_outside_the_picture_and_three_sigma_inside(rasterize: Ra
     camera = looking_ahead(20, 20, focal=100.0)
     inside = round_gaussian(0.15, 0.5)
     outside = inside._replace(means=torch.tensor([[9.0, 0.0, 3.0]]))
-    pair = Gaussians(*(torch.cat(p) for p in zip(inside, outside, strict=True)))
-    radii = rasterize(*pair, camera).radii
+    pair = Splats(*(torch.cat(p) for p in zip(inside, outside, strict=True)))
+    radii = rasterize(pair, camera).radii
     assert float(radii[1]) == 0
     # 5 pixels of spread and the blur; the definition adds a little under the root to round ellipses.
     variance = (100 / 3 * 0.15) ** 2 + 0.3

@@ -7,27 +7,27 @@ import re
 
 import pytest
 import torch
-from raster_scenes import Gaussians, looking_ahead, repeated, round_gaussian
+from raster_scenes import looking_ahead, repeated, round_gaussian
 
 from polarguide.errors import PolarguideError
-from polarguide.raster import Rasterize, ScreenStatistic, choose_backend, rasterize_reference
+from polarguide.raster import Rasterize, ScreenStatistic, Splats, choose_backend, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 
-BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "twin"])
+BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "reference"])
 
 
 @BOTH
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("name", Gaussians._fields)
-def test_what_is_not_finite_is_refused_with_its_row(rasterize: Rasterize, name: str, value: float) -> None:
+@pytest.mark.parametrize("name", Splats._fields)
+def test_what_is_not_finite_is_refused_with_its_index(rasterize: Rasterize, name: str, value: float) -> None:
     camera = looking_ahead(8, 8)
-    for row in (0, 3, 5):
+    for index in (0, 3, 5):
         gaussians = repeated(round_gaussian(1.0, 0.5), 6)
         broken = getattr(gaussians, name).clone()
-        broken.view(6, -1)[row, -1] = value
+        broken.view(6, -1)[index, -1] = value
         with pytest.raises(PolarguideError, match=re.escape(f"rasterize({name})")) as error:
-            rasterize(*gaussians._replace(**{name: broken}), camera)
-        assert error.value.found == f"NaN or infinity in row {row}"
+            rasterize(gaussians._replace(**{name: broken}), camera)
+        assert error.value.found == f"NaN or infinity in Gaussian {index}"
 
 
 @BOTH
@@ -37,8 +37,8 @@ def test_what_is_not_finite_is_refused_with_its_row(rasterize: Rasterize, name: 
         ("means", (6, 2)),
         ("means", ()),
         ("means", (5, 3)),
-        ("quats", (6, 3)),
-        ("quats", (5, 4)),
+        ("rotations", (6, 3)),
+        ("rotations", (5, 4)),
         ("scales", (6,)),
         ("scales", (7, 3)),
         ("opacities", (6, 1)),
@@ -51,7 +51,7 @@ def test_what_is_not_finite_is_refused_with_its_row(rasterize: Rasterize, name: 
 def test_wrong_shapes_are_refused(rasterize: Rasterize, name: str, shape: tuple[int, ...]) -> None:
     gaussians = repeated(round_gaussian(1.0, 0.5), 6)
     with pytest.raises(PolarguideError, match=r"expected shape .* found"):
-        rasterize(*gaussians._replace(**{name: torch.ones(shape)}), looking_ahead(8, 8))
+        rasterize(gaussians._replace(**{name: torch.ones(shape)}), looking_ahead(8, 8))
 
 
 @BOTH
@@ -59,7 +59,7 @@ def test_wrong_shapes_are_refused(rasterize: Rasterize, name: str, shape: tuple[
 def test_channels_beyond_the_interface_are_refused(rasterize: Rasterize, channels: int) -> None:
     gaussians = round_gaussian(1.0, 0.5)._replace(features=torch.ones(1, channels))
     with pytest.raises(PolarguideError, match=f"1 to 32 channels, found {channels}"):
-        rasterize(*gaussians, looking_ahead(8, 8))
+        rasterize(gaussians, looking_ahead(8, 8))
 
 
 @BOTH
@@ -68,16 +68,16 @@ def test_statistic_over_channels_that_do_not_exist_is_refused(
     rasterize: Rasterize, channels: tuple[int, ...]
 ) -> None:
     with pytest.raises(PolarguideError, match="statistic"):
-        rasterize(*round_gaussian(1.0, 0.5), looking_ahead(8, 8), statistic=ScreenStatistic(channels))
+        rasterize(round_gaussian(1.0, 0.5), looking_ahead(8, 8), statistic=ScreenStatistic(channels))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64])
 def test_native_backend_refuses_other_number_types(dtype: torch.dtype) -> None:
     gaussians = round_gaussian(1.0, 0.5)
-    for name in Gaussians._fields:
+    for name in Splats._fields:
         with pytest.raises(PolarguideError, match=re.escape(f"rasterize({name}): expected float32")):
             rasterize_cpu(
-                *gaussians._replace(**{name: getattr(gaussians, name).to(dtype)}), looking_ahead(8, 8)
+                gaussians._replace(**{name: getattr(gaussians, name).to(dtype)}), looking_ahead(8, 8)
             )
 
 

@@ -14,19 +14,12 @@ from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
 from polarguide.gaussians.harmonics import SH_C0, sh_basis
 from polarguide.raster import Rasterize, ScreenStatistic, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.shading.deferred import (
-    COLOR_CHANNELS,
-    MAXIMUM_LOG_LIGHT,
-    Shading,
-    base_colors,
-    local_light,
-    mirrored,
-    reflect,
-    render,
-)
+from polarguide.shading.deferred import DeferredShading, local_light, reflect_reference
+from polarguide.shading.gbuffer import COLOR_CHANNELS, render
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, base_colors, mirrored
 
 COUNT, RESOLUTION = 30, 8
-LERP, FRESNEL = Shading("lerp"), Shading("fresnel", 1.5)
+LERP, FRESNEL = DeferredShading("lerp"), DeferredShading("fresnel")
 
 
 def camera() -> Camera:
@@ -35,7 +28,7 @@ def camera() -> Camera:
 
 
 @pytest.fixture
-def rows() -> dict[str, Tensor]:
+def gaussians() -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -83,11 +76,11 @@ def test_angle_out_is_angle_in_and_twice_is_none() -> None:
 
 
 @pytest.mark.parametrize("shading", [LERP, FRESNEL], ids=["lerp", "fresnel"])
-@pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "twin"])
+@pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "reference"])
 def test_layers_add_up_to_the_final_picture(
-    rows: dict[str, Tensor], rasterize: Rasterize, shading: Shading
+    gaussians: dict[str, Tensor], rasterize: Rasterize, shading: DeferredShading
 ) -> None:
-    result = render(rows, camera(), rasterize, environment={"texels": environment()}, shading=shading)
+    result = render(gaussians, camera(), rasterize, shading=shading, light={"texels": environment()})
     assert result.specular is not None
     assert result.diffuse is not None
     assert result.strength is not None
@@ -107,28 +100,30 @@ def test_layers_add_up_to_the_final_picture(
         assert float(share.max()) <= 1.0001
 
 
-def test_without_environment_there_is_no_reflection(rows: dict[str, Tensor]) -> None:
-    result = render(rows, camera(), rasterize_cpu)
+def test_without_environment_there_is_no_reflection(gaussians: dict[str, Tensor]) -> None:
+    result = render(gaussians, camera(), rasterize_cpu)
     assert result.specular is result.diffuse is result.reflection is result.strength is result.depth is None
-    assert result.final is result.base
+    assert torch.equal(result.final, result.base)
     assert result.normal is not None
-    assert render(rows, camera(), rasterize_cpu, normals=False).normal is None
+    assert render(gaussians, camera(), rasterize_cpu, normals=False).normal is None
 
 
-def test_the_base_does_not_depend_on_what_else_is_splatted(rows: dict[str, Tensor]) -> None:
-    plain = render(rows, camera(), rasterize_cpu, normals=False)
-    full = render(rows, camera(), rasterize_cpu, environment={"texels": environment()}, depth=True)
+def test_the_base_does_not_depend_on_what_else_is_splatted(gaussians: dict[str, Tensor]) -> None:
+    plain = render(gaussians, camera(), rasterize_cpu, normals=False)
+    full = render(
+        gaussians, camera(), rasterize_cpu, shading=LERP, light={"texels": environment()}, depth=True
+    )
     for name in ("base", "alpha", "radii"):
         torch.testing.assert_close(getattr(plain, name), getattr(full, name))
 
 
-def test_strength_zero_shows_the_base_and_strength_one_the_mirror(rows: dict[str, Tensor]) -> None:
+def test_strength_zero_shows_the_base_and_strength_one_the_mirror(gaussians: dict[str, Tensor]) -> None:
     base, normal = torch.rand(20, 24, 3), torch.randn(20, 24, 3)
     nothing, everything = torch.zeros(20, 24), torch.ones(20, 24)
     for shading in (LERP, FRESNEL):
-        matte = reflect(base, normal, nothing, environment(), camera(), shading)
+        matte = reflect_reference(base, normal, nothing, environment(), camera(), shading)
         assert torch.equal(matte["final"], base)
-    mirror = reflect(base, normal, everything, environment(), camera(), LERP)
+    mirror = reflect_reference(base, normal, everything, environment(), camera(), LERP)
     assert torch.equal(mirror["final"], mirror["reflection"])
 
 
@@ -137,7 +132,7 @@ def test_a_dielectric_reflects_as_fresnel_says() -> None:
     brewster = math.atan(1.5)
     cosines = torch.tensor([1.0, math.cos(brewster), 0.0])[:, None]
     black, one = torch.zeros(3, 3), torch.ones(3, 1)
-    specular, diffuse = FRESNEL.layers(black, one, torch.ones(3, 3), cosines)
+    specular, diffuse = FRESNEL.contributions(black, one, torch.ones(3, 3), cosines)
     s_alone = math.sin(2 * brewster - math.pi / 2) ** 2
     torch.testing.assert_close(specular[:, 0], torch.tensor([0.04, s_alone / 2, 1.0]), atol=1e-5, rtol=1e-4)
     assert not diffuse.any()
@@ -145,9 +140,9 @@ def test_a_dielectric_reflects_as_fresnel_says() -> None:
 
 def test_light_of_texels() -> None:
     raw = torch.tensor([-100.0, 0.0, 2.0, 100.0])
-    torch.testing.assert_close(LERP.light(raw), torch.tensor([0.0, 0.5, 1 / (1 + math.exp(-2)), 1.0]))
+    torch.testing.assert_close(LERP.radiance(raw), torch.tensor([0.0, 0.5, 1 / (1 + math.exp(-2)), 1.0]))
     torch.testing.assert_close(
-        FRESNEL.light(raw), torch.tensor([0.0, 1.0, math.exp(2), math.exp(MAXIMUM_LOG_LIGHT)])
+        FRESNEL.radiance(raw), torch.tensor([0.0, 1.0, math.exp(2), math.exp(MAXIMUM_LOG_LIGHT)])
     )
 
 
@@ -157,15 +152,15 @@ def test_a_mirror_facing_the_camera_shows_what_is_behind_it() -> None:
     light[5] = 20.0  # OpenGL's order: +x, -x, +y, -y, +z, -z
     size, strength = (20, 24, 3), torch.ones(20, 24)
     toward = torch.tensor([0.0, 0.0, -1.0]).expand(size)
-    seen = reflect(torch.zeros(size), toward, strength, light, camera(), LERP)["final"]
+    seen = reflect_reference(torch.zeros(size), toward, strength, light, camera(), LERP)["final"]
     assert float(seen.min()) > 0.99
     tilted = torch.tensor([0.0, -math.sin(math.pi / 4), -math.cos(math.pi / 4)]).expand(size)
-    missed = reflect(torch.zeros(size), tilted, strength, light, camera(), LERP)["final"]
+    missed = reflect_reference(torch.zeros(size), tilted, strength, light, camera(), LERP)["final"]
     assert float(missed[10, 12].max()) < 0.01
 
 
-def test_depth_of_one_gaussian_is_its_camera_depth(rows: dict[str, Tensor]) -> None:
-    one = {name: t[:1].clone() for name, t in rows.items()}
+def test_depth_of_one_gaussian_is_its_camera_depth(gaussians: dict[str, Tensor]) -> None:
+    one = {name: t[:1].clone() for name, t in gaussians.items()}
     one["means"] = torch.tensor([[0.0, 0.1, 0.5]])
     one["log_scales"] = torch.zeros(1, 3)
     result = render(one, camera(), rasterize_cpu, depth=True)
@@ -173,34 +168,34 @@ def test_depth_of_one_gaussian_is_its_camera_depth(rows: dict[str, Tensor]) -> N
     torch.testing.assert_close(result.depth, torch.full((20, 24), 4.5), rtol=1e-5, atol=0)
 
 
-def test_base_colors_are_never_negative_and_gray_without_harmonics(rows: dict[str, Tensor]) -> None:
-    rows["sh_dc"] = rows["sh_dc"] * 5
-    assert float(base_colors(rows, torch.zeros(3), 3).min()) == 0
-    rows["sh_dc"] = 0 * rows["sh_dc"]
-    gray = base_colors(rows, torch.zeros(3), 0)
+def test_base_colors_are_never_negative_and_gray_without_harmonics(gaussians: dict[str, Tensor]) -> None:
+    gaussians["sh_dc"] = gaussians["sh_dc"] * 5
+    assert float(base_colors(gaussians, torch.zeros(3), 3).min()) == 0
+    gaussians["sh_dc"] = 0 * gaussians["sh_dc"]
+    gray = base_colors(gaussians, torch.zeros(3), 0)
     torch.testing.assert_close(gray, torch.full((COUNT, 3), 0.5))
 
 
-def test_degree_zero_does_not_depend_on_the_direction(rows: dict[str, Tensor]) -> None:
+def test_degree_zero_does_not_depend_on_the_direction(gaussians: dict[str, Tensor]) -> None:
     here, there = torch.zeros(3), torch.tensor([3.0, 1.0, -2.0])
-    assert torch.equal(base_colors(rows, here, 0), base_colors(rows, there, 0))
-    assert not torch.allclose(base_colors(rows, here, 3), base_colors(rows, there, 3), atol=1e-3)
+    assert torch.equal(base_colors(gaussians, here, 0), base_colors(gaussians, there, 0))
+    assert not torch.allclose(base_colors(gaussians, here, 3), base_colors(gaussians, there, 3), atol=1e-3)
 
 
 @pytest.mark.parametrize("shading", [LERP, FRESNEL], ids=["lerp", "fresnel"])
 @pytest.mark.parametrize("reflects", [False, True])
-def test_every_row_that_shows_gets_a_finite_gradient(
-    rows: dict[str, Tensor], reflects: bool, shading: Shading
+def test_every_parameter_that_shows_gets_a_finite_gradient(
+    gaussians: dict[str, Tensor], reflects: bool, shading: DeferredShading
 ) -> None:
-    trained = {name: t.clone().requires_grad_() for name, t in rows.items()}
+    trained = {name: t.clone().requires_grad_() for name, t in gaussians.items()}
     texels = environment().requires_grad_()
     statistic = ScreenStatistic(COLOR_CHANNELS)
     result = render(
         trained,
         camera(),
         rasterize_cpu,
-        environment={"texels": texels} if reflects else None,
-        shading=shading,
+        shading=shading if reflects else PLAIN,
+        light={"texels": texels},
         statistic=statistic,
     )
     loss = result.final.square().mean()
@@ -217,14 +212,14 @@ def test_every_row_that_shows_gets_a_finite_gradient(
 
 
 @pytest.mark.parametrize("shading", [LERP, FRESNEL], ids=["lerp", "fresnel"])
-def test_native_and_twin_render_the_same_with_gradients(rows: dict[str, Tensor], shading: Shading) -> None:
+def test_native_and_reference_render_the_same_with_gradients(
+    gaussians: dict[str, Tensor], shading: DeferredShading
+) -> None:
     outcomes = []
     for rasterize, dtype in ((rasterize_cpu, torch.float32), (rasterize_reference, torch.float64)):
-        trained = {name: t.to(dtype).detach().clone().requires_grad_() for name, t in rows.items()}
+        trained = {name: t.to(dtype).detach().clone().requires_grad_() for name, t in gaussians.items()}
         texels = environment().to(dtype).detach().requires_grad_()
-        result = render(
-            trained, camera(), rasterize, environment={"texels": texels}, shading=shading, depth=True
-        )
+        result = render(trained, camera(), rasterize, shading=shading, light={"texels": texels}, depth=True)
         result.final.square().mean().backward()
         outcomes.append((result, {name: t.grad for name, t in trained.items()}))
     (fast, fast_gradients), (slow, slow_gradients) = outcomes
@@ -240,70 +235,66 @@ def test_native_and_twin_render_the_same_with_gradients(rows: dict[str, Tensor],
         assert float((found.double() - expected).norm()) < 1e-3 * float(expected.norm()), name
 
 
-LOCAL = Shading("fresnel", 1.5, local=True)
+LOCAL = DeferredShading("fresnel", local=True)
 
 
-def test_local_light_that_is_nothing_changes_nothing(rows: dict[str, Tensor]) -> None:
-    rows |= {"local_dc": torch.zeros(COUNT, 3), "local_rest": torch.zeros(COUNT, 15, 3)}
+def test_local_light_that_is_nothing_changes_nothing(gaussians: dict[str, Tensor]) -> None:
+    gaussians |= {"local_dc": torch.zeros(COUNT, 3), "local_rest": torch.zeros(COUNT, 15, 3)}
     without = render(
-        rows, camera(), rasterize_reference, environment={"texels": environment()}, shading=FRESNEL
+        gaussians, camera(), rasterize_reference, shading=FRESNEL, light={"texels": environment()}
     )
-    with_it = render(
-        rows, camera(), rasterize_reference, environment={"texels": environment()}, shading=LOCAL
-    )
+    with_it = render(gaussians, camera(), rasterize_reference, shading=LOCAL, light={"texels": environment()})
     torch.testing.assert_close(with_it.final, without.final)
 
 
-def test_local_light_adds_to_the_environments_before_fresnel(rows: dict[str, Tensor]) -> None:
+def test_local_light_adds_to_the_environments_before_fresnel(gaussians: dict[str, Tensor]) -> None:
     """Of degree 0 it is a constant, blended by the weights that sum to alpha."""
-    rows |= {"local_dc": torch.full((COUNT, 3), 0.5 / SH_C0), "local_rest": torch.zeros(COUNT, 15, 3)}
+    gaussians |= {"local_dc": torch.full((COUNT, 3), 0.5 / SH_C0), "local_rest": torch.zeros(COUNT, 15, 3)}
     without = render(
-        rows, camera(), rasterize_reference, environment={"texels": environment()}, shading=FRESNEL
+        gaussians, camera(), rasterize_reference, shading=FRESNEL, light={"texels": environment()}
     )
-    with_it = render(
-        rows, camera(), rasterize_reference, environment={"texels": environment()}, shading=LOCAL
-    )
+    with_it = render(gaussians, camera(), rasterize_reference, shading=LOCAL, light={"texels": environment()})
     assert without.reflection is not None
     assert with_it.reflection is not None
     torch.testing.assert_close(with_it.reflection, without.reflection + 0.5 * without.alpha[..., None])
     torch.testing.assert_close(with_it.base, without.base)
 
 
-def test_local_light_is_that_of_the_mirrored_direction(rows: dict[str, Tensor]) -> None:
+def test_local_light_is_that_of_the_mirrored_direction(gaussians: dict[str, Tensor]) -> None:
     generator = torch.Generator().manual_seed(3)
-    rows |= {
+    gaussians |= {
         "local_dc": torch.randn(COUNT, 3, generator=generator),
         "local_rest": torch.randn(COUNT, 15, 3, generator=generator),
     }
     rays, normals = (directions(seed)[:COUNT].float() for seed in (4, 5))
     mirrors = mirrored(rays, normals)
-    light = local_light(rows, mirrors, 3)
+    light = local_light(gaussians, mirrors, 3)
     basis = sh_basis(mirrors, 3)
-    coefficients = torch.cat((rows["local_dc"][:, None], rows["local_rest"]), dim=1)
+    coefficients = torch.cat((gaussians["local_dc"][:, None], gaussians["local_rest"]), dim=1)
     torch.testing.assert_close(light, (basis[..., None] * coefficients).sum(1), atol=1e-5, rtol=1e-5)
 
 
-def test_normals_keep_their_outer_side_past_the_silhouette(rows: dict[str, Tensor]) -> None:
+def test_normals_keep_their_outer_side_past_the_silhouette(gaussians: dict[str, Tensor]) -> None:
     """A Gaussian that faces slightly away is turned over without its outer side, and stays with it."""
     center = camera().center.float()
-    rows["outward"] = torch.zeros(COUNT, 3)
-    shape = (rows["means"], rows["quaternions"], rows["log_scales"], center)
+    gaussians["outward"] = torch.zeros(COUNT, 3)
+    shape = (gaussians["means"], gaussians["quaternions"], gaussians["log_scales"], center)
     flipped = shortest_axis_normals(*shape)
-    torch.testing.assert_close(shortest_axis_normals(*shape, rows["outward"]), flipped)
-    cosine = (flipped * normalize(center - rows["means"], dim=-1)).sum(-1)
+    torch.testing.assert_close(shortest_axis_normals(*shape, gaussians["outward"]), flipped)
+    cosine = (flipped * normalize(center - gaussians["means"], dim=-1)).sum(-1)
     outward = -flipped
     kept = shortest_axis_normals(*shape, outward)
     grazing = cosine < GRAZING
     assert 3 < int(grazing.sum()) < COUNT
     torch.testing.assert_close(kept[grazing], -flipped[grazing])
     torch.testing.assert_close(kept[~grazing], flipped[~grazing])
-    rows["outward"] = outward
+    gaussians["outward"] = outward
     normal = render(
-        rows, camera(), rasterize_reference, environment={"texels": environment()}, shading=FRESNEL
+        gaussians, camera(), rasterize_reference, shading=FRESNEL, light={"texels": environment()}
     ).normal
-    del rows["outward"]
+    del gaussians["outward"]
     other = render(
-        rows, camera(), rasterize_reference, environment={"texels": environment()}, shading=FRESNEL
+        gaussians, camera(), rasterize_reference, shading=FRESNEL, light={"texels": environment()}
     ).normal
     assert normal is not None
     assert other is not None

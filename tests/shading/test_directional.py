@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,12 +13,12 @@ from torch.testing import assert_close
 
 from polarguide.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.shading.deferred import render
 from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
+from polarguide.shading.gbuffer import render
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, mirrored
 
-SHADING = DirectionalShading(width=8)
+SHADING = DirectionalShading(width=8, environment_resolution=8, environment_spread=1.0)
 COUNT, RESOLUTION, LEVELS = 30, 8, 5
 
 
@@ -31,19 +32,19 @@ def normal(seed: int, *shape: int) -> Tensor:
 
 
 def light(dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-    values = SHADING.first_light_values(RESOLUTION, 1.0, torch.Generator().manual_seed(0))
+    values = SHADING.initial_light(torch.Generator().manual_seed(0))
     return {name: t.to(dtype) for name, t in values.items()}
 
 
 @pytest.fixture
-def rows() -> dict[str, Tensor]:
+def gaussians() -> dict[str, Tensor]:
     core = {
         "means": 0.7 * normal(1, COUNT, 3),
         "quaternions": normal(2, COUNT, 4),
         "log_scales": -1.5 + 0.5 * normal(3, COUNT, 3),
         "opacity_logits": normal(4, COUNT),
     }
-    return core | SHADING.first_parameters(torch.rand(COUNT, 3), torch.Generator().manual_seed(5))
+    return core | SHADING.initial_parameters(torch.rand(COUNT, 3), torch.Generator().manual_seed(5))
 
 
 def plainly(values: dict[str, Tensor], ray: Tensor, roughness: Tensor, feature: Tensor) -> Tensor:
@@ -103,8 +104,8 @@ def test_length_of_a_feature_does_not_matter_and_brightness_has_an_end() -> None
     assert_close(SHADING.radiance(bright, rays, roughness, features), brightest)
 
 
-def test_layers_add_up_to_the_final_picture(rows: dict[str, Tensor]) -> None:
-    result = render(rows, camera(), rasterize_cpu, environment=light(), shading=SHADING, depth=True)
+def test_layers_add_up_to_the_final_picture(gaussians: dict[str, Tensor]) -> None:
+    result = render(gaussians, camera(), rasterize_cpu, shading=SHADING, light=light(), depth=True)
     assert result.specular is not None
     assert result.diffuse is not None
     assert torch.equal(result.specular + result.diffuse, result.final)
@@ -116,26 +117,29 @@ def test_layers_add_up_to_the_final_picture(rows: dict[str, Tensor]) -> None:
     assert result.depth is not None
 
 
-def test_without_harmonics_the_view_changes_only_the_specular_layer(rows: dict[str, Tensor]) -> None:
-    """Of one opaque Gaussian that fills the picture the albedo is that of its row, wherever the camera stands."""
-    one = {name: t[:1].clone() for name, t in rows.items()}
+def test_without_harmonics_the_view_changes_only_the_specular_layer(gaussians: dict[str, Tensor]) -> None:
+    """Of one opaque Gaussian that fills the picture the albedo is its own, wherever the camera stands."""
+    one = {name: t[:1].clone() for name, t in gaussians.items()}
     one["means"], one["log_scales"] = torch.zeros(1, 3), torch.full((1, 3), 3.0)
-    result = render(one, camera(), rasterize_cpu, environment=light(), shading=SHADING)
+    result = render(one, camera(), rasterize_cpu, shading=SHADING, light=light())
     color = result.diffuse[10, 12] / result.alpha[10, 12]  # type: ignore[index]
     assert_close(color, albedo_of(one)[0], rtol=1e-4, atol=1e-5)
 
 
 def test_first_values_are_those_asked_for() -> None:
-    shading = DirectionalShading(width=8, first_albedo=0.4, first_roughness=0.3, first_light=0.1)
+    shading = replace(
+        SHADING, first_albedo=0.4, first_roughness=0.3, first_light=0.1, environment_resolution=4
+    )
     colors = torch.tensor([[0.5, 0.2, 0.1], [0.0, 1.0, 0.3]])
-    rows = shading.first_parameters(colors, torch.Generator().manual_seed(0))
-    assert_close(albedo_of(rows), (0.4 * colors).clamp(min=1e-3))
-    assert_close(torch.sigmoid(rows["roughness_logits"]), torch.full((2,), 0.3))
-    values = shading.first_light_values(4, 0.5, torch.Generator().manual_seed(0))
+    gaussians = shading.initial_parameters(colors, torch.Generator().manual_seed(0))
+    assert_close(albedo_of(gaussians), (0.4 * colors).clamp(min=1e-3))
+    assert_close(torch.sigmoid(gaussians["roughness_logits"]), torch.full((2,), 0.3))
+    values = shading.initial_light(torch.Generator().manual_seed(0))
     assert values["texels"].shape == (6, 4, 4, CHANNELS)
     assert_close(values["mlp_bias_2"].exp(), torch.full((3,), 0.1))
-    assert set(shading.rates(1.0)) == set(values)
-    assert shading.rates(1.0)["texels"] == 1.0
+    table = replace(shading, environment_rate=1.0).light_parameters
+    assert {name: tuple(t.shape) for name, t in values.items()} == {n: p.shape for n, p in table.items()}
+    assert table["texels"].rate == 1.0
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-12, 1e-3])
@@ -152,10 +156,10 @@ def test_degenerate_normals_and_features_stay_finite_with_gradients(scale: float
         assert bool(torch.isfinite(tensor).all())
 
 
-def test_every_row_and_parameter_gets_a_gradient(rows: dict[str, Tensor]) -> None:
-    trained = {name: t.clone().requires_grad_() for name, t in rows.items()}
+def test_every_parameter_gets_a_gradient(gaussians: dict[str, Tensor]) -> None:
+    trained = {name: t.clone().requires_grad_() for name, t in gaussians.items()}
     values = {name: t.requires_grad_() for name, t in light().items()}
-    result = render(trained, camera(), rasterize_cpu, environment=values, shading=SHADING)
+    result = render(trained, camera(), rasterize_cpu, shading=SHADING, light=values)
     result.final.square().mean().backward()
     for name, tensor in (trained | values).items():
         assert tensor.grad is not None, name
@@ -163,11 +167,11 @@ def test_every_row_and_parameter_gets_a_gradient(rows: dict[str, Tensor]) -> Non
         assert bool(tensor.grad.any()), name
 
 
-def test_a_gaussian_alone_is_its_albedo_and_the_light_in_its_mirror(rows: dict[str, Tensor]) -> None:
+def test_a_gaussian_alone_is_its_albedo_and_the_light_in_its_mirror(gaussians: dict[str, Tensor]) -> None:
     rays = normalize(normal(15, COUNT, 3), dim=-1)
     normals = normalize(normal(16, COUNT, 3), dim=-1)
     normals = torch.where((normals * rays).sum(-1, keepdim=True) > 0, -normals, normals)
-    fields = SHADING.fields(rows)
+    fields = SHADING.fields(gaussians)
     assert {name: tuple(t.shape[1:]) for name, t in fields.items()} == {
         "albedo": (3,),
         "roughness": (),
@@ -176,4 +180,4 @@ def test_a_gaussian_alone_is_its_albedo_and_the_light_in_its_mirror(rows: dict[s
     expected = fields["albedo"] + SHADING.radiance(
         light(), mirrored(rays, normals), fields["roughness"], fields["feature"]
     )
-    assert_close(SHADING.colors(rows, light(), rays, normals), expected)
+    assert_close(SHADING.colors(gaussians, light(), rays, normals), expected)

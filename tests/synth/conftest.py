@@ -1,14 +1,22 @@
-"""For the rendering tests: Mitsuba, or a reason to skip; and which of its variants can be used here."""
+"""For the rendering tests: Mitsuba, or a reason to skip; and its variants, all paths compiled or one path at a time."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import pytest
 
 from polarguide.synth.variant import Variant, choose_variant
 
 
-@pytest.fixture(scope="session")
-def variant() -> Variant:
-    """The fastest polarized variant of this machine: compiled, or one path at a time where LLVM is missing."""
-    pytest.importorskip("mitsuba", reason="Mitsuba is not installed (pip install 'polarguide[synth]')")
-    return choose_variant("rgb", threads=1)
+@pytest.fixture(scope="session", params=["compiled", "scalar"])
+def variant(request: pytest.FixtureRequest) -> Iterator[Variant]:
+    """A polarized variant, which is current: the one that is taken with LLVM, and the one without."""
+    pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "scalar":
+            patch.setattr("polarguide.synth.variant._llvm_lack", lambda: "not wanted here")
+        chosen = choose_variant("rgb", threads=1)
+        if chosen.fast != (request.param == "compiled"):
+            pytest.skip("no LLVM for Mitsuba's compiled variants -> apt-get install libllvm19")
+        yield chosen

@@ -13,15 +13,14 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
+from polarguide.camera import Camera, look_at
 from polarguide.synth.build import BuiltScene, build_scene
-from polarguide.synth.cameras import look_at
 from polarguide.synth.film import LobeRadiance, render_lobes
 from polarguide.synth.geometry import ground_truth_maps
-from polarguide.synth.mesh import unit
 from polarguide.synth.schema import parse_scene
 from polarguide.synth.transport import PathLimits
 from polarguide.synth.variant import Variant
+from polarguide.vectors import unit_array as unit
 
 INDEX = 1.5
 BALL = {
@@ -41,7 +40,9 @@ BALL = {
 @pytest.fixture(scope="module")
 def camera() -> Camera:
     """Off the axis of the ball, so that frames off the axis count, and turned against the world."""
-    return look_at(np.array([2.2, -1.4, 1.1]), np.array([0.2, 0.15, 0.1]), 20, 16, 20.0)
+    return Camera(
+        20, 16, 20.0, 20.0, 10.0, 8.0, *look_at((2.2, -1.4, 1.1), (0.2, 0.15, 0.1), (0.0, 0.0, 1.0))
+    )
 
 
 @pytest.fixture(scope="module")

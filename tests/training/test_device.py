@@ -16,7 +16,7 @@ from torch.utils._pytree import tree_leaves
 
 from polarguide.camera import Camera
 from polarguide.capture import Scene
-from polarguide.raster import Backend, Rasterized, ScreenStatistic
+from polarguide.raster import Backend, Rasterized, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
 from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import Trainer, TrainSettings, first_state
@@ -73,17 +73,8 @@ class _Splat(torch.autograd.Function):
         return (*(torch.empty_like(t) for t in ctx.saved_tensors), None, None)
 
 
-def stand_in(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    camera: Camera,
-    *,
-    statistic: ScreenStatistic | None = None,
-) -> Rasterized:
-    return Rasterized(*_Splat.apply(means, quats, scales, opacities, features, camera, statistic))
+def stand_in(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
+    return Rasterized(*_Splat.apply(*splats, camera, statistic))
 
 
 @pytest.fixture(autouse=True)
@@ -113,7 +104,7 @@ def look_at_all(trainer: Trainer, step: int) -> None:
     """A step of the stage at ``step`` on every training view, without a round of the density control."""
     for slot in range(len(trainer.scene.train_views)):
         trainer.state.step = step
-        trainer._look(slot, trainer.schedule.at(step).stage, True)
+        trainer._backpropagate(slot, trainer.schedule.at(step).stage, True)
         trainer._join_gradients(idle=False)
         trainer._optimize()
 

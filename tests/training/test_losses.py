@@ -14,6 +14,7 @@ from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.color import srgb_encode
 from polarguide.errors import PolarguideError
+from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult
 from polarguide.training.losses import (
     azimuth_loss,
@@ -28,6 +29,7 @@ from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Weights
 
 SIZE = (12, 14)
+GLASS = DeferredShading("fresnel").bind(1.5)
 SCALES = torch.tensor([[-3.0, -2.0, -1.0], [-1.0, -4.0, -2.0], [0.0, 0.0, -5.0]])
 
 
@@ -144,12 +146,12 @@ def test_chromatic_loss_has_a_weight_of_its_own(priors: ViewPriors) -> None:
 
 def test_stokes_loss_is_zero_for_the_layers_and_normals_that_were_measured(priors: ViewPriors) -> None:
     rendered = result(specular=LAYERS[0], diffuse=LAYERS[1], normal=0.7 * FACING)
-    assert float(stokes_loss(rendered, priors, 1.5)) == pytest.approx(0.0, abs=1e-6)
-    assert float(stokes_loss(rendered, priors, 1.4)) > 1e-3
+    assert float(stokes_loss(rendered, priors, GLASS)) == pytest.approx(0.0, abs=1e-6)
+    assert float(stokes_loss(rendered, priors, GLASS.bind(1.4))) > 1e-3
     swapped = result(specular=LAYERS[1], diffuse=LAYERS[0], normal=FACING)
-    assert float(stokes_loss(swapped, priors, 1.5)) > 1e-2
+    assert float(stokes_loss(swapped, priors, GLASS)) > 1e-2
     nothing = replace(priors, reliable=torch.zeros(SIZE))
-    assert float(stokes_loss(swapped, nothing, 1.5)) == 0
+    assert float(stokes_loss(swapped, nothing, GLASS)) == 0
 
 
 def test_stokes_loss_turns_a_normal_to_the_one_that_was_measured(priors: ViewPriors) -> None:
@@ -158,7 +160,7 @@ def test_stokes_loss_turns_a_normal_to_the_one_that_was_measured(priors: ViewPri
     optimizer = torch.optim.Adam([normal], lr=0.01)
     for _ in range(300):
         optimizer.zero_grad()
-        stokes_loss(result(specular=LAYERS[0], diffuse=LAYERS[1], normal=normal), priors, 1.5).backward()
+        stokes_loss(result(specular=LAYERS[0], diffuse=LAYERS[1], normal=normal), priors, GLASS).backward()
         optimizer.step()
     before = (start * FACING).sum(-1).clamp(-1, 1).acos().mean()
     after = (normalize(normal.detach(), dim=-1) * FACING).sum(-1).clamp(-1, 1).acos().mean()
@@ -169,7 +171,7 @@ def test_stokes_loss_is_finite_where_there_is_no_light_and_no_normal(priors: Vie
     dark = replace(priors, stokes=torch.zeros(3, *SIZE, 3))
     layers = [torch.zeros(*SIZE, 3, requires_grad=True) for _ in range(3)]
     rendered = result(specular=layers[0], diffuse=layers[1], normal=layers[2])
-    stokes_loss(rendered, dark, 1.5).backward()
+    stokes_loss(rendered, dark, GLASS).backward()
     for layer in layers:
         assert layer.grad is not None
         assert bool(torch.isfinite(layer.grad).all())
@@ -197,7 +199,7 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         stokes=1.1,
     )
     total, photometric = step_loss(
-        rendered, shown, valid, weights, priors, ssim_weight=0.3, index=1.5, log_scales=SCALES, extent=2.0
+        rendered, shown, valid, weights, priors, ssim_weight=0.3, shading=GLASS, log_scales=SCALES, extent=2.0
     )
     assert rendered.specular is not None
     assert rendered.diffuse is not None
@@ -211,7 +213,7 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         + 0.4 * azimuth_loss(rendered.normal, priors)
         + 0.6 * chromatic_loss(rendered.normal, priors)
         + 0.9 * flatness_loss(SCALES, rendered.radii, 2.0)
-        + 1.1 * stokes_loss(rendered, priors, 1.5)
+        + 1.1 * stokes_loss(rendered, priors, GLASS)
     )
     assert float(total) == pytest.approx(float(expected), rel=1e-5)
     assert float(photometric) == pytest.approx(float(expected_photometric), rel=1e-6)
@@ -228,7 +230,7 @@ def test_a_perfect_picture_costs_nothing(priors: ViewPriors) -> None:
         weights,
         priors,
         ssim_weight=0.2,
-        index=1.5,
+        shading=GLASS,
         log_scales=SCALES,
         extent=2.0,
     )
@@ -239,7 +241,7 @@ def test_layers_that_a_recipe_lacks_are_left_out(priors: ViewPriors) -> None:
     weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
     shown = srgb_encode(picture(6))
     total, photometric = step_loss(
-        result(), shown, None, weights, priors, ssim_weight=0.2, index=1.5, log_scales=SCALES, extent=2.0
+        result(), shown, None, weights, priors, ssim_weight=0.2, shading=GLASS, log_scales=SCALES, extent=2.0
     )
     assert torch.equal(total, photometric)
     total, photometric = step_loss(
@@ -249,7 +251,7 @@ def test_layers_that_a_recipe_lacks_are_left_out(priors: ViewPriors) -> None:
         weights,
         None,
         ssim_weight=0.2,
-        index=1.5,
+        shading=GLASS,
         log_scales=SCALES,
         extent=2.0,
     )
@@ -266,7 +268,7 @@ def test_a_loss_that_is_not_finite_is_an_error(priors: ViewPriors) -> None:
             Weights(normal=0.1),
             priors,
             ssim_weight=0.2,
-            index=1.5,
+            shading=GLASS,
             log_scales=SCALES,
             extent=2.0,
         )

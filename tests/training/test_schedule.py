@@ -117,15 +117,15 @@ def test_fractions_of_every_recipe_add_up(recipe: Recipe) -> None:
 
 
 @EVERY_RECIPE
-def test_every_recipe_is_named_told_and_trains_what_it_renders(recipe: Recipe) -> None:
+def test_every_recipe_is_named_described_and_trains_what_it_renders(recipe: Recipe) -> None:
     assert RECIPES[recipe.name] is recipe
     assert recipe.about.endswith(".")
     core = {"means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest"}
     assert core <= set(recipe.rates)
     assert all(set(stage.rate_factors) <= set(recipe.rates) for stage in recipe.stages)
-    side = "strength_logits" if recipe.directional is None else "log_albedo"
-    assert (side in recipe.rates) == recipe.reflects
-    assert "texels" in recipe.environment_rates
+    assert set(recipe.learning_rates) == set(recipe.shapes) - {"outward"}
+    assert recipe.shading.reflects == any(stage.reflection for stage in recipe.stages)
+    assert recipe.shading.reflects == bool(recipe.light_rates)
     assert list(recipe.sh_fractions) == sorted(recipe.sh_fractions)
 
 

@@ -15,11 +15,12 @@ from polarguide.errors import PolarguideError
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import StepReport, Trainer, TrainSettings, first_state
 
 STEPS, STOP = 60, 25
-DIRECTIONAL_ROWS = ("log_albedo", "roughness_logits", "features")
+DIRECTIONAL = ("log_albedo", "roughness_logits", "features")
 
 
 def train(
@@ -49,9 +50,11 @@ def test_every_recipe_trains(tiny_scene: Scene, name: str) -> None:
     assert {report.stage for report in reports} == {stage.name for stage in RECIPES[name].stages}
     floats = {k: t for k, t in trainer.state.tensors().items() if t.is_floating_point()}
     assert all(bool(torch.isfinite(t).all()) for t in floats.values())
-    assert ("environment.texels" in floats) == RECIPES[name].reflects
-    side = {"strength_logits"} if RECIPES[name].directional is None else set(DIRECTIONAL_ROWS)
-    assert {f"gaussians.{row}" for row in side} <= set(floats) or not RECIPES[name].reflects
+    shapes = {
+        n.removeprefix("gaussians."): tuple(t.shape[1:]) for n, t in floats.items() if "gaussians." in n
+    }
+    assert shapes == RECIPES[name].shapes
+    assert set(trainer.state.light) == set(RECIPES[name].shading.light_parameters)
 
 
 @pytest.mark.parametrize("name", ["3dgs", "polarguide"])
@@ -89,13 +92,13 @@ def test_resumed_is_uninterrupted_bit_by_bit(tiny_scene: Scene, busy_recipe: Rec
 def test_a_directional_light_is_resumed_bit_by_bit(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
-    """Side rows follow the density control, and the grid and the MLP keep their moments."""
+    """Parameters of the model follow the density control, and the grid and the MLP keep their moments."""
     stop = 14  # between two rounds of the density control that add Gaussians
     recipe = dataclasses.replace(
         RECIPES["ref-gs"],
         densification=dataclasses.replace(busy_recipe.densification, every=4, pixels_each=1.0),
         initialization=busy_recipe.initialization,
-        environment_resolution=8,
+        shading=DirectionalShading(width=64, environment_spread=0.5, environment_resolution=8),
     )
     whole, reports = train(tiny_scene, recipe)
     assert len({report.gaussians for report in reports[stop : STEPS // 2]}) > 1
@@ -106,10 +109,10 @@ def test_a_directional_light_is_resumed_bit_by_bit(
     Trainer(tiny_scene, recipe, TrainSettings(STEPS, 3), choose_backend("cpu"), state).run(lambda _: None)
     assert different(state.tensors(), whole.state.tensors()) == []
     tensors = state.tensors()
-    moved = [f"adam.{row}.exp_avg" for row in DIRECTIONAL_ROWS]
+    moved = [f"adam.{name}.exp_avg" for name in DIRECTIONAL]
     moved += [f"environment.adam.mlp_weight_{layer}.exp_avg" for layer in range(3)]
     assert all(bool(tensors[name].any()) for name in (*moved, "environment.adam.exp_avg"))
-    assert all(tensors[f"gaussians.{row}"].shape[0] == len(state.gaussians) for row in DIRECTIONAL_ROWS)
+    assert all(tensors[f"gaussians.{name}"].shape[0] == len(state.gaussians) for name in DIRECTIONAL)
 
 
 @pytest.mark.parametrize("stop", [1, 6, 7, 16, 24, 40, 59])
@@ -185,7 +188,7 @@ def test_test_views_are_never_trained_on(tiny_scene: Scene) -> None:
     assert different(shown.state.tensors(), hidden.state.tensors()) == []
 
 
-def test_the_first_state_has_one_row_per_point_and_added_gaussian(
+def test_the_first_state_has_one_gaussian_per_point_and_added_one(
     tiny_scene: Scene, busy_recipe: Recipe
 ) -> None:
     state = first_state(tiny_scene, busy_recipe, TrainSettings(10, 0))

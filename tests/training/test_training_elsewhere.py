@@ -79,7 +79,7 @@ def test_what_a_recipe_begins_and_ends_with(tiny_scene: Scene, tmp_path: Path, n
                 trainer._act("orient_normals")
                 outward[here] = trainer.state.gaussians["outward"].detach().to("cpu")
             path = tmp_path / f"{here}.ply"
-            write_run_ply(path, trainer.state, RECIPES[name].shading(1.5))
+            write_run_ply(path, trainer.state, trainer.shading)
             written[here] = read_ply(path)
     assert bool(outward) == RECIPES[name].oriented
     if outward:

@@ -18,8 +18,10 @@ from polarguide.training.trainer import Trainer, TrainSettings
 
 pytestmark = [
     pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA GPU"),
-    pytest.mark.skipif(not has_gsplat(), reason="gsplat is not installed"),
+    pytest.mark.skipif(
+        not torch.cuda.is_available(), reason="no CUDA GPU -> on a machine with one: make gpu-check"
+    ),
+    pytest.mark.skipif(not has_gsplat(), reason="no gsplat -> pip install '.[cuda]'"),
 ]
 
 
@@ -84,7 +86,7 @@ def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str)
         strict = True
         try:
             for slot in range(views):
-                trainer._look(slot, stage, True)
+                trainer._backpropagate(slot, stage, True)
                 trainer._optimize()
         finally:
             strict = False

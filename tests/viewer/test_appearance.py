@@ -30,7 +30,7 @@ def paint(seen, appearance=PLAIN, view=None, camera=CAMERA, **named):
 @pytest.mark.parametrize("recipe", KINDS)
 def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
     seen = shown(recipe)
-    result = seen.render(CAMERA, seen.gaussians, seen.environment, depth=True)
+    result = seen.render(CAMERA, depth=True)
     for layer in LAYERS:
         picture = paint(seen, Appearance(layer=layer))
         if getattr(result, layer) is None:
@@ -45,7 +45,7 @@ def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
 
 def test_exposure_and_reflection():
     seen = shown()
-    result = seen.render(CAMERA, seen.gaussians, seen.environment, depth=False)
+    result = seen.render(CAMERA, depth=False)
     brighter = paint(seen, Appearance(exposure=-1.5))
     assert np.array_equal(brighter, figures.radiance_to_rgb(result.final / 2**1.5))
     without = paint(seen, Appearance(strength=0.0))
@@ -65,7 +65,7 @@ def test_turning_the_environment_turns_what_a_mirror_shows():
     assert far > 5 * barely
     assert far > 1
     # Light that is the same all around stays; so does what does not reflect.
-    even = replace(seen, environment={"texels": torch.full((6, 8, 8, 3), 0.3)})
+    even = replace(seen, light={"texels": torch.full((6, 8, 8, 3), 0.3)})
     assert np.abs(paint(even, Appearance(turn=90)).astype(int) - paint(even)).max() <= 1
     base = Appearance(layer="base")
     assert np.array_equal(paint(seen, replace(base, turn=90)), paint(seen, base))
@@ -118,7 +118,7 @@ def test_what_was_measured_there():
     assert np.abs(found["DoLP"].astype(int) - dolp)[there].max() <= 3
     aolp = figures.aolp_to_rgb(torch.zeros(there.shape))
     assert np.abs(found["AoLP"].astype(int) - aolp)[there].max() <= 3
-    final = seen.render(CAMERA, seen.gaussians, seen.environment, depth=False).final
+    final = seen.render(CAMERA, depth=False).final
     assert np.array_equal(found["error"], figures.error_to_rgb(final, view.photograph()))
     right = paint(replace(seen, gaussians=seen.gaussians), Appearance(layer="error"), view)
     assert np.array_equal(right, found["error"])

@@ -10,6 +10,7 @@ import pytest
 from fake_browser import FakeClient
 from viewer_scenes import frame_of_scene, photographs, shown
 
+from polarguide.shading.result import LAYERS
 from polarguide.viewer.panel import FREE_VIEW, PanelOptions
 from polarguide.viewer.session import NO_LAYER, PATH_FILE, PICTURE_FILE, Session
 from polarguide.viewer.viewport import letterbox
@@ -23,7 +24,7 @@ class ViewingSession:
         self.clock, self.seen = clock, shown()
         self.photographs = photographs(self.seen)
         self.client = FakeClient()
-        options = PanelOptions(lit=True, turns=True, views=tuple(self.photographs), trains=True)
+        options = PanelOptions(LAYERS, turns=True, views=tuple(self.photographs), trains=True)
         self.session = Session(self.client, self.photographs, frame_of_scene(), options, lambda: None)
         self.session.go("v0")
         self.client.camera.report()
@@ -63,7 +64,7 @@ def viewing(monkeypatch):
 
 
 def rendered(seen, camera):
-    result = seen.render(camera, seen.gaussians, seen.environment, depth=False)
+    result = seen.render(camera, depth=False)
     return figures.radiance_to_rgb(result.final)
 
 

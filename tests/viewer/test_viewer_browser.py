@@ -35,7 +35,9 @@ class Opened:
         cameras = {**ring(width=WIDTH // 4, height=HEIGHT // 4)}
         cameras[HOSTILE] = cameras.pop("v5")
         self.photographs = {name: photograph(name, camera, self.seen) for name, camera in cameras.items()}
-        self.viewer = Viewer(lambda: self.seen, self.photographs, lit=True, port=18080, title=HOSTILE)
+        self.viewer = Viewer(
+            lambda: self.seen, self.photographs, shading=self.seen.shading, port=18080, title=HOSTILE
+        )
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -78,19 +80,21 @@ class Opened:
         lens = self.photographs[name].view.camera
         scaled = {key: 4 * getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
         camera = replace(lens, **scaled)
-        result = self.seen.render(camera, self.seen.gaussians, self.seen.environment, depth=True)
+        result = self.seen.render(camera, depth=True)
         if layer == "normal":
             return figures.normal_to_rgb(result.normal, camera)
         return figures.radiance_to_rgb(getattr(result, layer))
 
 
 def psnr(picture: np.ndarray, expected: np.ndarray) -> float:
-    return float(-10 * np.log10(np.mean(((picture - expected.astype(float))[FREE] / 255) ** 2)))
+    error = np.mean(((picture - expected.astype(float))[FREE] / 255) ** 2)
+    return float(-10 * np.log10(max(error, 1e-12)))
 
 
 @pytest.fixture(scope="module")
 def opened() -> Iterator[Opened]:
-    with chromium() as browser:
+    with chromium() as browser, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("polarguide.viewer.place.ARRIVAL", PATIENCE)  # a busy machine's browser takes its time
         viewing = Opened(browser)
         yield viewing
         viewing.close()

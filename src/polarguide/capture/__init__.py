@@ -1,7 +1,29 @@
 """Read a scene folder: views with four polarizer angles, a COLMAP model, ground truth."""
 
-from polarguide.capture.colmap.model import ColmapModel, read_model
-from polarguide.capture.reader import load_scene
-from polarguide.capture.view import ANGLES, GroundTruth, Scene, View
+from __future__ import annotations
 
-__all__ = ["ANGLES", "ColmapModel", "GroundTruth", "Scene", "View", "load_scene", "read_model"]
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from polarguide.capture.colmap.model import ColmapModel, read_model
+    from polarguide.capture.reader import load_scene
+    from polarguide.capture.view import GroundTruth, Scene, View
+
+_MODULES = {
+    "ColmapModel": "colmap.model",
+    "GroundTruth": "view",
+    "Scene": "view",
+    "View": "view",
+    "load_scene": "reader",
+    "read_model": "colmap.model",
+}
+"""Where each name is defined. It is loaded when it is asked for: a calibration can be read without torch."""
+
+__all__ = ["ColmapModel", "GroundTruth", "Scene", "View", "load_scene", "read_model"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

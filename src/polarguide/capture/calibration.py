@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
-from polarguide.records import read_record
+from polarguide.polarizer import ANGLES, four_intensities, stokes_of_four
+from polarguide.records import check_options, read_record
 
-Gains = tuple[float, float, float, float]
+Gain = Annotated[float, msgspec.Meta(ge=0.5, le=2.0)]
+Gains = tuple[Gain, Gain, Gain, Gain]
+Sense = Literal["ccw", "cw"]
 UNIT_GAINS: Gains = (1.0, 1.0, 1.0, 1.0)
 LARGEST_IMBALANCE = 0.1
 """Pair sums that differ by more than this share are no gain differences: files are swapped, or not linear."""
@@ -43,7 +45,7 @@ class Calibration:
 
     gains: Gains | None = None
     order: tuple[int, int, int, int] = ANGLES
-    sense: str | None = None
+    sense: Sense | None = None
     zero: float = 0.0
 
     @property
@@ -67,20 +69,31 @@ def checked(calibration: Calibration, where: object) -> Calibration:
     Raises:
         PolarguideError: gains are not positive, the order is no permutation, the zero is not finite, ...
     """
-    gains, order = calibration.gains, calibration.order
-    faults = (
-        (gains is not None and not all(math.isfinite(g) and 0.5 <= g <= 2.0 for g in gains),
-         "gains", "four numbers from 0.5 to 2", gains),
-        (sorted(order) != sorted(ANGLES), "order", "0, 45, 90 and 135, each once", order),
-        (calibration.sense not in (None, "cw", "ccw"), "sense", "cw or ccw", calibration.sense),
-        (not math.isfinite(calibration.zero), "zero", "a finite number of degrees", calibration.zero),
-    )  # fmt: skip
-    for wrong, name, expected, found in faults:
-        if wrong:
-            raise PolarguideError(
-                f"{where} ({name})", expected=expected, found=repr(found), remedy="Correct the value."
-            )
+    check_options(calibration, lambda field: f"{where} ({field})")
+    if sorted(calibration.order) != sorted(ANGLES):
+        raise PolarguideError(
+            f"{where} (order)",
+            expected="0, 45, 90 and 135, each once",
+            found=str(calibration.order),
+            remedy="Correct the value.",
+        )
     return calibration
+
+
+class _Gains(msgspec.Struct, forbid_unknown_fields=True):
+    i0: Gain = msgspec.field(name="0")
+    i45: Gain = msgspec.field(name="45")
+    i90: Gain = msgspec.field(name="90")
+    i135: Gain = msgspec.field(name="135")
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """A calibration file."""
+
+    gains: _Gains | None = None
+    order: tuple[int, int, int, int] = ANGLES
+    sense: Sense | None = None
+    zero: float = 0.0
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -91,30 +104,9 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         PolarguideError: the file cannot be read, has unknown keys or values that make no sense.
     """
-    content = read_record(path, dict[str, Any])
-    unknown = sorted(content.keys() - {"gains", "order", "sense", "zero"})
-    try:
-        if unknown:
-            raise ValueError(f"the key {unknown[0]!r}")
-        found = Calibration()
-        if "gains" in content:
-            gains = content["gains"]
-            if not isinstance(gains, dict) or sorted(gains) != sorted(str(angle) for angle in ANGLES):
-                raise ValueError(f"the gains {json.dumps(gains)}")
-            i0, i45, i90, i135 = (float(gains[str(angle)]) for angle in ANGLES)
-            found = replace(found, gains=(i0, i45, i90, i135))
-        if "order" in content:
-            first, second, third, fourth = (int(angle) for angle in content["order"])
-            found = replace(found, order=(first, second, third, fourth))
-        found = replace(found, sense=content.get("sense"), zero=float(content.get("zero", 0.0)))
-    except (ValueError, TypeError) as error:
-        raise PolarguideError(
-            path,
-            expected='"gains" by angle ("0", "45", "90", "135"), "order", "sense" and "zero"',
-            found=str(error),
-            remedy="See docs/formats.md for the calibration file.",
-        ) from None
-    return checked(found, path)
+    file = read_record(path, _File, remedy="See docs/formats.md for the calibration file.")
+    gains = None if file.gains is None else msgspec.structs.astuple(file.gains)
+    return checked(Calibration(gains, file.order, file.sense, file.zero), path)
 
 
 def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> float | None:
@@ -162,9 +154,7 @@ def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDAr
     placed = intensities[[targets.index(angle) for angle in ANGLES]]
     if calibration.permutes:
         return placed
-    i0, i45, i90, i135 = placed
-    s0, s1, s2 = placed.sum(axis=0) / 2, i0 - i90, i45 - i135
+    s0, s1, s2 = stokes_of_four(placed)
     cosine, sine = (f(2.0 * math.radians(calibration.zero)) for f in (math.cos, math.sin))
-    turned1, turned2 = s1 * cosine - s2 * sine, s1 * sine + s2 * cosine
-    out = np.stack([s0 + turned1, s0 + turned2, s0 - turned1, s0 - turned2]) / 2
-    return np.maximum(out, 0.0).astype(np.float32)
+    turned = four_intensities((s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine))
+    return np.maximum(np.stack(turned), 0.0).astype(np.float32)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from polarguide.capture.metadata import held_out, refractive_index_of
 from polarguide.capture.view import Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, read_view
 from polarguide.errors import PolarguideError
-from polarguide.records import decode
+from polarguide.progress import SILENT, Reporter
 
 _THREADS = 4
 
@@ -51,7 +50,7 @@ def load_scene(
     downscale: int = 1,
     transfer: str = "linear",
     views: Sequence[str] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    reporter: Reporter = SILENT,
 ) -> Scene:
     """Read a capture.
 
@@ -67,7 +66,7 @@ def load_scene(
             only where all of its box is; it is invalid or saturated where any of it is.
         transfer: how the files are encoded: "linear", or "srgb" for display-encoded pictures.
         views: names of the views to read; all if None. The split is that of the whole capture.
-        progress: called with the number of views read and the number to read, after each view.
+        reporter: receives the progress.
 
     Returns:
         The scene; ``Scene.warnings`` lists possible faults that do not prevent its use.
@@ -84,12 +83,12 @@ def load_scene(
     files = Files()
     for file in model.files:
         files.read(file)
-    tests = held_out(root / "split.json", _read_json(files, root / "split.json"), layout.names)
-    index = refractive_index_of(root / "scene.json", _read_json(files, root / "scene.json"))
+    tests = held_out(root / "split.json", files.read_if_there(root / "split.json"), layout.names)
+    index = refractive_index_of(root / "scene.json", files.read_if_there(root / "scene.json"))
     for name in names:
         model.camera(name)  # find missing poses before the pictures are read
 
-    stored = read_views(layout, names, model, downscale=downscale, transfer=transfer, progress=progress)
+    stored = read_views(layout, names, model, downscale=downscale, transfer=transfer, reporter=reporter)
     for item in stored.data:
         files.digests.update(item.digests)
     posed_views = tuple(
@@ -120,7 +119,7 @@ def read_views(
     *,
     downscale: int,
     transfer: str,
-    progress: Callable[[int, int], None] | None = None,
+    reporter: Reporter = SILENT,
 ) -> StoredViews:
     """Read the files of some views, in several threads.
 
@@ -130,7 +129,7 @@ def read_views(
         model: the capture's COLMAP model, if it has one; views that it lacks are read without a camera.
         downscale: side of the pixel boxes to average.
         transfer: "linear" or "srgb".
-        progress: called with the number of views read and the number to read, after each view.
+        reporter: receives the progress.
 
     Raises:
         PolarguideError: a file cannot be used, a camera does not fit its pictures, or the views differ in depth.
@@ -142,7 +141,10 @@ def read_views(
     posed = frozenset(() if model is None else model.names)
     data: list[ViewData] = []
     cameras: list[Camera | None] = []
-    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+    with (
+        reporter.track(f"reading {layout.root.resolve().name}", len(names)) as advance,
+        ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool,
+    ):
         for item in pool.map(read, names):
             data.append(item)
             camera = None
@@ -150,8 +152,7 @@ def read_views(
                 camera = fit_camera(model.camera(item.name), *item.size, folder=model.folder, view=item.name)
                 camera = camera if downscale == 1 else camera.downscaled(downscale)
             cameras.append(camera)
-            if progress is not None:
-                progress(len(data), len(names))
+            advance(len(data))
     largest_value = _largest_value(data)
     scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
     measures = [checks.measure(item.codes, ~(item.invalid | item.saturated(scale))) for item in data]
@@ -181,11 +182,6 @@ def _check_downscale(downscale: int) -> None:
             found=repr(downscale),
             remedy="1 keeps the full size.",
         )
-
-
-def _read_json(files: Files, path: Path) -> dict[str, Any] | None:
-    """The JSON object in a file, or None if there is no such file."""
-    return decode(files.read(path), dict[str, Any], path) if path.exists() else None
 
 
 def _largest_value(data: Sequence[ViewData]) -> int:

@@ -11,9 +11,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
-
-ANGLES = (0, 45, 90, 135)
-"""Polarizer angles in degrees, in the order in which every stack of four stores them."""
+from polarguide.polarizer import ANGLES as ANGLES
 
 FULL_CODE = 65535
 """The code of linear intensity 1."""

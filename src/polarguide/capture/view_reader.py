@@ -34,6 +34,10 @@ class Files:
         self.digests[path] = hashlib.sha256(data).hexdigest()
         return data
 
+    def read_if_there(self, path: Path) -> bytes | None:
+        """The bytes of a file, or None if there is no such file."""
+        return self.read(path) if path.exists() else None
+
 
 @dataclass(frozen=True, eq=False)
 class ViewData:

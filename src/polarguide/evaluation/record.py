@@ -6,27 +6,43 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
+
+import msgspec
 
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.scores import MEAN_KEYS, PERFECT_PSNR, ViewScores, score_view, summarize
+from polarguide.evaluation.scores import ViewScores, summarize
+from polarguide.evaluation.table import HIGHEST_PSNR, METRICS, RUN_METRICS, VIEW_METRICS, Metric
 from polarguide.files import write_text
+from polarguide.records import decode, read_record, shortened
 
-__all__ = [
-    "PROVENANCE_KEYS",
-    "RUN_KEYS",
-    "ViewScores",
-    "score_view",
-    "summarize",
-    "validate_metrics",
-    "write_metrics",
-]
+METRICS_FILE = "metrics.json"
+_WRITE_AGAIN = "Score the run again with this version: polarguide eval."
 
-RUN_KEYS = ("fps", "fps_layers", "train_seconds", "gaussians", "steps", "peak_memory_mib")
-"""The keys that belong to a run, not to a view. Each may be null."""
 
-PROVENANCE_KEYS = ("recipe", "seed", "commit", "versions", "device", "downscale", "scene_hash")
-"""What has to be known to repeat a run."""
+class Provenance(TypedDict):
+    """What has to be known to repeat a run. Others may stand beside it."""
+
+    recipe: str
+    seed: int
+    commit: str | None
+    versions: dict[str, str]
+    device: str
+    downscale: int
+    scene_hash: str
+
+
+def _fields(metrics: tuple[Metric, ...]) -> list[tuple[str, Any]]:
+    return [
+        (m.key, Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None if m.unit == "dB" else float | None)
+        for m in metrics
+    ]
+
+
+_REASON = ("lpips_reason", str | None, None)
+_VIEW = msgspec.defstruct("View", [*_fields(VIEW_METRICS), _REASON])
+_VIEWS = Annotated[dict[str, Any], msgspec.Meta(min_length=1)]
+_RUN = msgspec.defstruct("Run", [*_fields(METRICS), ("views", _VIEWS), ("provenance", Provenance), _REASON])
 
 
 def write_metrics(
@@ -38,15 +54,13 @@ def write_metrics(
 ) -> dict[str, Any]:
     """Write ``metrics.json`` in one step: a reader sees the old file or the whole new one.
 
-    Top level: the means of ``summarize``, the keys of ``run``, ``views`` and ``provenance``. Numbers are
-        finite: NaN
-    and infinity become null, an infinite PSNR ``PERFECT_PSNR``.
+    Top level: the means of ``summarize``, the keys of ``run``, ``views`` and ``provenance``. NaN becomes null.
 
     Args:
         path: the file; its folder must exist.
         views: the scores by view name, at least one.
-        run: values for keys of ``RUN_KEYS``; one that is left out is null.
-        provenance: the keys of ``PROVENANCE_KEYS``, and others as you like.
+        run: values of ``RUN_METRICS`` by key; one that is left out is null.
+        provenance: the keys of ``Provenance``, and others as you like.
 
     Returns:
         What was written.
@@ -54,24 +68,38 @@ def write_metrics(
     Raises:
         PolarguideError: the record does not pass ``validate_metrics``.
     """
-    path = Path(path)
-    clean: dict[str, Any] = {
-        name: {k: _clean(k, v) for k, v in scores.items()} for name, scores in views.items()
+    finite: dict[str, Any] = {
+        name: {key: _finite(value) for key, value in scores.items()} for name, scores in views.items()
     }
     record: dict[str, Any] = {
-        **summarize(clean),
-        **dict.fromkeys(RUN_KEYS),
-        **{key: _clean(key, value) for key, value in run.items()},
-        "views": clean,
+        **summarize(finite),
+        **{metric.key: None for metric in RUN_METRICS},
+        **{key: _finite(value) for key, value in run.items()},
+        "views": finite,
         "provenance": dict(provenance),
     }
     validate_metrics(record, where=path)
-    text = json.dumps(record, indent=2, allow_nan=False) + "\n"
-    write_text(path, text)
+    write_text(Path(path), json.dumps(record, indent=2, allow_nan=False) + "\n")
     return record
 
 
-def validate_metrics(record: Mapping[str, Any], where: str | Path = "metrics.json") -> None:
+def read_metrics(run: Path) -> dict[str, Any]:
+    """The scores in a run folder, as ``write_metrics`` wrote them.
+
+    Raises:
+        PolarguideError: the run has not been scored, or the file is not such a record.
+    """
+    path = run / METRICS_FILE
+    if not path.exists():
+        raise PolarguideError(
+            path, expected="the scores of a run", found="none", remedy="Run polarguide eval."
+        )
+    record = read_record(path, dict[str, Any], remedy=_WRITE_AGAIN)
+    validate_metrics(record, path)
+    return record
+
+
+def validate_metrics(record: Any, where: str | Path = METRICS_FILE) -> None:
     """Check a record against the schema of ``metrics.json``.
 
     Args:
@@ -81,55 +109,25 @@ def validate_metrics(record: Mapping[str, Any], where: str | Path = "metrics.jso
     Raises:
         PolarguideError: naming the first key at fault, what was expected there, and what was found.
     """
-    if not isinstance(record, Mapping):
-        raise _fault(where, "an object", record)
-    _check_numbers(record, MEAN_KEYS + RUN_KEYS, where)
+    decode(record, _RUN, where, remedy=_WRITE_AGAIN)
     _check_reason(record, where)
-    views = record.get("views")
-    if not isinstance(views, Mapping) or not views:
-        raise _fault(f"{where}: views", "an object with at least one view", views)
-    for name, scores in views.items():
-        if not isinstance(scores, Mapping):
-            raise _fault(f"{where}: views.{name}", "an object", scores)
-        _check_numbers(scores, MEAN_KEYS, f"{where}: views.{name}")
-        _check_reason(scores, f"{where}: views.{name}")
-    provenance = record.get("provenance")
-    if not isinstance(provenance, Mapping):
-        raise _fault(f"{where}: provenance", "an object", provenance)
-    for key in PROVENANCE_KEYS:
-        if key not in provenance:
-            raise PolarguideError(
-                f"{where}: provenance.{key}",
-                expected="a value (null if unknown)",
-                found="no such key",
-                remedy="Write the record again with this version.",
-            )
+    for name, scores in record["views"].items():
+        decode(scores, _VIEW, f"{where}, view {name}", remedy=_WRITE_AGAIN)
+        _check_reason(scores, f"{where}, view {name}")
 
 
-def _check_numbers(record: Mapping[str, Any], keys: tuple[str, ...], where: object) -> None:
-    for key in keys:
-        value = record.get(key, "no such key")
-        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-        if not number and value is not None:
-            raise _fault(f"{where}: {key}", "a finite number or null", value)
-        if value is not None and "psnr" in key and value > PERFECT_PSNR:
-            raise _fault(f"{where}: {key}", f"at most {PERFECT_PSNR} dB", value)
+def _check_reason(scores: Mapping[str, Any], where: object) -> None:
+    """Refuse an absent LPIPS without a reason."""
+    reason = scores.get("lpips_reason")
+    if scores["lpips"] is None and not reason:
+        raise PolarguideError(
+            f"{where} (lpips_reason)",
+            expected="a reason, because lpips is null",
+            found=shortened(reason),
+            remedy=_WRITE_AGAIN,
+        )
 
 
-def _check_reason(record: Mapping[str, Any], where: object) -> None:
-    reason = record.get("lpips_reason")
-    if record["lpips"] is None and not (isinstance(reason, str) and reason):
-        raise _fault(f"{where}: lpips_reason", "a reason, because lpips is null", reason)
-
-
-def _fault(where: object, expected: str, found: object) -> PolarguideError:
-    return PolarguideError(
-        where, expected=expected, found=repr(found)[:80], remedy="Write the record again with this version."
-    )
-
-
-def _clean(key: str, value: Any) -> Any:
+def _finite(value: Any) -> Any:
     """A value as JSON can hold it."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return PERFECT_PSNR if "psnr" in key and value > 0 else None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value

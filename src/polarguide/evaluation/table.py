@@ -1,34 +1,54 @@
-"""What the tables of a comparison show: one row of data for each column."""
+"""The one table of metrics: how each is measured on a view, and how scores, console, tables and report show it.
+
+A new metric is a row here, beside the function in ``metrics.py`` that it calls.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-Direction = Literal["higher", "lower"]
+from torch import Tensor
+
+from polarguide.evaluation.metrics import layer_error, normal_mae_deg, normal_within_11, squared_error, ssim
+from polarguide.evaluation.target import ViewTarget
+
+HIGHEST_PSNR = 100.0
+"""What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
+
+Layers = Mapping[str, Tensor | None]
+"""Rendered layers of a view by name: ``final``, ``normal``, ``specular``, ``diffuse``; None where there is none."""
+Measure = Callable[[ViewTarget, Layers], Tensor | None]
+"""A metric of one view as a tensor []; None where it is not defined. In place of decibels the mean squared error."""
 
 
 @dataclass(frozen=True)
-class Column:
+class Metric:
     """One quantity of a run.
 
     Attributes:
         key: its name in ``metrics.json``.
-        label: heading. unit: after it, in brackets; empty for none.
-        digits: decimal places shown.
+        label: what people read. unit: after the value; empty for none.
+        digits: decimal places in tables.
         better: which direction is better; None: neither, and nothing is set in bold.
-        shown: whether Markdown, LaTeX and the report have it (CSV and JSON have all).
-        speed: whether it counts only when measured alone; such a value may be absent without a fault.
-        factor: what the value is multiplied with before it is shown.
+        of: whether each view has a value, and a run their mean, or only the run.
+        measure: its value on a view; None where it is not a single tensor (LPIPS), or not of a view.
+        shown: "tables": console, Markdown, LaTeX and the report have it; "files": only CSV and ``results.json``;
+            "record": only ``metrics.json``.
+        timed: whether it counts only when measured alone; such a value may be absent without a fault.
+        factor: what the value is multiplied by in tables.
     """
 
     key: str
     label: str
     unit: str
     digits: int
-    better: Direction | None
-    shown: bool = True
-    speed: bool = False
+    better: Literal["higher", "lower"] | None
+    of: Literal["view", "run"] = "view"
+    measure: Measure | None = None
+    shown: Literal["tables", "files", "record"] = "tables"
+    timed: bool = False
     factor: float = 1.0
 
     @property
@@ -41,22 +61,117 @@ class Column:
         """Label, unit and arrow."""
         return " ".join(filter(None, (self.label, f"({self.unit})" if self.unit else "", self.arrow)))
 
+    def text(self, value: float) -> str:
+        """A recorded value as the console shows it."""
+        number = f"{value:,}" if isinstance(value, int) else f"{value:.3f}"
+        return f"{number} {self.unit if self.factor == 1.0 else ''}".rstrip()
 
-COLUMNS: tuple[Column, ...] = (
-    Column("psnr", "PSNR", "dB", 2, "higher"),
-    Column("psnr_foreground", "PSNR foreground", "dB", 2, "higher"),
-    Column("psnr_reflective", "PSNR reflective", "dB", 2, "higher"),
-    Column("ssim", "SSIM", "", 3, "higher"),
-    Column("lpips", "LPIPS", "", 3, "lower"),
-    Column("normal_mae_deg", "normal error", "deg", 1, "lower"),
-    Column("normal_within_11", "within 11.25 deg", "%", 1, "higher", factor=100.0),
-    Column("specular_psnr", "specular PSNR", "dB", 2, "higher"),
-    Column("diffuse_psnr", "diffuse PSNR", "dB", 2, "higher"),
-    Column("specular_psnr_aligned", "specular PSNR aligned", "dB", 2, "higher", shown=False),
-    Column("diffuse_psnr_aligned", "diffuse PSNR aligned", "dB", 2, "higher", shown=False),
-    Column("gaussians", "Gaussians", "", 0, None),
-    Column("fps", "FPS", "", 1, "higher", speed=True),
-    Column("fps_layers", "FPS all layers", "", 1, "higher", shown=False, speed=True),
-    Column("train_seconds", "training", "s", 0, "lower", speed=True),
+
+def _picture(region: str) -> Measure:
+    """The squared error of the final picture over a region of the target."""
+
+    def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
+        pixels, final = getattr(target, region), layers["final"]
+        return None if pixels is None or final is None else squared_error(final, target.photograph, pixels)
+
+    return measure
+
+
+def _similarity(target: ViewTarget, layers: Layers) -> Tensor | None:
+    final = layers["final"]
+    return None if final is None else ssim(final, target.photograph, target.valid, target.windows)
+
+
+def _normal(compare: Callable[..., Tensor]) -> Measure:
+    """A comparison of rendered and true normals on the foreground."""
+
+    def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
+        found, true = layers["normal"], target.normal
+        return None if found is None or true is None else compare(found, true, target.surface)
+
+    return measure
+
+
+def _layer(name: str, *, aligned: bool = False) -> Measure:
+    """The squared error of a layer against its true lobe on the foreground."""
+
+    def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
+        found, true = layers[name], getattr(target, name)
+        if found is None or true is None:
+            return None
+        return layer_error(found, true, target.foreground, aligned=aligned)
+
+    return measure
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric("psnr", "PSNR", "dB", 2, "higher", measure=_picture("valid")),
+    Metric("psnr_foreground", "PSNR foreground", "dB", 2, "higher", measure=_picture("foreground")),
+    Metric("psnr_reflective", "PSNR reflective", "dB", 2, "higher", measure=_picture("reflective")),
+    Metric("ssim", "SSIM", "", 3, "higher", measure=_similarity),
+    Metric("lpips", "LPIPS", "", 3, "lower"),
+    Metric("normal_mae_deg", "normal error", "deg", 1, "lower", measure=_normal(normal_mae_deg)),
+    Metric(
+        "normal_within_11",
+        "normals within 11.25 deg",
+        "%",
+        1,
+        "higher",
+        measure=_normal(normal_within_11),
+        factor=100.0,
+    ),
+    Metric("specular_psnr", "specular PSNR", "dB", 2, "higher", measure=_layer("specular")),
+    Metric("diffuse_psnr", "diffuse PSNR", "dB", 2, "higher", measure=_layer("diffuse")),
+    Metric(
+        "specular_psnr_aligned",
+        "specular PSNR aligned",
+        "dB",
+        2,
+        "higher",
+        measure=_layer("specular", aligned=True),
+        shown="files",
+    ),
+    Metric(
+        "diffuse_psnr_aligned",
+        "diffuse PSNR aligned",
+        "dB",
+        2,
+        "higher",
+        measure=_layer("diffuse", aligned=True),
+        shown="files",
+    ),
+    Metric("gaussians", "Gaussians", "", 0, None, of="run"),
+    Metric("fps", "FPS", "", 1, "higher", of="run", timed=True),
+    Metric("fps_layers", "FPS all layers", "", 1, "higher", of="run", shown="files", timed=True),
+    Metric("train_seconds", "training", "s", 0, "lower", of="run", timed=True),
+    Metric("steps", "steps", "", 0, None, of="run", shown="record"),
+    Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
 )
-KEYS: tuple[str, ...] = tuple(column.key for column in COLUMNS)
+VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")
+"""Those of one view, which are averaged over views."""
+RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")
+"""Those that belong to a run. Each may be null."""
+COLUMNS = tuple(metric for metric in METRICS if metric.shown != "record")
+"""Those that comparisons collect."""
+
+
+def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> list[tuple[str, str]]:
+    """The metrics of a run as people read them.
+
+    Args:
+        record: of a run, as ``metrics.json`` has it.
+        scores_only: leave out what belongs to the run alone (times, counts) and what has no value.
+
+    Returns:
+        Labels and values with their units, in the order of the table; "n/a", with the reason where one is recorded,
+        for a metric without a value.
+    """
+    lines = []
+    for metric in METRICS:
+        value = record.get(metric.key)
+        if metric.shown != "tables" or (scores_only and (metric.of == "run" or value is None)):
+            continue
+        reason = record.get(f"{metric.key}_reason")
+        absent = f"n/a ({reason})" if reason else "n/a"
+        lines.append((metric.label, absent if value is None else metric.text(value)))
+    return lines

@@ -4,10 +4,28 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
-from typing import Any, TypedDict
+from collections.abc import Sequence
+from typing import TypedDict
 
-from polarguide.evaluation.table import KEYS
+from polarguide.evaluation.table import COLUMNS
+
+
+class RunRecord(TypedDict):
+    """One training: what it was, the state of its work, and its scores.
+
+    ``metrics`` holds numbers or None by key, and is None unless the run is done; ``views`` holds the same for each test
+    view. ``folder`` is relative to that of the record.
+    """
+
+    scene: str
+    recipe: str
+    seed: int
+    folder: str
+    state: str
+    error: str | None
+    metrics: dict[str, float | None] | None
+    lpips_reason: str | None
+    views: dict[str, dict[str, float | None]]
 
 
 class Cell(TypedDict):
@@ -31,12 +49,14 @@ class Row(TypedDict):
     cells: dict[str, Cell]
 
 
-def aggregate(runs: Sequence[Mapping[str, Any]], scenes: Sequence[str], recipes: Sequence[str]) -> list[Row]:
+NO_VALUE = Cell(mean=None, spread=None, count=0)
+
+
+def aggregate(runs: Sequence[RunRecord], scenes: Sequence[str], recipes: Sequence[str]) -> list[Row]:
     """The table of a comparison.
 
     Args:
-        runs: records with ``scene``, ``recipe``, ``seed`` and ``metrics`` (key -> number or None; None for a run that
-            has not finished).
+        runs: in any order; those that have not finished count for nothing.
         scenes, recipes: names, in the order in which rows are wanted.
 
     Returns:
@@ -50,27 +70,32 @@ def aggregate(runs: Sequence[Mapping[str, Any]], scenes: Sequence[str], recipes:
     return rows
 
 
-def _finished(runs: Sequence[Mapping[str, Any]], scene: str, recipe: str) -> list[Mapping[str, Any]]:
-    return [r for r in runs if r["scene"] == scene and r["recipe"] == recipe and r["metrics"] is not None]
+def _finished(
+    runs: Sequence[RunRecord], scene: str, recipe: str
+) -> list[tuple[int, dict[str, float | None]]]:
+    """Seeds and metrics."""
+    return [
+        (run["seed"], run["metrics"])
+        for run in runs
+        if run["scene"] == scene and run["recipe"] == recipe and run["metrics"] is not None
+    ]
 
 
-def _scene_row(runs: Sequence[Mapping[str, Any]], scene: str, recipe: str) -> Row:
+def _scene_row(runs: Sequence[RunRecord], scene: str, recipe: str) -> Row:
     finished = _finished(runs, scene, recipe)
-    cells = {key: cell_of([run["metrics"].get(key) for run in finished]) for key in KEYS}
+    cells = {m.key: cell_of([metrics.get(m.key) for _, metrics in finished]) for m in COLUMNS}
     return Row(scene=scene, recipe=recipe, finished=len(finished), cells=cells)
 
 
-def _mean_row(
-    runs: Sequence[Mapping[str, Any]], rows: Sequence[Row], scenes: Sequence[str], recipe: str
-) -> Row:
+def _mean_row(runs: Sequence[RunRecord], rows: Sequence[Row], scenes: Sequence[str], recipe: str) -> Row:
     own = {row["scene"]: row for row in rows if row["recipe"] == recipe}
     cells: dict[str, Cell] = {}
-    for key in KEYS:
+    for key in (metric.key for metric in COLUMNS):
         wanted = [s for s in scenes if any(r["scene"] == s and r["cells"][key]["count"] for r in rows)]
         means = [own[scene]["cells"][key]["mean"] for scene in wanted]
         numbers = [mean for mean in means if mean is not None]
         if not numbers or len(numbers) < len(wanted):
-            cells[key] = Cell(mean=None, spread=None, count=0)
+            cells[key] = NO_VALUE
             continue
         over_seeds = cell_of(list(_by_seed(runs, wanted, recipe, key).values()))
         cells[key] = Cell(
@@ -79,16 +104,14 @@ def _mean_row(
     return Row(scene=None, recipe=recipe, finished=sum(r["finished"] for r in own.values()), cells=cells)
 
 
-def _by_seed(
-    runs: Sequence[Mapping[str, Any]], scenes: Sequence[str], recipe: str, key: str
-) -> dict[int, float]:
+def _by_seed(runs: Sequence[RunRecord], scenes: Sequence[str], recipe: str, key: str) -> dict[int, float]:
     """The mean over scenes of every seed that has a value on all of them."""
     values: dict[int, list[float]] = {}
     for scene in scenes:
-        for run in _finished(runs, scene, recipe):
-            value = run["metrics"].get(key)
+        for seed, metrics in _finished(runs, scene, recipe):
+            value = metrics.get(key)
             if value is not None:
-                values.setdefault(run["seed"], []).append(value)
+                values.setdefault(seed, []).append(value)
     return {seed: math.fsum(v) / len(v) for seed, v in values.items() if len(v) == len(scenes)}
 
 

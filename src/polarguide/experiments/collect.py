@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from polarguide import __version__
 from polarguide.evaluation.sources import commit, scoring_digest
-from polarguide.evaluation.table import KEYS
+from polarguide.evaluation.table import COLUMNS
+from polarguide.experiments.aggregate import RunRecord
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
-from polarguide.experiments.results import make_results, write_results
+from polarguide.experiments.results import Results, make_results, write_results
 from polarguide.experiments.tables import csv_text, latex, markdown
-from polarguide.files import atomic
+from polarguide.files import write_text
 from polarguide.runs.folder import recipe_data
 
 BESIDE_OTHERS = "beside_others.txt"
@@ -27,7 +27,7 @@ def collect(
     scenes: Sequence[SceneEntry],
     plan: Sequence[PlannedRun],
     failures: Mapping[Path, str],
-) -> dict[str, Any]:
+) -> Results:
     """The record of a comparison as far as its runs are.
 
     Args:
@@ -44,12 +44,12 @@ def collect(
         },
         settings={
             "steps": comparison.settings.steps,
-            "seeds": comparison.seeds,
-            "downscale": comparison.downscale,
-            "transfer": comparison.transfer,
+            "seeds": comparison.options.seeds,
+            "downscale": comparison.options.downscale,
+            "transfer": comparison.options.transfer,
             "refractive_index": comparison.settings.refractive_index,
-            "threads": comparison.threads,
-            "jobs": comparison.jobs,
+            "threads": comparison.options.threads,
+            "jobs": comparison.options.parallel,
         },
         scenes=[
             {"name": s.name, "digest": s.digest, "views": s.views, "test_views": list(s.test_views)}
@@ -63,11 +63,11 @@ def collect(
     )
 
 
-def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) -> dict[str, Any]:
+def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) -> RunRecord:
     record = run.metrics() if run.state() == "done" else None
     metrics = None
     if record is not None:
-        metrics = {key: record.get(key) for key in KEYS}
+        metrics = {m.key: record.get(m.key) for m in COLUMNS}
         if (run.folder / BESIDE_OTHERS).exists():
             metrics["train_seconds"] = None
     return {
@@ -80,7 +80,7 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
         "metrics": metrics,
         "lpips_reason": record.get("lpips_reason") if record is not None else None,
         "views": {
-            name: {key: scores.get(key) for key in KEYS if key in scores}
+            name: {m.key: scores[m.key] for m in COLUMNS if m.key in scores}
             for name, scores in record["views"].items()
         }
         if record is not None
@@ -88,10 +88,9 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
     }
 
 
-def write_tables(out: Path, results: Mapping[str, Any]) -> None:
+def write_tables(out: Path, results: Results) -> None:
     """Write ``results.json``, ``.md``, ``.csv`` and ``.tex``, each in one step."""
     write_results(out / "results.json", results)
     files = {"md": TITLE + markdown(results), "csv": csv_text(results), "tex": latex(results)}
     for suffix, text in files.items():
-        with atomic(out / f"results.{suffix}") as path:
-            path.write_text(text, encoding="utf-8")
+        write_text(out / f"results.{suffix}", text)

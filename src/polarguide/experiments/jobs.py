@@ -3,134 +3,182 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
+from typing import Any
 
-PROGRAM = (sys.executable, "-m", "polarguide")
+from polarguide.experiments.worker import COMMAND, Task, Training, encoded
+from polarguide.progress import Advance, Reporter
+from polarguide.runs.folder import LOG
+
 POLL_SECONDS = 0.1
 STDERR = "stderr.txt"
+TAIL_BYTES = 4096
 
 
 @dataclass(frozen=True)
 class Job:
-    """Command lines of the program (without its name) to run one after the other.
+    """Tasks to do one after the other, each in a process of its own.
 
     Attributes:
         label: what messages call it.
-        folder: of the run; made if need be. Its ``stderr.txt`` takes what the children say.
-        commands: the command lines.
+        folder: of the run; made if need be. Its ``stderr.txt`` takes what the children write.
+        tasks: what to do.
         steps: the number of training steps at its end.
     """
 
     label: str
     folder: Path
-    commands: tuple[tuple[str, ...], ...]
+    tasks: tuple[Task, ...]
     steps: int
+
+    def step(self) -> int:
+        """How many steps of the training are done, as its log says."""
+        line = last_line(self.folder / LOG)
+        return min(self.steps, int(line["step"]) + 1) if line and "step" in line else 0
 
 
 class Child:
     """A job at work."""
 
-    def __init__(self, job: Job, threads: int) -> None:
-        self.job, self._threads = job, threads
-        self._waiting = deque(job.commands)
+    def __init__(self, job: Job, advance: Advance, command: Sequence[str]) -> None:
+        self.job, self._advance, self._command = job, advance, command
+        self._waiting = deque(job.tasks)
         job.folder.mkdir(parents=True, exist_ok=True)
         self._errors = job.folder / STDERR
-        self._process: subprocess.Popen[bytes] | None = None
-        self.verb = ""
-        self._next()
+        self._start_next()
 
-    def _next(self) -> None:
-        command = self._waiting.popleft()
-        self.verb = command[0]
-        count = str(self._threads)
+    def _start_next(self) -> None:
+        self._task = self._waiting.popleft()
         with open(self._errors, "wb") as errors:
             self._process = subprocess.Popen(
-                [*PROGRAM, *command, "--threads", count],
-                stdin=subprocess.DEVNULL,
+                self._command,
+                stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
-                env={**os.environ, "OMP_NUM_THREADS": count},
+                env={"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "OMP_NUM_THREADS": str(self._task.threads)},
                 # A session of its own: Ctrl-C in the terminal reaches it through the parent alone, once. The lock of
                 # the output folder, which it inherits, outlives a parent that is killed.
                 start_new_session=True,
                 close_fds=False,
             )
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError), self._process.stdin as stdin:
+            stdin.write(encoded(self._task))
 
     def ended(self) -> bool:
-        """Look at the process, start the next one if it succeeded; True where nothing is left to do."""
-        assert self._process is not None
+        """Poll the process, start the next one if it succeeded; True where nothing is left to do."""
         code = self._process.poll()
         if code is None:
             return False
         if code == 0 and self._waiting:
-            self._next()
+            self._start_next()
             return False
         return True
 
     def error(self) -> str | None:
         """After the end: the last line of its stderr, or None if all went well."""
-        assert self._process is not None
         if self._process.returncode == 0:
             return None
         lines = [line for line in self._errors.read_text(errors="replace").splitlines() if line.strip()]
-        said = lines[-1].strip() if lines else f"{self.verb} ended with status {self._process.returncode}"
-        return said.removeprefix("error: ")
+        return lines[-1].strip() if lines else f"the process ended with status {self._process.returncode}"
+
+    def report(self) -> None:
+        """Pass on how far it is."""
+        note = "" if isinstance(self._task, Training) else "scoring"
+        line = last_line(self.job.folder / LOG) or {}
+        psnr, count = line.get("psnr"), line.get("gaussians")
+        if not note and psnr is not None and count is not None:
+            note = f"PSNR {psnr:.1f} dB  {count:,} Gaussians"
+        self._advance(self.job.step(), note=note)
 
     def interrupt(self) -> None:
         """Ask it to stop: a training saves its state first."""
-        if self._process is not None and self._process.poll() is None:
+        if self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
 
     def wait(self) -> None:
         """Until it has stopped."""
-        if self._process is not None:
-            self._process.wait()
+        self._process.wait()
 
     def kill(self) -> None:
         """Stop it at once; its last checkpoint stays."""
-        if self._process is not None and self._process.poll() is None:
+        if self._process.poll() is None:
             self._process.kill()
             self._process.wait()
+
+
+class _Progress:
+    """What a reporter is told of many jobs: one piece of work for all, and one for each at work."""
+
+    def __init__(self, jobs: Sequence[Job], reporter: Reporter, stack: contextlib.ExitStack) -> None:
+        self._reporter, self._total, self._ended = reporter, len(jobs), 0
+        self._steps = {job.folder: job.step() for job in jobs}
+        self._all = stack.enter_context(reporter.track("all", sum(job.steps for job in jobs)))
+        self._stack = stack
+        self._open: dict[Path, contextlib.ExitStack] = {}
+
+    def begin(self, job: Job) -> Advance:
+        """A job starts."""
+        self._open[job.folder] = self._stack.enter_context(contextlib.ExitStack())
+        return self._open[job.folder].enter_context(self._reporter.track(job.label, job.steps))
+
+    def report(self, active: Sequence[Child]) -> None:
+        """How far all and each of them are."""
+        for child in active:
+            child.report()
+            self._steps[child.job.folder] = child.job.step()
+        self._all(sum(self._steps.values()), note=f"{self._ended}/{self._total} runs")
+
+    def end(self, job: Job, error: str | None) -> None:
+        """A job has ended."""
+        self._ended += 1
+        self._steps[job.folder] = job.steps
+        self._open.pop(job.folder).close()
+        self._reporter.say(f"done  {job.label}" if error is None else f"failed  {job.label}: {error}")
 
 
 def run_jobs(
     jobs: Sequence[Job],
     *,
     parallel: int,
-    threads: int,
-    on_end: Callable[[Job, str | None], None],
-    on_look: Callable[[Sequence[Child]], None],
+    reporter: Reporter,
+    on_end: Callable[[Job, str | None], None] = lambda job, error: None,
+    command: Sequence[str] = COMMAND,
 ) -> None:
     """Work through jobs. One that fails takes no other down.
 
     Args:
         jobs: what to do, in this order.
-        parallel: jobs at a time. threads: of each.
+        parallel: jobs at a time.
+        reporter: receives progress, and a line at the end of each job.
         on_end: called after each job, with its error or None.
-        on_look: called several times a second with the jobs at work.
+        command: what to run in a child, with the task on its standard input.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C, SIGTERM or SIGHUP, when all children have stopped.
+        KeyboardInterrupt: raised meanwhile, as by Ctrl-C; passed on when all children have stopped.
     """
     waiting, active = deque(jobs), list[Child]()
-    with _signals_as_interrupts():
+    with contextlib.ExitStack() as stack:
+        progress = _Progress(jobs, reporter, stack)
         try:
             while waiting or active:
                 while waiting and len(active) < parallel:
-                    active.append(Child(waiting.popleft(), threads))
+                    job = waiting.popleft()
+                    active.append(Child(job, progress.begin(job), command))
                 for child in [child for child in active if child.ended()]:
                     active.remove(child)
-                    on_end(child.job, child.error())
-                on_look(active)
+                    error = child.error()
+                    progress.end(child.job, error)
+                    on_end(child.job, error)
+                progress.report(active)
                 time.sleep(POLL_SECONDS)
         except BaseException:  # whatever happens here, no child goes on unwatched
             _stop(active)
@@ -149,16 +197,19 @@ def _stop(children: Sequence[Child]) -> None:
             child.kill()
 
 
-@contextlib.contextmanager
-def _signals_as_interrupts() -> Iterator[None]:
-    """SIGTERM and SIGHUP act like Ctrl-C."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    old = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+def last_line(log: Path) -> dict[str, Any] | None:
+    """The last whole line of a log, or None where there is none yet."""
     try:
-        yield
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
+        with open(log, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
+            lines = file.read().split(b"\n")
+    except OSError:
+        return None
+    for line in reversed(lines):
+        try:
+            values = json.loads(line)
+        except ValueError:  # empty, half written, or cut by the seek
+            continue
+        if isinstance(values, dict):
+            return values
+    return None

@@ -10,20 +10,21 @@ import hashlib
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from polarguide import __version__
-from polarguide.cli.common import Transfer, read_scene
-from polarguide.cli.evaluate import METRICS
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import validate_metrics
+from polarguide.evaluation import read_metrics
 from polarguide.evaluation.sources import scoring_digest, training_digest
-from polarguide.raster import DeviceName
+from polarguide.experiments.options import CompareOptions
+from polarguide.options import SceneOptions
+from polarguide.progress import SILENT, Reporter
 from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration, recipe_data
+from polarguide.runs.opened import read_scene
 from polarguide.training.recipe import Recipe
-from polarguide.training.trainer import TrainSettings
+from polarguide.training.settings import TrainSettings
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
@@ -36,39 +37,26 @@ class Comparison:
 
     Attributes:
         scenes: folders. recipes: the methods, in the order of the tables.
-        settings: steps, first seed (0) and refractive index. seeds: how many seeds, from 0 up.
-        downscale, transfer, device: as for ``train``.
-        jobs: trainings at a time. threads: of each.
-        speed: whether to time pictures that were not timed alone. report_views: test views a scene in the report.
+        settings: of each training; the first seed, from which others count up.
+        options: how runs are trained, timed and shown.
         out: folder to write.
     """
 
     scenes: tuple[Path, ...]
     recipes: tuple[Recipe, ...]
     settings: TrainSettings
-    seeds: int
-    downscale: int
-    transfer: Transfer
-    device: DeviceName
-    jobs: int
-    threads: int
-    speed: bool
-    report_views: int
+    options: CompareOptions
     out: Path
 
     @property
     def command(self) -> str:
         """A command line that asks for the same."""
-        words = [
-            "polarguide",
-            "compare",
-            *map(str, self.scenes),
-            "--recipes",
-            *(r.name for r in self.recipes),
-        ]
-        words += ["--steps", str(self.settings.steps), "--seeds", str(self.seeds), "--out", str(self.out)]
-        words += ["--downscale", str(self.downscale), "--transfer", self.transfer]
-        words += ["--refractive-index", str(self.settings.refractive_index)]
+        settings, options = self.settings, self.options
+        words = ["polarguide", "compare", *map(str, self.scenes)]
+        words += ["--recipes", *(recipe.name for recipe in self.recipes)]
+        words += ["--steps", str(settings.steps), "--seeds", str(options.seeds), "--out", str(self.out)]
+        words += ["--downscale", str(options.downscale), "--transfer", options.transfer]
+        words += ["--refractive-index", str(settings.refractive_index)]
         return shlex.join(words)
 
 
@@ -90,8 +78,7 @@ class PlannedRun:
     scene: SceneEntry
     recipe: Recipe
     settings: TrainSettings
-    downscale: int
-    transfer: Transfer
+    reading: SceneOptions
     folder: Path
 
     @property
@@ -115,9 +102,8 @@ class PlannedRun:
     def metrics(self) -> dict[str, Any] | None:
         """The record of its scores, or None where there is no valid one by this version."""
         try:
-            record = json.loads((self.folder / METRICS).read_text(encoding="utf-8"))
-            validate_metrics(record)
-        except (OSError, ValueError, KeyError, PolarguideError):
+            record = read_metrics(self.folder)
+        except (OSError, PolarguideError):
             return None
         whole = record["steps"] == self.settings.steps
         return record if whole and record["provenance"].get("sources") == scoring_digest() else None
@@ -133,12 +119,12 @@ class PlannedRun:
             and found.recipe_data == recipe_data(self.recipe)
             and found.settings == self.settings
             and (found.recipe, found.downscale, found.transfer)
-            == (self.recipe.name, self.downscale, self.transfer)
+            == (self.recipe.name, self.reading.downscale, self.reading.transfer)
         )
         return found if same else None
 
 
-def scene_entries(comparison: Comparison) -> list[SceneEntry]:
+def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[SceneEntry]:
     """Read every scene once: its digest and its test views.
 
     Raises:
@@ -146,7 +132,7 @@ def scene_entries(comparison: Comparison) -> list[SceneEntry]:
     """
     entries: list[SceneEntry] = []
     for path in comparison.scenes:
-        scene = read_scene(path, downscale=comparison.downscale, transfer=comparison.transfer)
+        scene = read_scene(path, comparison.options, reporter)
         if scene.name in [entry.name for entry in entries]:
             raise PolarguideError(
                 path,
@@ -167,53 +153,40 @@ def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[Plan
     return [
         _planned(comparison, scene, recipe, seed)
         for scene in scenes
-        for seed in range(comparison.seeds)
+        for seed in range(comparison.settings.seed, comparison.settings.seed + comparison.options.seeds)
         for recipe in comparison.recipes
     ]
 
 
 def _planned(comparison: Comparison, scene: SceneEntry, recipe: Recipe, seed: int) -> PlannedRun:
-    settings = TrainSettings(comparison.settings.steps, seed, comparison.settings.refractive_index)
+    settings, options = replace(comparison.settings, seed=seed), comparison.options
+    reading = SceneOptions(options.downscale, options.transfer)
     key = run_key(
         scene.digest,
         recipe_data(recipe),
         settings,
-        downscale=comparison.downscale,
-        transfer=comparison.transfer,
+        reading,
         code=f"{__version__} {training_digest()}",
     )
     folder = comparison.out / RUNS / scene.name / recipe.name.replace(":", "__") / f"{seed}-{key}"
-    return PlannedRun(scene, recipe, settings, comparison.downscale, comparison.transfer, folder)
+    return PlannedRun(scene, recipe, settings, reading, folder)
 
 
 def run_key(
-    scene_digest: str,
-    recipe: Mapping[str, Any],
-    settings: TrainSettings,
-    *,
-    downscale: int,
-    transfer: str,
-    code: str,
+    scene_digest: str, recipe: Mapping[str, Any], settings: TrainSettings, reading: SceneOptions, *, code: str
 ) -> str:
     """A short digest of everything that a training's result depends on.
 
     Args:
         scene_digest: of the scene's files.
         recipe: all values of the recipe.
-        settings: steps, seed and refractive index.
-        downscale, transfer: how the pictures are read.
+        settings: of the training.
+        reading: how the pictures are read.
         code: which version of the program trains.
 
     Returns:
         Ten hexadecimal digits.
     """
-    parts = [
-        scene_digest,
-        recipe,
-        [settings.steps, settings.seed, settings.refractive_index],
-        downscale,
-        transfer,
-        code,
-    ]
+    parts = [scene_digest, recipe, asdict(settings), asdict(reading), code]
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]

@@ -1,19 +1,45 @@
-"""The report of a comparison: one HTML file that needs nothing beside itself."""
+"""The report of a comparison: one HTML file with tables, curves and pictures that needs nothing beside itself."""
 
 from __future__ import annotations
 
 import html
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from string import Template
 from typing import Any
 
-from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash
-from polarguide.experiments.tables import Block, ShownCell, blocks, notes, shown_columns
-from polarguide.visualization.embedded import LAYERS, EmbeddedView
-from polarguide.visualization.figures import color_gradient
+import torch
+from torch import Tensor
 
+from polarguide.capture import View
+from polarguide.evaluation.metrics import normal_angles_deg
+from polarguide.evaluation.table import COLUMNS
+from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash, read_curve
+from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
+from polarguide.experiments.results import Results
+from polarguide.experiments.tables import Block, ShownCell, blocks, formatted, notes, shown_columns
+from polarguide.files import write_text
+from polarguide.progress import Reporter
+from polarguide.runs.opened import OpenedRun, read_scene
+from polarguide.visualization import figures
+from polarguide.visualization.embedded import LAYERS, EmbeddedView, Tile, chosen_views, embed
+from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
+
+REPORT = "report.html"
+PICTURE_BYTES = 28_000_000
+"""What all pictures of a report may take, so that the file stays one that can be mailed and opened."""
+GROUND_TRUTH = "ground truth"
+PHOTOGRAPH = "photograph"
+LAYER_METRICS = {
+    "final": "psnr",
+    "diffuse": "diffuse_psnr",
+    "specular": "specular_psnr",
+    "normal": "normal_mae_deg",
+    "error": "psnr",
+    "normal_error": "normal_mae_deg",
+}
+"""Which score stands beside which layer."""
 ERROR_HIGH = 0.25
 """Mean absolute difference of shown pictures that is brightest in the error map."""
 NORMAL_ERROR_HIGH = 45.0
@@ -25,8 +51,97 @@ LEGEND = {
 """What the colors of false-color layers say."""
 
 
+def write_report(
+    comparison: Comparison,
+    scenes: Sequence[SceneEntry],
+    plan: Sequence[PlannedRun],
+    results: Results,
+    reporter: Reporter,
+) -> None:
+    """Render the pictures of the finished runs and write ``report.html`` in one step."""
+    views: list[EmbeddedView] = []
+    remarks: list[str] = []
+    curves: dict[str, list[Curve]] = {}
+    for scene in scenes:
+        shown = _first_finished(comparison, plan, scene)
+        drawn = (read_curve(run.folder, run.recipe.name) for run in shown)
+        curves[scene.name] = [curve for curve in drawn if curve is not None]
+        if comparison.options.report_views and shown:
+            names = chosen_views(scene.test_views, comparison.options.report_views)
+            if len(names) < len(scene.test_views):
+                remarks.append(f"{scene.name}: {len(names)} of {len(scene.test_views)} test views are shown.")
+            limit = PICTURE_BYTES // (len(scenes) * len(names))
+            with reporter.track(f"report: pictures of {scene.name}", len(names)) as advance:
+                for done, (embedded, remark) in enumerate(
+                    _scene_views(comparison, scene, shown, names, limit)
+                ):
+                    views += [embedded] if embedded is not None else []
+                    remarks += [remark] if remark is not None else []
+                    advance(done + 1)
+    write_text(comparison.out / REPORT, report_html(results, views, curves, remarks))
+
+
+def _first_finished(
+    comparison: Comparison, plan: Sequence[PlannedRun], scene: SceneEntry
+) -> list[PlannedRun]:
+    """For every recipe the finished run with the lowest seed."""
+    found: dict[str, PlannedRun] = {}
+    for run in plan:
+        if run.scene.name == scene.name and run.recipe.name not in found and run.state() == "done":
+            found[run.recipe.name] = run
+    return [found[recipe.name] for recipe in comparison.recipes if recipe.name in found]
+
+
+def _scene_views(
+    comparison: Comparison, entry: SceneEntry, runs: Sequence[PlannedRun], names: Sequence[str], limit: int
+) -> Iterator[tuple[EmbeddedView | None, str | None]]:
+    """The named views of one scene, as ``embed`` gives them; ``limit`` in bytes for each."""
+    scene = read_scene(entry.path, comparison.options)
+    opened = [OpenedRun.open(run.folder, device=comparison.options.device) for run in runs]
+    scores = [(run.metrics() or {})["views"] for run in runs]
+    for name in names:
+        view = scene.view(name)
+        tiles = [_ground_truth_tile(view)]
+        tiles += [_tile(run, view, s.get(name, {})) for run, s in zip(opened, scores, strict=True)]
+        yield embed(entry.name, name, tiles, limit)
+
+
+def _ground_truth_tile(view: View) -> Tile:
+    pictures = {key: value for key, value in ground_truth_pictures(view).items() if key in LAYER_METRICS}
+    return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
+
+
+def _tile(run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
+    """What one run shows of one view."""
+    result = run.model.render(view.camera).to("cpu")
+    pictures: dict[str, Picture] = {}
+    for layer in ("final", "diffuse", "specular", "normal"):
+        picture = layer_picture(result, layer, view.camera)
+        if picture is not None:
+            pictures[layer] = picture
+    pictures["error"] = figures.error_to_rgb(result.final, view.photograph(), ERROR_HIGH)
+    ground_truth = view.ground_truth
+    if ground_truth is not None and ground_truth.normal is not None and result.normal is not None:
+        angles = normal_angles_deg(result.normal.cpu(), ground_truth.normal)
+        pictures["normal_error"] = _angles_picture(angles, ground_truth.mask)
+    by_key = {metric.key: metric for metric in COLUMNS}
+    lines = {
+        layer: f"{formatted(value, by_key[key])} {by_key[key].unit}"
+        for layer, key in LAYER_METRICS.items()
+        if layer in pictures and (value := scores.get(key)) is not None
+    }
+    return Tile(run.recipe.name, pictures, lines)
+
+
+def _angles_picture(angles: Tensor, mask: Tensor | None) -> Picture:
+    """Degrees [H, W] in false colors; black outside the mask and where there is no ground truth."""
+    if mask is not None:
+        angles = torch.where(mask, angles, torch.nan)
+    return figures.scalar_to_rgb(angles, 0.0, NORMAL_ERROR_HIGH, "inferno")
+
+
 def report_html(
-    results: Mapping[str, Any],
+    results: Results,
     views: Sequence[EmbeddedView],
     curves: Mapping[str, Sequence[Curve]],
     remarks: Sequence[str] = (),
@@ -52,7 +167,7 @@ def report_html(
         notes=_list(notes(results)),
         pictures_hidden="" if views else "hidden",
         remarks=_list(remarks),
-        gradient=color_gradient("inferno"),
+        gradient=figures.color_gradient("inferno"),
         legend=_script_data(LEGEND),
         data=_script_data([vars(view) for view in views]),
         layers=_script_data(LAYERS),
@@ -66,7 +181,7 @@ def _page(name: str) -> str:
     return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")
 
 
-def _summary(results: Mapping[str, Any]) -> str:
+def _summary(results: Results) -> str:
     settings, counts = results["settings"], {k: len(results[k]) for k in ("scenes", "recipes", "runs")}
 
     def plural(count: int, word: str) -> str:
@@ -91,7 +206,7 @@ def _list(texts: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{html.escape(text)}</li>" for text in texts) + "</ul>" if texts else ""
 
 
-def _tables(results: Mapping[str, Any]) -> str:
+def _tables(results: Results) -> str:
     headings = "".join(
         f"<th>{html.escape(column.label)}<br>{html.escape(' '.join((column.unit, column.arrow)))}</th>"
         for column in shown_columns(results)
@@ -115,7 +230,7 @@ def _cell(cell: ShownCell) -> str:
     return f"<td>{value}{f' <small>± {spread}</small>' if spread else ''}</td>"
 
 
-def _curves(results: Mapping[str, Any], curves: Mapping[str, Sequence[Curve]]) -> str:
+def _curves(results: Results, curves: Mapping[str, Sequence[Curve]]) -> str:
     parts = []
     for scene, drawn in curves.items():
         if not drawn:
@@ -135,7 +250,7 @@ def _curves(results: Mapping[str, Any], curves: Mapping[str, Sequence[Curve]]) -
     return "".join(parts)
 
 
-def _recipes(results: Mapping[str, Any]) -> str:
+def _recipes(results: Results) -> str:
     return "".join(
         f"<details><summary><code>{html.escape(recipe['name'])}</code> {html.escape(recipe['about'])}</summary>"
         f"<pre>{html.escape(json.dumps(recipe['data'], indent=1))}</pre></details>"
@@ -143,7 +258,7 @@ def _recipes(results: Mapping[str, Any]) -> str:
     )
 
 
-def _provenance(results: Mapping[str, Any]) -> str:
+def _provenance(results: Results) -> str:
     facts = {**results["provenance"], **results["settings"]}
     rows = [
         (key.replace("_", " "), "unknown" if value is None else str(value)) for key, value in facts.items()

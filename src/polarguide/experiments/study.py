@@ -6,11 +6,13 @@ import html
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import ticks
+from polarguide.experiments.results import Results
+from polarguide.files import write_text
 
-SCORES = (("psnr", "PSNR (dB) ↑"), ("normal_mae_deg", "normal error (degrees) ↓"))
+DRAWN = tuple(metric for metric in COLUMNS if metric.key in ("psnr", "normal_mae_deg"))
 NAMES = {
     "views": "training views",
     "noise": "noise (1: exposed to full scale, 2: a quarter of that light)",
@@ -18,6 +20,7 @@ NAMES = {
     "spacing": "degrees between neighboring views",
 }
 """What the parameters of a sweep are called at the axis, where their name does not say it."""
+STUDY = "study.svg"
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM, ROW = 430, 330, 52, 14, 26, 44, 18
 PALETTE = ("#3366cc", "#dc3912", "#109618", "#ff9900", "#990099", "#0099c6", "#dd4477", "#66aa00")
 
@@ -33,7 +36,14 @@ def read_study(scene: Path) -> tuple[str, float] | None:
         return None
 
 
-def study_svg(results: Mapping[str, Any], studies: Mapping[str, tuple[str, float] | None]) -> str | None:
+def write_study(out: Path, results: Results, scenes: Mapping[str, Path]) -> None:
+    """Write ``study.svg``, where the scenes (folders by name) are a family of ``polarguide synth --sweep``."""
+    drawn = study_svg(results, {name: read_study(path) for name, path in scenes.items()})
+    if drawn is not None:
+        write_text(out / STUDY, drawn)
+
+
+def study_svg(results: Results, studies: Mapping[str, tuple[str, float] | None]) -> str | None:
     """Every recipe's scores over the number under study, as an SVG file.
 
     Args:
@@ -50,10 +60,10 @@ def study_svg(results: Mapping[str, Any], studies: Mapping[str, tuple[str, float
         return None
     recipes = [recipe["name"] for recipe in results["recipes"]]
     panels: list[str] = []
-    for key, label in SCORES:
-        lines = {recipe: _line(results, recipe, key, values) for recipe in recipes}
+    for metric in DRAWN:
+        lines = {recipe: _line(results, recipe, metric.key, values) for recipe in recipes}
         if any(lines.values()):
-            panels.append(_panel(lines, recipes, label, next(iter(parameters)), len(panels) * WIDTH))
+            panels.append(_panel(lines, recipes, metric.heading, next(iter(parameters)), len(panels) * WIDTH))
     if not panels:
         return None
     legend = [
@@ -67,12 +77,12 @@ def study_svg(results: Mapping[str, Any], studies: Mapping[str, tuple[str, float
     return "".join([head, '<rect class="frame" width="100%" height="100%"/>', *panels, *legend, "</svg>\n"])
 
 
-def _line(results: Mapping[str, Any], recipe: str, key: str, values: Mapping[str, float]) -> list[Point]:
+def _line(results: Results, recipe: str, key: str, values: Mapping[str, float]) -> list[Point]:
     points = []
     for row in results["table"]:
-        mean = row["cells"][key]["mean"]
-        if row["recipe"] == recipe and row["scene"] in values and mean is not None:
-            points.append((values[row["scene"]], float(mean)))
+        mean, value = row["cells"][key]["mean"], values.get(row["scene"] or "")
+        if row["recipe"] == recipe and value is not None and mean is not None:
+            points.append((value, float(mean)))
     return sorted(points)
 
 

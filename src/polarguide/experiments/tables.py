@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from polarguide.evaluation.table import COLUMNS, Column
-from polarguide.experiments.aggregate import Cell, Row
+from polarguide.evaluation.table import COLUMNS, Metric
+from polarguide.experiments.aggregate import NO_VALUE, Cell, Row
+from polarguide.experiments.results import Results
 
 MEAN_TITLE = "mean over scenes"
 NOT_APPLICABLE = "n/a"
@@ -41,16 +41,16 @@ class Block:
     rows: tuple[tuple[str, tuple[ShownCell, ...]], ...]
 
 
-def shown_columns(results: Mapping[str, Any]) -> tuple[Column, ...]:
+def shown_columns(results: Results) -> tuple[Metric, ...]:
     """The columns that people see: those with a value in some row."""
     return tuple(
         column
         for column in COLUMNS
-        if column.shown and any(row["cells"][column.key]["count"] for row in results["table"])
+        if column.shown == "tables" and any(_cell_of(row, column)["count"] for row in results["table"])
     )
 
 
-def blocks(results: Mapping[str, Any]) -> list[Block]:
+def blocks(results: Results) -> list[Block]:
     """The table by scenes, formatted, with the best of every column marked."""
     columns = shown_columns(results)
     titles: dict[str | None, str] = {row["scene"]: row["scene"] or MEAN_TITLE for row in results["table"]}
@@ -69,9 +69,9 @@ def blocks(results: Mapping[str, Any]) -> list[Block]:
     return made
 
 
-def best_rows(rows: Sequence[Row], column: Column) -> set[int]:
+def best_rows(rows: Sequence[Row], column: Metric) -> set[int]:
     """Which rows are best in a column, as far as its shown digits tell; none where fewer than two have a value."""
-    values = {i: _shown_number(row["cells"][column.key], column) for i, row in enumerate(rows)}
+    values = {i: _shown_number(_cell_of(row, column), column) for i, row in enumerate(rows)}
     numbers = {index: value for index, value in values.items() if value is not None}
     if column.better is None or len(numbers) < 2:
         return set()
@@ -79,7 +79,7 @@ def best_rows(rows: Sequence[Row], column: Column) -> set[int]:
     return {index for index, value in numbers.items() if value == best}
 
 
-def notes(results: Mapping[str, Any]) -> list[str]:
+def notes(results: Results) -> list[str]:
     """What a reader of the table has to know, a sentence each."""
     said = ["↑ higher is better, ↓ lower is better; the best of each scene and column is bold."]
     seeds = results["settings"]["seeds"]
@@ -101,7 +101,7 @@ def notes(results: Mapping[str, Any]) -> list[str]:
     return said
 
 
-def markdown(results: Mapping[str, Any]) -> str:
+def markdown(results: Results) -> str:
     """The table in Markdown, a heading for every scene, then the notes."""
     columns = shown_columns(results)
     lines = []
@@ -116,20 +116,20 @@ def markdown(results: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def csv_text(results: Mapping[str, Any]) -> str:
+def csv_text(results: Results) -> str:
     """All columns in full precision: ``scene`` (empty: mean over scenes), ``recipe``, ``runs``, key, key_spread, ..."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     pairs = (name for column in COLUMNS for name in (column.key, f"{column.key}_spread"))
     writer.writerow(["scene", "recipe", "runs", *pairs])
     for row in results["table"]:
-        cells = [row["cells"][column.key] for column in COLUMNS]
+        cells = [_cell_of(row, column) for column in COLUMNS]
         values = (value for cell in cells for value in (cell["mean"], cell["spread"]))
         writer.writerow([row["scene"] or "", row["recipe"], row["finished"], *values])
     return file.getvalue()
 
 
-def latex(results: Mapping[str, Any]) -> str:
+def latex(results: Results) -> str:
     """A ``tabular`` in the style of booktabs, one block of rows for every scene."""
     columns = shown_columns(results)
     lines = ["% needs \\usepackage{booktabs}", f"\\begin{{tabular}}{{l{'r' * len(columns)}}}", "\\toprule"]
@@ -150,23 +150,29 @@ def latex_text(text: str) -> str:
     return "".join(_LATEX.get(character, character) for character in text)
 
 
-def _cell(row: Row, column: Column, best: bool, table: Sequence[Row]) -> ShownCell:
-    cell = row["cells"][column.key]
+def _cell_of(row: Row, column: Metric) -> Cell:
+    """A record of an older version lacks the metrics that came later."""
+    return row["cells"].get(column.key, NO_VALUE)
+
+
+def _cell(row: Row, column: Metric, best: bool, table: Sequence[Row]) -> ShownCell:
+    cell = _cell_of(row, column)
     if cell["mean"] is None:
         # A speed that was not measured alone, or a run that has not finished, is not "not applicable".
         known = row["scene"] is None and any(
-            other["recipe"] == row["recipe"] and other["cells"][column.key]["count"] for other in table
+            other["recipe"] == row["recipe"] and _cell_of(other, column)["count"] for other in table
         )
-        return ShownCell("" if column.speed or not row["finished"] or known else NOT_APPLICABLE)
-    spread = "" if cell["spread"] is None else _formatted(cell["spread"], column)
-    return ShownCell(_formatted(cell["mean"], column), spread, best)
+        return ShownCell("" if column.timed or not row["finished"] or known else NOT_APPLICABLE)
+    spread = "" if cell["spread"] is None else formatted(cell["spread"], column)
+    return ShownCell(formatted(cell["mean"], column), spread, best)
 
 
-def _shown_number(cell: Cell, column: Column) -> float | None:
+def _shown_number(cell: Cell, column: Metric) -> float | None:
     return None if cell["mean"] is None else round(cell["mean"] * column.factor, column.digits)
 
 
-def _formatted(value: float, column: Column) -> str:
+def formatted(value: float, column: Metric) -> str:
+    """A recorded value as tables show it, without its unit."""
     return f"{value * column.factor:,.{column.digits}f}"
 
 

@@ -41,7 +41,7 @@ def scene_mesh(
 
     Args:
         cameras: at least two. render: gives a view with depth and normals.
-        resolution: voxels along the longest side of what the cameras look at.
+        resolution: voxels along the longest side of what the cameras see.
 
     Raises:
         PolarguideError: there is no surface, or a library is missing.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -12,33 +12,23 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from polarguide.shading.cubemap import ringed_texels
-from polarguide.shading.mips import box_mips
 
 
 @torch.no_grad()
 def light_numbers(levels: Sequence[Tensor]) -> NDArray[np.float16]:
     """Cubemaps [6, R, R, C] with their rings, one after the other, channels filled up to a multiple of four."""
-    rows = []
+    numbers = []
     for texture in levels:
         texels = ringed_texels(texture.detach().clamp(-6e4, 6e4))
-        rows.append(pad(texels, (0, -texels.shape[-1] % 4)).flatten())
-    return torch.cat(rows).numpy().astype("<f2")
+        numbers.append(pad(texels, (0, -texels.shape[-1] % 4)).flatten())
+    return torch.cat(numbers).numpy().astype("<f2")
 
 
 @torch.no_grad()
-def directional_levels(light: Mapping[str, Tensor]) -> list[Tensor]:
-    """The levels of the directional shading's grid."""
-    return box_mips(light["texels"])
-
-
-@torch.no_grad()
-def network_numbers(light: Mapping[str, Tensor]) -> NDArray[np.float32]:
-    """The MLP: for each layer weights [inputs, outputs], then biases; outputs filled up to a multiple of four."""
-    rows = []
-    for layer in range(3):
-        for values in (light[f"mlp_weight_{layer}"].detach(), light[f"mlp_bias_{layer}"].detach()[None]):
-            rows.append(pad(values, (0, -values.shape[1] % 4)).flatten())
-    return torch.cat(rows).numpy().astype("<f4")
+def network_numbers(matrices: Sequence[Tensor]) -> NDArray[np.float32]:
+    """Matrices [rows, columns] one after the other, columns filled up to a multiple of four."""
+    padded = [pad(matrix.detach(), (0, -matrix.shape[1] % 4)).flatten() for matrix in matrices]
+    return torch.cat(padded).numpy().astype("<f4")
 
 
 def viridis() -> NDArray[np.uint8]:

@@ -14,11 +14,10 @@ from polarguide.capture import View
 from polarguide.color import srgb_encode
 from polarguide.errors import PolarguideError
 from polarguide.files import atomic
+from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.raster import Rasterize
-from polarguide.shading.deferred import harmonic_colors
-from polarguide.shading.directional import albedo_of
-from polarguide.shading.model import Parameters
+from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.shading.visibility import outward_directions
 
 OPAQUE = 0.5
@@ -29,7 +28,7 @@ FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
 
 @torch.no_grad()
 def surface_points(
-    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize
+    gaussians: Parameters, shading: ShadingModel, views: Iterable[View], rasterize: Rasterize
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Positions, outward unit normals and display colors, each [M, 3], of opaque Gaussians that a view sees.
 
@@ -51,11 +50,8 @@ def surface_points(
         means, gaussians["quaternions"][kept], gaussians["log_scales"][kept], torch.zeros(3)
     )
     normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
-    if "log_albedo" in gaussians:
-        linear = albedo_of(gaussians)[kept]
-    else:
-        few = {name: gaussians[name][kept] for name in ("sh_dc", "sh_rest")}
-        linear = harmonic_colors(few, -normals.contiguous())
+    few = {name: gaussians[name][kept] for name in (*CORE_SHAPES, *shading.parameters)}
+    linear = shading.diffuse_colors(few, -normals.contiguous())
     colors = srgb_encode(linear.clamp(0, 1))
     return means, normals, colors
 

@@ -19,12 +19,13 @@ from torch import Tensor
 
 from polarguide import __version__
 from polarguide.camera import Camera
-from polarguide.export.page_light import directional_levels, light_numbers, network_numbers, viridis
-from polarguide.export.records import TEXELS, Kind, records, shading_kind
+from polarguide.export.page_light import light_numbers, network_numbers, viridis
+from polarguide.export.records import records
 from polarguide.files import atomic
+from polarguide.gaussians.ply import refit_sh_to_display
+from polarguide.runs.point_cloud import gaussian_colors
 from polarguide.scene_frame import scene_frame
-from polarguide.shading.deferred import Shading
-from polarguide.shading.model import Parameters, ShadingModel
+from polarguide.shading.model import PLAIN_LAYERS, PageShading, Parameters, ShadingModel
 
 SCRIPTS = ("algebra.js", "sorter.js", "renderer.js", "navigation.js", "controls.js", "unpack.js", "main.js")
 SHADERS = {
@@ -36,22 +37,17 @@ SHADERS = {
     "light": "light.glsl",
     "shade": "shade.frag",
 }
-LAYERS: dict[Kind, tuple[str, ...]] = {
-    "plain": ("final", "normal"),
-    "reflection": ("final", "diffuse", "specular", "base", "strength", "normal"),
-    "local": ("final", "diffuse", "specular", "base", "strength", "normal"),
-    "directional": ("final", "diffuse", "specular", "base", "normal"),
-}
-LEFT_OUT = "The reflections of this model are left out: the page does not know their shading. It shows the base color."
-TURNED_LOCALLY = (
-    "Turning the environment turns what is reflected from afar. What stands near is reflected by the Gaussians "
-    "themselves, which stay as they are."
+LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal")
+"""Layers that the page can show, in its order."""
+BAKED = (
+    "This page has no shaders for the reflections of this model. Each Gaussian shows its color toward the eye, with "
+    "reflections baked into spherical harmonics of degree 3, which keep broad highlights and no mirror images."
 )
 
 
 def share_page(
     gaussians: Parameters,
-    environment: Mapping[str, Tensor] | None,
+    light: Mapping[str, Tensor],
     shading: ShadingModel,
     cameras: Mapping[str, Camera],
     *,
@@ -64,7 +60,7 @@ def share_page(
 
     Args:
         gaussians: the Gaussians.
-        environment: parameters of the learned light, None: no reflection. shading: of the recipe.
+        light: parameters of the learned light by name. shading: of the recipe, for the run's refractive index.
         cameras: poses to choose from by name, at least one. first: name of the one to begin with.
         title, caption: any text; it is escaped.
         metrics: labels and values, any text.
@@ -72,28 +68,27 @@ def share_page(
     Returns:
         HTML that asks for nothing from outside; its own policy forbids it to.
     """
-    kind = shading_kind(shading, lit=environment is not None)
-    notes = [LEFT_OUT] if kind is None else [TURNED_LOCALLY] if kind == "local" else []
-    kind = kind or "plain"
-    quantized = records(gaussians, kind)
+    page = shading.page(gaussians, light)
+    layers: Sequence[str] = shading.layers
+    if page is None:
+        page, layers = baked_page(gaussians, light, shading), PLAIN_LAYERS
+    quantized = records(gaussians, page.values)
     scene: dict[str, Any] = {
-        "kind": kind,
-        "texels": TEXELS[kind],
+        "kind": page.kind,
+        "texels": quantized.texels,
         "count": len(quantized.data),
-        "layers": LAYERS[kind],
+        "layers": [name for name in LAYERS if name in layers],
+        "index": 1.5,
+        "resolution": int(page.light[0].shape[1]) if page.light else 1,
+        "levels": max(1, len(page.light)),
+        **_frame(cameras, first),
+        **page.constants,
     }
-    scene |= _frame(cameras, first) | {"index": 1.5, "resolution": 1, "levels": 1}
-    arrays: dict[str, NDArray[np.generic] | None] = {"light": None, "network": None, "viridis": viridis()}
-    if kind != "plain" and environment is not None:
-        levels = [environment["texels"]]
-        if kind == "directional":
-            levels = directional_levels(environment)
-            arrays["network"] = network_numbers(environment)
-            scene["width"] = int(environment["mlp_weight_0"].shape[1])
-        arrays["light"] = light_numbers(levels)
-        scene |= {"resolution": int(levels[0].shape[1]), "levels": len(levels)}
-    if isinstance(shading, Shading):
-        scene |= {"blend": shading.blend, "index": shading.index}
+    arrays: dict[str, NDArray[np.generic] | None] = {
+        "light": light_numbers(page.light) if page.light else None,
+        "network": network_numbers(page.network) if page.network else None,
+        "viridis": viridis(),
+    }
     script = "\n".join(
         f'"use strict";\n{_page(name)}' if not i else _page(name) for i, name in enumerate(SCRIPTS)
     )
@@ -102,7 +97,7 @@ def share_page(
         version=html.escape(__version__),
         title=html.escape(title),
         caption=html.escape(caption),
-        notes="".join(f'<p class="note">{html.escape(note)}</p>' for note in notes),
+        notes="".join(f'<p class="note">{html.escape(note)}</p>' for note in page.notes),
         metrics="".join(
             f"<tr><th>{html.escape(label)}</th><td>{html.escape(value)}</td></tr>" for label, value in metrics
         ),
@@ -113,6 +108,15 @@ def share_page(
         records=_packed(quantized.planes()),
         **{name: "" if values is None else _packed(values.tobytes()) for name, values in arrays.items()},
     )
+
+
+def baked_page(gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel) -> PageShading:
+    """The page of a model for which there are no shaders: linear harmonics of its Gaussians' own colors, and a note."""
+    count = len(gaussians["means"])
+    dc, rest = refit_sh_to_display(
+        lambda directions: gaussian_colors(gaussians, light, shading, directions).cpu(), count
+    )
+    return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
 
 
 def write_page(path: Path, page: str) -> None:

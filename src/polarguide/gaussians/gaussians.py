@@ -1,6 +1,6 @@
-"""The trainable rows: one row per Gaussian in every tensor, and an Adam optimizer whose moments follow the rows.
+"""The Gaussians in training: tensors with one entry per Gaussian, and an Adam optimizer whose moments follow them.
 
-Rows are edited (kept, appended, overwritten) only through the methods here, so a tensor and its moments cannot get
+Gaussians are removed, appended and overwritten only through the methods here, so a tensor and its moments cannot get
 out of step.
 """
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from polarguide.errors import PolarguideError
 
-# What every recipe trains, with the shape of one row. Recipes may add side tensors of their own.
+# What every recipe trains, with the shape of one Gaussian's values. A shading model adds parameters of its own.
 CORE_SHAPES = {
     "means": (3,),
     "quaternions": (4,),
@@ -22,13 +22,15 @@ CORE_SHAPES = {
     "sh_dc": (3,),
     "sh_rest": (15, 3),
 }
+# The direction from which training views see a Gaussian; not trained, and only where a recipe is oriented.
+ORIENTED_SHAPES = {"outward": (3,)}
 
 
 class Gaussians:
     """Named per-Gaussian tensors with their Adam moments (Kingma and Ba 2015, epsilon 1e-15 as in 3DGS).
 
     Args:
-        tensors: the rows, all with the same first axis; ``CORE_SHAPES`` and any side tensors.
+        tensors: all with the same first axis; those of ``CORE_SHAPES`` and any others.
         rates: learning rate by name; a name without one is not trained.
     """
 
@@ -48,10 +50,10 @@ class Gaussians:
         counts = {name: t.shape[0] for name, t in self._tensors.items()}
         if len(set(counts.values())) > 1:
             raise PolarguideError(
-                "Gaussian rows",
-                expected="one row count",
+                "Gaussians",
+                expected="as many in every tensor",
                 found=str(counts),
-                remedy="Give every tensor one row each.",
+                remedy="Give every tensor one entry for each Gaussian.",
             )
 
     def __len__(self) -> int:
@@ -60,8 +62,9 @@ class Gaussians:
     def __getitem__(self, name: str) -> Tensor:
         return self._tensors[name]
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._tensors
+    def get(self, name: str) -> Tensor | None:
+        """The tensor, or None if there is none of that name."""
+        return self._tensors.get(name)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -69,7 +72,7 @@ class Gaussians:
         return tuple(self._tensors)
 
     def snapshot(self) -> dict[str, Tensor]:
-        """Detached copies of all rows."""
+        """Detached copies of all tensors."""
         return {name: t.detach().clone() for name, t in self._tensors.items()}
 
     def trained(self) -> list[Tensor]:
@@ -102,17 +105,17 @@ class Gaussians:
                 state[key].zero_()
 
     def keep(self, index: Tensor) -> None:
-        """Keep only the rows that ``index`` (a mask or indices) selects."""
+        """Keep only the Gaussians that ``index`` (a mask or indices) selects."""
         self._replace({name: t.detach()[index] for name, t in self._tensors.items()}, lambda m: m[index])
 
     def append(self, gaussians: Mapping[str, Tensor]) -> None:
-        """Append rows to every tensor; their moments start at zero."""
+        """Append Gaussians, given by every tensor; their moments start at zero."""
         joined = {name: torch.cat((t.detach(), gaussians[name])) for name, t in self._tensors.items()}
         count = gaussians["means"].shape[0]
         self._replace(joined, lambda m: torch.cat((m, m.new_zeros(count, *m.shape[1:]))))
 
     def _replace(self, tensors: Mapping[str, Tensor], follow: Callable[[Tensor], Tensor]) -> None:
-        """Put other rows in the tensors' place; ``follow`` makes the same edit on a moment."""
+        """Put other values in the tensors' place; ``follow`` makes the same edit on a moment."""
         groups = {group["name"]: group for group in self._optimizer.param_groups}
         for name, values in tensors.items():
             old, new = self._tensors[name], values.contiguous().requires_grad_()

@@ -14,10 +14,25 @@ from polarguide.inspection.verdict import Check, Verdict
 DECIDED = 0.95
 """Probability from which an order counts as decided."""
 ZERO_OFF = 3.0
-"""Degrees of zero offset from which on it is wrong, if it exceeds three standard errors; from half of it on, look."""
+"""Degrees of zero offset from which on it is wrong, beyond three standard errors; from half of it on, a warning."""
 ZERO_UNSURE = 3.0
 """Standard error in degrees above which a zero offset gets no verdict."""
 FIX = "Write a corrected scene with --fix FOLDER"
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One of the eight orders, and what the evidence says of it.
+
+    Attributes:
+        order: sense and zero. files: the angles that the pictures called 0, 45, 90 and 135 were taken at.
+        probability: of this order. log_odds: of the most likely order to it, 0 or more.
+    """
+
+    order: Order
+    files: FileOrder
+    probability: float
+    log_odds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +61,16 @@ class AngleFindings:
         return None if self.order is None else self.order.files(PAIRINGS[self.pairing])
 
     @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """All eight, in the order of ``ORDERS``; none without evidence."""
+        if self.posterior is None:
+            return ()
+        rows = zip(ORDERS, self.posterior.probabilities, self.posterior.log_odds, strict=True)
+        return tuple(
+            Hypothesis(order, order.files(PAIRINGS[self.pairing]), p, odds) for order, p, odds in rows
+        )
+
+    @property
     def offset(self) -> float | None:
         """The significant zero offset relative to the order, in degrees; None if there is none."""
         if self.order is None or self.posterior is None or self.posterior.offset_error > ZERO_UNSURE:
@@ -55,20 +80,16 @@ class AngleFindings:
 
     def record(self) -> dict[str, Any]:
         """As plain JSON types."""
-        hypotheses = []
-        if self.posterior is not None:
-            hypotheses = [
-                {
-                    "files": list(order.files(PAIRINGS[self.pairing])),
-                    "sense": "ccw" if order.sense > 0 else "cw",
-                    "zero_degrees": order.zero,
-                    "probability": p,
-                    "log_odds_against": against,
-                }
-                for order, p, against in zip(
-                    ORDERS, self.posterior.probabilities, self.posterior.log_odds, strict=True
-                )
-            ]
+        hypotheses = [
+            {
+                "files": list(row.files),
+                "sense": "ccw" if row.order.sense > 0 else "cw",
+                "zero_degrees": row.order.zero,
+                "probability": row.probability,
+                "log_odds_against": row.log_odds,
+            }
+            for row in self.hypotheses
+        ]
         return {
             "decided": self.order is not None,
             "order": None if self.files is None else list(self.files),
@@ -105,7 +126,8 @@ def order_check(angles: AngleFindings) -> Check:
             if p > 0.02
         ]
         return Check(
-            key, title, "look", f"Not decided. The pictures named 0, 45, 90, 135 were taken at {' or '.join(rivals)}.",
+            key, title, "warning",
+            f"Not decided. The pictures named 0, 45, 90, 135 were taken at {' or '.join(rivals)}.",
             _more_evidence(angles), figures=angles.record(),
         )  # fmt: skip
     if files == PAIRINGS[0]:
@@ -127,7 +149,7 @@ def handedness_check(angles: AngleFindings) -> Check:
     figures = {"counter_clockwise": probability}
     if max(probability, 1 - probability) < DECIDED:
         said = f"Not decided: counter-clockwise with a probability of {probability:.0%}."
-        return Check(key, title, "look", said, _more_evidence(angles), figures=figures)
+        return Check(key, title, "warning", said, _more_evidence(angles), figures=figures)
     if probability > 0.5:
         said = f"Counter-clockwise as displayed, with a probability of {probability:.1%}."
         return Check(key, title, "ok", said, figures=figures)
@@ -147,13 +169,13 @@ def zero_check(angles: AngleFindings) -> Check:
     figures = {"offset_degrees": offset, "error_degrees": error}
     if not math.isfinite(error) or error > ZERO_UNSURE:
         said = f"The standard error of the zero is {error:.1f}°: too large to decide."
-        return Check(key, title, "look", said, _more_evidence(angles), figures=figures)
+        return Check(key, title, "warning", said, _more_evidence(angles), figures=figures)
     about = "" if angles.order in (None, IDENTITY) else " (relative to the order found above)"
     said = f"The zero of the instrument lies at {offset:+.1f}° ± {error:.1f}°{about}."
     verdict: Verdict = "ok"
     remedy = ""
     if abs(offset) > max(ZERO_OFF / 2, 3 * error):
-        verdict = "wrong" if angles.offset is not None else "look"
+        verdict = "wrong" if angles.offset is not None else "warning"
         remedy = f"{FIX}, or repeat prepare with --zero {offset:.1f}."
     return Check(key, title, verdict, said, remedy, figures=figures)
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +19,7 @@ from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
-from polarguide.records import read_record
+from polarguide.progress import SILENT, Reporter
 
 LONGEST = 640
 """Pixels of the longer side that pictures are averaged down to (by whole factors)."""
@@ -95,7 +93,7 @@ def read_capture(
     *,
     downscale: int = 0,
     transfer: str = "linear",
-    progress: Callable[[int, int], None] | None = None,
+    reporter: Reporter = SILENT,
 ) -> Capture:
     """Read a scene folder for inspection.
 
@@ -103,7 +101,7 @@ def read_capture(
         path: a folder in a layout that ``load_scene`` reads; a COLMAP model may be missing.
         downscale: side of the pixel boxes to average; 0: until the longer side is at most 640.
         transfer: "linear" or "srgb".
-        progress: called with the number of views read and the number to read.
+        reporter: receives the progress.
 
     Raises:
         PolarguideError: a file cannot be used.
@@ -114,11 +112,9 @@ def read_capture(
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
-    index = refractive_index_of(
-        metadata, read_record(metadata, dict[str, Any]) if metadata.exists() else None
-    )
+    index = refractive_index_of(metadata, read_file(metadata) if metadata.exists() else None)
     factor = downscale or _fitting_factor(layout, names[0])
-    stored = read_views(layout, names, model, downscale=factor, transfer=transfer, progress=progress)
+    stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())
     return Capture(
         root=root,

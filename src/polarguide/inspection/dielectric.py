@@ -31,17 +31,17 @@ def dielectric_check(
         "exclude such areas with masks, and expect worse normals there."
     )
     if pixels is None or len(pixels.aolp) == 0:
-        verdict: Verdict = "look" if above > NOT_DIELECTRIC else "ok"
+        verdict: Verdict = "warning" if above > NOT_DIELECTRIC else "ok"
         said += (
             " Without normals, reflections of a smooth dielectric cannot be distinguished from metal or sky."
         )
-        return Check(key, title, verdict, said, remedy if verdict == "look" else "", figures=figures)
+        return Check(key, title, verdict, said, remedy if verdict == "warning" else "", figures=figures)
     strange = float(exceeds_dielectric(pixels, index).float().mean())
     figures["unexplained"] = strange
     said += f" Of the pixels with a normal, {strange:.0%} have a DoLP above the maximum of both lobes at their zenith."
     if strange <= NOT_DIELECTRIC:
         return Check(key, title, "ok", said, figures=figures)
-    return Check(key, title, "look", said, remedy, figures=figures)
+    return Check(key, title, "warning", said, remedy, figures=figures)
 
 
 def exceeds_dielectric(pixels: SurfaceSamples, index: float) -> torch.Tensor:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,8 @@ from polarguide.files import write_whole, writing
 from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import FileOrder, swaps
-from polarguide.records import read_record
+from polarguide.progress import SILENT, Reporter
+from polarguide.records import read_record, to_json
 
 COPIED = ("sparse", "masks", "invalid", "gt", "split.json")
 """Files and folders that are copied unchanged."""
@@ -47,9 +46,7 @@ def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
     return None if files == ANGLES and zero == 0.0 else Calibration(order=files, zero=zero)
 
 
-def fix_scene(
-    capture: Capture, change: Calibration, out: Path, advance: Callable[[int], None] = lambda done: None
-) -> str:
+def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Reporter = SILENT) -> str:
     """Write a corrected copy of a scene; the scene itself does not change.
 
     If only the order changes, files are copied under their right names, byte by byte. If the zero changes, the four
@@ -58,7 +55,7 @@ def fix_scene(
 
     Args:
         capture: the scene. change: from ``correction``. out: a new folder.
-        advance: called with the number of views written.
+        reporter: receives the progress.
 
     Returns:
         A description of what was done.
@@ -78,7 +75,7 @@ def fix_scene(
     shutil.rmtree(partial, ignore_errors=True)
     try:
         with writing(out):
-            _write(capture, change, partial, advance)
+            _write(capture, change, partial, reporter)
             if out.is_dir():
                 out.rmdir()
             os.replace(partial, out)
@@ -97,7 +94,7 @@ def described(change: Calibration) -> str:
     return " and ".join(parts)
 
 
-def _write(capture: Capture, change: Calibration, folder: Path, advance: Callable[[int], None]) -> None:
+def _write(capture: Capture, change: Calibration, folder: Path, reporter: Reporter) -> None:
     (folder / "polar").mkdir(parents=True)
     for name in COPIED:
         source = capture.root / name
@@ -105,12 +102,13 @@ def _write(capture: Capture, change: Calibration, folder: Path, advance: Callabl
             shutil.copytree(source, folder / name)
         elif source.exists():
             shutil.copy2(source, folder / name)
-    for done, view in enumerate(capture.layout.names):
-        if change.zero:
-            _rotate_view(capture, change, folder, view)
-        else:
-            _rename_view(capture, change.order, folder, view)
-        advance(done + 1)
+    with reporter.track("fixing", len(capture.layout.names)) as advance:
+        for done, view in enumerate(capture.layout.names, 1):
+            if change.zero:
+                _rotate_view(capture, change, folder, view)
+            else:
+                _rename_view(capture, change.order, folder, view)
+            advance(done)
     write_whole(folder / METADATA, _corrected_metadata(capture, change))
 
 
@@ -143,4 +141,4 @@ def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
         "scale": 1.0 / change.peak,
     }
     content["corrections"] = [*content.get("corrections", []), note]
-    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
+    return to_json(content)

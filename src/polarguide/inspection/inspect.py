@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
@@ -26,37 +23,17 @@ from polarguide.inspection.measurements import ViewMeasurements, measure_view
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.points import point_evidence
 from polarguide.inspection.pose_checks import coverage_check, pose_check
+from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.short_run import LONGEST, short_run, surface_of
 from polarguide.inspection.surfaces import Surface, SurfaceSamples, normal_evidence, sample_surfaces
 from polarguide.inspection.verdict import Check, Verdict, worst
+from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend
 
-Normals = Literal["auto", "points", "train"]
 SURE = 0.98
 """Probability from which on ``auto`` is content with the points."""
 FEWEST_TO_TRAIN = 8
 RUN_FOLDER = "short_run"
-Progress = Callable[[int], None]
-Track = Callable[[str, int], AbstractContextManager[Progress]]
-
-
-@dataclass(frozen=True)
-class InspectSettings:
-    """What the user chooses.
-
-    Attributes:
-        downscale: side of the pixel boxes to average; 0: chosen. transfer: how the files are encoded.
-        refractive_index: of the surfaces; None: that of ``scene.json``, else 1.5.
-        normals: "points" uses points seen in several views alone, "train" trains for normals as well, "auto" does so
-            if the points do not decide.
-        steps: of the short training.
-    """
-
-    downscale: int = 0
-    transfer: str = "linear"
-    refractive_index: float | None = None
-    normals: Normals = "auto"
-    steps: int = 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +62,22 @@ class Inspection:
         return next(check for check in self.checks if check.key == key)
 
 
-@contextlib.contextmanager
-def silent(label: str, total: int) -> Iterator[Progress]:
-    """Progress that nobody sees."""
-    yield lambda done: None
+def inspection_folder(scene: Path, out: Path | None = None) -> Path:
+    """The folder that an inspection writes: ``out``, or SCENE-inspection beside the scene.
+
+    Raises:
+        PolarguideError: there is a file of this name.
+    """
+    folder = out if out is not None else scene.resolve().with_name(scene.resolve().name + "-inspection")
+    if folder.exists() and not folder.is_dir():
+        raise PolarguideError(
+            folder, expected="a folder to write", found="a file", remedy="Give another --out."
+        )
+    return folder
 
 
 def inspect_scene(
-    path: Path, out: Path, settings: InspectSettings, backend: Backend, track: Track = silent
+    path: Path, out: Path, settings: InspectSettings, backend: Backend, reporter: Reporter = SILENT
 ) -> Inspection:
     """Inspect a scene folder.
 
@@ -101,29 +86,24 @@ def inspect_scene(
         out: folder for what is kept of a short training.
         settings: the user's choices.
         backend: what the short training runs on.
-        track: opens a progress bar, given a label and a total.
+        reporter: receives the progress.
 
     Raises:
-        PolarguideError: the scene cannot be read.
+        PolarguideError: the scene cannot be read, or a setting is out of range.
     """
-    with track("reading", 0) as advance:
-        capture = read_capture(
-            path,
-            downscale=settings.downscale,
-            transfer=settings.transfer,
-            progress=lambda done, total: advance(done),
-        )
+    settings.check()
+    capture = read_capture(path, downscale=settings.downscale, transfer=settings.transfer, reporter=reporter)
     index = settings.refractive_index or capture.refractive_index or 1.5
     measurements: list[ViewMeasurements] = []
-    with track("measuring", len(capture.views)) as advance:
+    with reporter.track("measuring", len(capture.views)) as advance:
         for view in capture.views:
             measurements.append(measure_view(view, index))
             advance(len(measurements))
     pairing = find_pairing(capture)
     checks = picture_checks(capture, measurements, pairing)
-    with track("matching features", 1):
+    with reporter.track("matching features", 1):
         checks += [pose_check(capture), coverage_check(capture)]
-    angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, track)
+    angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
     checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
     checks.append(dielectric_check(measurements, pixels, index))
     return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
@@ -136,13 +116,13 @@ def _angles(
     index: float,
     pairing: int,
     backend: Backend,
-    track: Track,
+    reporter: Reporter,
 ) -> tuple[AngleFindings, SurfaceSamples | None]:
     """Order, sense and zero by what geometry there is; and the pixels with normals if there are any."""
     sources: list[Evidence] = []
     if capture.model is None or len(capture.posed) < 2:
         return combine_evidence(sources, pairing), None
-    with track("weighing points", 1):
+    with reporter.track("weighing points", 1):
         evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
     sources.append(evidence)
     angles = combine_evidence(sources, pairing)
@@ -151,29 +131,24 @@ def _angles(
         return angles, pixels
     if len(capture.posed) < FEWEST_TO_TRAIN:
         return angles, pixels
-    pixels = _trained_pixels(capture, out, settings, pairing, backend, track)
+    pixels = _trained_pixels(capture, out, settings, pairing, backend, reporter)
     sources.append(normal_evidence(pixels, index))
     return combine_evidence(sources, pairing), pixels
 
 
 def _trained_pixels(
-    capture: Capture, out: Path, settings: InspectSettings, pairing: int, backend: Backend, track: Track
+    capture: Capture, out: Path, settings: InspectSettings, pairing: int, backend: Backend, reporter: Reporter
 ) -> SurfaceSamples:
     factor = max(1, math.ceil(max(capture.size) / LONGEST))
     names = [view.name for view in capture.posed]
-    with track("reading for the short training", 0) as advance:
-        scene = load_scene(
-            capture.root,
-            downscale=factor,
-            transfer=settings.transfer,
-            views=names,
-            progress=lambda done, total: advance(done),
-        )
+    scene = load_scene(
+        capture.root, downscale=factor, transfer=settings.transfer, views=names, reporter=reporter
+    )
     if not scene.train_views:
         raise PolarguideError(
             capture.root, expected="views to train on", found="none", remedy="Use --normals points."
         )
-    with track("short training", settings.steps) as advance:
+    with reporter.track("short training", settings.steps) as advance:
         state = short_run(
             scene,
             out / RUN_FOLDER,
@@ -181,7 +156,7 @@ def _trained_pixels(
             backend=backend,
             on_step=lambda report: advance(report.step + 1),
         )
-    with track("comparing with normals", len(names)) as advance:
+    with reporter.track("comparing with normals", len(names)) as advance:
 
         def surfaces() -> Iterator[tuple[InspectedView, Surface]]:
             for done, view in enumerate(capture.posed):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Callable
 from importlib import resources
 from string import Template
 
@@ -14,27 +13,28 @@ from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.layers import LAYERS, layer_uris
 from polarguide.inspection.measurements import ViewMeasurements
-from polarguide.inspection.orders import ORDERS, PAIRINGS
 from polarguide.inspection.verdict import Check, Verdict
+from polarguide.progress import SILENT, Reporter
 from polarguide.visualization import figures
 
 FILE = "inspection.html"
-_CLASSES: dict[Verdict, str] = {"ok": "ok", "look": "look", "wrong": "wrong", "n/a": "na"}
+_CLASSES: dict[Verdict, str] = {"ok": "ok", "warning": "warning", "wrong": "wrong", "n/a": "na"}
 
 
-def inspection_html(found: Inspection, advance: Callable[[int], None] = lambda done: None) -> str:
+def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
     """The HTML page; all names and texts in it are escaped.
 
     Args:
         found: the findings.
-        advance: called with the number of finished views.
+        reporter: receives the progress.
     """
     capture = found.capture
     marked = {name for check in found.checks for name in check.views}
     tiles = []
-    for done, (view, measured) in enumerate(zip(capture.views, found.measurements, strict=True)):
-        tiles.append(_tile(layer_uris(view), measured, view.name in marked))
-        advance(done + 1)
+    with reporter.track("drawing", len(capture.views)) as advance:
+        for view, measured in zip(capture.views, found.measurements, strict=True):
+            tiles.append(_tile(layer_uris(view), measured, view.name in marked))
+            advance(len(tiles))
     posed = f"{len(capture.posed)} with a pose" if capture.model is not None else "no poses"
     width, height = capture.size
     return Template(_part("inspection.html")).substitute(
@@ -94,13 +94,13 @@ def _angles(angles: AngleFindings) -> str:
     if angles.posterior is None:
         return "<p>Not decided: this check needs poses and reflecting surfaces.</p>" + notes
     rows = []
-    for k, order in enumerate(ORDERS):
-        files = ", ".join(f"{angle}°" for angle in order.files(PAIRINGS[angles.pairing]))
-        p, against = angles.posterior.probabilities[k], angles.posterior.log_odds[k]
+    for k, row in enumerate(angles.hypotheses):
+        files = ", ".join(f"{angle}°" for angle in row.files)
         mark = ' class="best"' if k == angles.posterior.best else ""
-        said = "" if k == angles.posterior.best else f"{-against:.1f}"
+        said = "" if k == angles.posterior.best else f"{-row.log_odds:.1f}"
+        p = row.probability
         rows.append(
-            f"<tr{mark}><th>{files}</th><td>{html.escape(order.label)}</td><td>{p:.2%}</td>"
+            f"<tr{mark}><th>{files}</th><td>{html.escape(row.order.label)}</td><td>{p:.2%}</td>"
             f'<td><span class="bar"><i style="width:{100 * p:.1f}%"></i></span></td><td>{said}</td></tr>'
         )
     return (

@@ -67,7 +67,7 @@ def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: 
         )  # fmt: skip
     off = tuple(r.view for r in measurements if r.sum_error > PAIR_ERROR)
     if off:
-        verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) else "look"
+        verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) else "warning"
         return Check(
             key, title, verdict,
             f"I0 + I90 and I45 + I135 differ by more than {PAIR_ERROR:.0%} of S0 in {len(off)} views "
@@ -95,7 +95,7 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
         if slope < 0
         else "The files seem linear but are decoded (or have another tone curve): try --transfer linear."
     )
-    return Check(key, title, "wrong" if high else "look", said, remedy, figures=figures)
+    return Check(key, title, "wrong" if high else "warning", said, remedy, figures=figures)
 
 
 def _exposure(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
@@ -110,14 +110,14 @@ def _exposure(measurements: Sequence[ViewMeasurements], pairing: int | None) -> 
     verdict: Verdict = "ok"
     remedy = ""
     if abs(ratio - 1) > UNEQUAL:
-        verdict = "wrong" if abs(ratio - 1) > VERY_UNEQUAL else "look"
+        verdict = "wrong" if abs(ratio - 1) > VERY_UNEQUAL else "warning"
         said += f" If only one picture deviates, it does by {2 * abs(ratio - 1):.0%}."
         remedy = (
             "Let prepare estimate the gains (it does by default), or measure them on unpolarized light and give "
             "--calibration. The pair sums do not show which of the four deviates."
         )
     if off:
-        verdict = "look" if verdict == "ok" else verdict
+        verdict = "warning" if verdict == "ok" else verdict
         said += f" It differs by more than {UNSTEADY:.0%} in {len(off)} views ({listed(list(off))})."
         remedy = remedy or "Look for automatic exposure, flicker, or motion between the shots."
     return Check(key, title, verdict, said, remedy, off, figures)
@@ -145,7 +145,7 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
     )
     if not off:
         return Check(key, title, "ok", said, figures=figures)
-    verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "look"
+    verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "warning"
     return Check(
         key, title, verdict, f"{said} Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))}).",
         "These pixels carry no polarization and are excluded: expose shorter, keep lamps out of the picture.",
@@ -167,7 +167,7 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
     figures = {"noise_share": share, "bright": bright}
     if not off:
         return Check(key, title, "ok", said, figures=figures)
-    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < 0.01 else "look"
+    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < 0.01 else "warning"
     return Check(
         key, title, verdict, f"{said} Dark or noisy: {len(off)} views ({listed(list(off))}).",
         "Use a longer exposure at the lowest gain, or average several shots.", off, figures,
@@ -184,7 +184,7 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
     if share >= LITTLE:
         return Check(key, title, "ok", said, figures=figures)
     return Check(
-        key, title, "wrong" if share < ALMOST_NONE else "look", said,
+        key, title, "wrong" if share < ALMOST_NONE else "warning", said,
         "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from lower "
         "views; check that the filter is a linear polarizer, the right way round, and that the exposure was fixed.",
         figures=figures,

@@ -33,7 +33,7 @@ def pose_check(capture: Capture) -> Check:
     errors = view_errors(epipolar_errors(capture))
     if len(errors) < 3:
         return Check(
-            key, title, "n/a" if not missing else "look",
+            key, title, "n/a" if not missing else "warning",
             f"Too few features match between neighboring views to judge the poses. {len(missing)} views have none.",
             "Structure from motion needs static texture." if missing else "", missing,
             {"views": {}, "without_pose": len(missing)},
@@ -45,15 +45,15 @@ def pose_check(capture: Capture) -> Check:
     verdict: Verdict = "ok"
     remedies = []
     if bad:
-        verdict = "look"
+        verdict = "warning"
         said += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
         remedies.append("Leave these views out, or register them again.")
     if missing:
-        verdict = "look"
+        verdict = "warning"
         said += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
         remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
     if typical > TYPICAL_PX:
-        verdict = "wrong" if typical > 2 * TYPICAL_PX else "look"
+        verdict = "wrong" if typical > 2 * TYPICAL_PX else "warning"
         remedies.append("Refine the model (bundle adjustment), and check that it belongs to these pictures.")
     return Check(key, title, verdict, said, " ".join(remedies), (*bad, *missing), figures)
 
@@ -81,7 +81,7 @@ def coverage_check(capture: Capture) -> Check:
     lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
     if lonely or len(seen) < FEW_VIEWS:
         return Check(
-            key, title, "look", said,
+            key, title, "warning", said,
             "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.", lonely, figures,
         )  # fmt: skip
     return Check(key, title, "ok", said, figures=figures)

@@ -1,17 +1,20 @@
-"""``inspection.json``: the findings for programs."""
+"""``inspection.json``, the findings for programs, beside the page for people."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from polarguide import __version__
-from polarguide.files import atomic
+from polarguide.files import make_folder, write_text, write_whole
 from polarguide.inspection.inspect import Inspection
+from polarguide.inspection.page_html import FILE as PAGE
+from polarguide.inspection.page_html import inspection_html
 from polarguide.inspection.verdict import plain
+from polarguide.progress import SILENT, Reporter
+from polarguide.records import to_json
 
-SCHEMA = 1
+SCHEMA = 2
 """Raised whenever a key changes its meaning or goes away; new keys do not raise it."""
 FILE = "inspection.json"
 
@@ -47,8 +50,14 @@ def inspection_record(found: Inspection) -> dict[str, Any]:
     return record
 
 
-def write_record(found: Inspection, out: Path) -> Path:
-    """Write ``inspection.json`` in one step; returns its path."""
-    with atomic(out / FILE) as path:
-        path.write_text(json.dumps(inspection_record(found), indent=1, ensure_ascii=False) + "\n", "utf-8")
-    return out / FILE
+def write_inspection(found: Inspection, out: Path, reporter: Reporter = SILENT) -> tuple[Path, Path]:
+    """Write the page and ``inspection.json`` into a folder; returns their paths.
+
+    Raises:
+        PolarguideError: they cannot be written.
+    """
+    make_folder(out)
+    page, record = out / PAGE, out / FILE
+    write_whole(record, to_json(inspection_record(found)))
+    write_text(page, inspection_html(found, reporter))
+    return page, record

@@ -20,7 +20,7 @@ from polarguide.inspection.surfaces import Surface
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
-from polarguide.shading.deferred import render
+from polarguide.shading.gbuffer import render
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
 from polarguide.training.state import TrainingState
@@ -95,7 +95,7 @@ def _same(folder: Path, wanted: dict[str, object]) -> bool:
 
 @torch.no_grad()
 def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
-    """What the trained Gaussians say of the surface in one view, on the CPU, where pictures are compared with it."""
+    """The surface of the trained Gaussians in one view, on the CPU, where pictures are compared with it."""
     result = render(state.gaussians, view.camera, backend.rasterize, sh_degree=0, normals=True, depth=True)
     result = result.to("cpu")
     if result.normal is None or result.depth is None:

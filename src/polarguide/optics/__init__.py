@@ -36,7 +36,8 @@ from polarguide.optics.separation import (
     paper_separation,
     predicted_stokes,
 )
-from polarguide.optics.stokes import ANGLES, aolp, dolp, intensity, luminance, photograph, stokes
+from polarguide.optics.stokes import aolp, dolp, intensity, luminance, photograph, stokes
+from polarguide.polarizer import ANGLES
 
 __all__ = [
     "ANGLES",

@@ -19,14 +19,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.optics._guard import check_index, check_leading, safe_atan2
-from polarguide.optics._window import window_mean
+from polarguide.optics._numerics import check_leading, check_refractive_index, safe_atan2, window_mean
 from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith
 from polarguide.optics.stokes import dolp, luminance
 
 
 class ChromaticNormals(NamedTuple):
-    """What the color differences say.
+    """Normals from color differences, as angles.
 
     Attributes:
         zenith: [H, W] radians, of the diffuse lobe whose degree of polarization is the slope's.
@@ -44,7 +43,7 @@ class ChromaticNormals(NamedTuple):
 
 def chromatic_normals(
     stokes: Tensor,
-    index: float = 1.5,
+    refractive_index: float = 1.5,
     *,
     window: int = 5,
     minimum_certainty: float = 1.5,
@@ -61,7 +60,7 @@ def chromatic_normals(
 
     Args:
         stokes: [3, H, W, C] with the colors last.
-        index: refractive index.
+        refractive_index: of the surface, more than 1.
         window: odd side of the window in pixels; the surface should be flat over it.
         minimum_certainty: least certainty of a decided pixel.
         minimum_contrast: least standard deviation of S0 among the colors, as a share of S0.
@@ -71,10 +70,10 @@ def chromatic_normals(
         ChromaticNormals. Nothing is decided in a picture without color.
 
     Raises:
-        ValueError: ``stokes`` is not [3, H, W, C], ``window`` is even, or ``index`` is not above 1.
+        ValueError: ``stokes`` is not [3, H, W, C], ``window`` is even, or ``refractive_index`` is not above 1.
     """
     check_leading(stokes, 3, "stokes")
-    check_index(index)
+    check_refractive_index(refractive_index)
     if stokes.ndim != 4:
         raise ValueError(f"stokes: expected shape [3, H, W, C], found {list(stokes.shape)}")
     mean = luminance(stokes)
@@ -91,9 +90,9 @@ def chromatic_normals(
     # What rounding leaves of a picture without color explains nothing.
     colored = variance.sqrt() > minimum_contrast * s0
     certainty = torch.where(colored, explained / unexplained.clamp(min=1e-6 * s0.abs() + least), 0.0)
-    limit = diffuse_dolp_limit(index)
+    limit = diffuse_dolp_limit(refractive_index)
     against = slope1 * s1 + slope2 * s2 < 0
     decided = colored & (certainty >= minimum_certainty) & (degree < 0.95 * limit)
     decided = decided & (against | (dolp(mean) < pure_lobe_dolp))
-    zenith = diffuse_zenith(degree.clamp(max=limit), index)
+    zenith = diffuse_zenith(degree.clamp(max=limit), refractive_index)
     return ChromaticNormals(zenith, safe_atan2(slope2, slope1) / 2, certainty, decided)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from polarguide.optics._guard import safe_atan2
+from polarguide.optics._numerics import safe_atan2
 from polarguide.vectors import dot
 
 

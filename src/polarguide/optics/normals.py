@@ -1,4 +1,4 @@
-"""Normals from polarization: candidates, the choice among them, and the pixels worth asking.
+"""Normals from polarization: candidates, the choice among them, and the pixels that can tell.
 
 The polarization of one pixel leaves a surface normal ambiguous: the angle of polarization gives the azimuth
 up to a half turn, plus a quarter turn because specular and diffuse light are polarized at right angles.
@@ -13,8 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.optics._guard import check_leading, safe_normalize, safe_sqrt
-from polarguide.optics._window import window_mean
+from polarguide.optics._numerics import check_leading, safe_normalize, safe_sqrt, window_mean
 from polarguide.optics.frames import normal_from_angles
 from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
 from polarguide.optics.stokes import aolp, dolp
@@ -22,7 +21,7 @@ from polarguide.vectors import dot
 
 
 class Candidates(NamedTuple):
-    """The paper's four candidates.
+    """The four candidates of PolarGuide-GSDR.
 
     Attributes:
         normals: [..., 4, 3] unit: n, -n, R n, -R n, where R turns by 90 degrees about the view axis.
@@ -65,31 +64,33 @@ class Disambiguated(NamedTuple):
     cosine: Tensor
 
 
-def paper_candidates(stokes: Tensor, rays: Tensor, index: float | Tensor = 1.5) -> Candidates:
-    """Four candidate normals as the PolarGuide-GSDR paper lists them: n, -n, R n, -R n.
+def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5) -> Candidates:
+    """Four candidate normals as in PolarGuide-GSDR: n, -n, R n, -R n.
 
     n has the angle of polarization as azimuth and the diffuse zenith of the degree of polarization. (The
-    paper's closed form for the zenith inverts no Fresnel curve; the exact inverse stands in its place.) Two
+    closed form of PolarGuide-GSDR for the zenith inverts no Fresnel curve; this is the exact inverse.) Two
     of the four face away from the camera.
 
     Args:
         stokes: [3, ...] of the luminance.
         rays: [..., 3] unit camera rays.
-        index: refractive index, a number or [...].
+        refractive_index: of the surface, more than 1: a number or [...].
 
     Returns:
         Candidates.
 
     Raises:
-        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+        ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
-    polar, turn = diffuse_zenith(dolp(stokes), index), aolp(stokes)
+    polar, turn = diffuse_zenith(dolp(stokes), refractive_index), aolp(stokes)
     normal = normal_from_angles(polar, turn, rays)
     rotated = normal_from_angles(polar, turn + math.pi / 2, rays)
     return Candidates(torch.stack((normal, -normal, rotated, -rotated), dim=-2), polar, turn)
 
 
-def physical_candidates(stokes: Tensor, rays: Tensor, index: float | Tensor = 1.5) -> PhysicalCandidates:
+def physical_candidates(
+    stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5
+) -> PhysicalCandidates:
     """Six candidate normals that face the camera: the exact inverses of both lobes.
 
     Diffuse zenith at azimuth AoLP and AoLP + pi; the two specular zeniths at AoLP + pi/2 and AoLP - pi/2.
@@ -97,21 +98,22 @@ def physical_candidates(stokes: Tensor, rays: Tensor, index: float | Tensor = 1.
     Args:
         stokes: [3, ...] of the luminance.
         rays: [..., 3] unit camera rays.
-        index: refractive index, a number or [...].
+        refractive_index: of the surface, more than 1: a number or [...].
 
     Returns:
         PhysicalCandidates. Candidates that are not valid hold the clamped value.
 
     Raises:
-        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+        ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
     degree, angle = dolp(stokes), aolp(stokes)
-    below, above = specular_zeniths(degree, index)
-    polar = torch.stack((diffuse_zenith(degree, index), below, above), dim=-1).repeat_interleave(2, dim=-1)
+    below, above = specular_zeniths(degree, refractive_index)
+    polar = torch.stack((diffuse_zenith(degree, refractive_index), below, above), dim=-1)
+    polar = polar.repeat_interleave(2, dim=-1)
     turns = torch.tensor((0.0, 1.0, 0.5, -0.5, 0.5, -0.5), dtype=angle.dtype, device=angle.device) * math.pi
     normals = normal_from_angles(polar, angle[..., None] + turns, rays[..., None, :])
     specular = torch.tensor((False, False, True, True, True, True), device=angle.device)
-    possible = specular | (degree <= diffuse_dolp_limit(index))[..., None]
+    possible = specular | (degree <= diffuse_dolp_limit(refractive_index))[..., None]
     return PhysicalCandidates(normals, possible & (stokes[0] > 0)[..., None], specular)
 
 
@@ -122,7 +124,7 @@ def disambiguate(
     *,
     azimuth_weight: float = 0.0,
 ) -> Disambiguated:
-    """Choose the candidate nearest to a guide normal (the cosine rule of the PolarGuide-GSDR paper).
+    """Choose the candidate nearest to a guide normal (the cosine rule of PolarGuide-GSDR).
 
     The score of a candidate is its cosine with the guide. With ``azimuth_weight`` w it becomes
     ``(1 - w s) cosine + w s cos(difference of azimuths)``, s the sine of the guide's zenith: a wrong

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.optics._guard import check_leading, safe_normalize
+from polarguide.optics._numerics import check_leading, safe_normalize
 from polarguide.optics.frames import lens_frame
 from polarguide.optics.fresnel import dolp_slopes, reflectances, transmittances
 from polarguide.vectors import dot
@@ -42,7 +42,7 @@ def exact_separation(
     stokes: Tensor,
     normals: Tensor,
     rays: Tensor,
-    index: float | Tensor = 1.5,
+    refractive_index: float | Tensor = 1.5,
     *,
     minimum_contrast: float = 0.05,
 ) -> Separation:
@@ -57,7 +57,7 @@ def exact_separation(
         stokes: [3, ..., C] with the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
-        index: refractive index, a number or [...].
+        refractive_index: of the surface, more than 1: a number or [...].
         minimum_contrast: least ``rho_s + rho_d`` that counts as well-conditioned. The default excludes
             zeniths below about 11 degrees at n = 1.5. The divisor itself is held above a tenth of it, which
             bounds the amplification of noise.
@@ -66,11 +66,11 @@ def exact_separation(
         Separation in units of S0. ``conditioned`` is also False where the normal faces away or is zero.
 
     Raises:
-        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+        ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
     check_leading(stokes, 3, "stokes")
     cosine, x, y = _components(normals, rays)
-    specular_slope, diffuse_slope = dolp_slopes(cosine, index)
+    specular_slope, diffuse_slope = dolp_slopes(cosine, refractive_index)
     sine2 = 1 - cosine.clamp(0, 1) ** 2
     contrast = (specular_slope + diffuse_slope) * sine2
     s0, s1, s2 = stokes.unbind(0)
@@ -85,10 +85,10 @@ def exact_separation(
     return Separation(specular, s0 - specular, (contrast >= minimum_contrast) & (cosine > 0))
 
 
-def paper_separation(stokes: Tensor, zenith: Tensor, index: float | Tensor = 1.5) -> Separation:
-    """The reflection cue of the PolarGuide-GSDR paper, averaged over the four polarizer angles.
+def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Separation:
+    """The reflection cue of PolarGuide-GSDR, averaged over the four polarizer angles.
 
-    The paper sends the observed S0 through Fresnel's equations: specular ``S0 R``, and the rest
+    The observed S0 goes through Fresnel's equations: specular ``S0 R``, and the rest
     ``S0 (1 - R)`` transmitted once more, ``S0 (1 - R) T``, with R and T the means over s and p. The average
     over the polarizer angles does not change when the camera rolls. It is a coarse cue: the share of the
     specular layer depends on the zenith alone, and the layers do not add up to S0.
@@ -96,16 +96,16 @@ def paper_separation(stokes: Tensor, zenith: Tensor, index: float | Tensor = 1.5
     Args:
         stokes: [3, ..., C] with the colors last.
         zenith: [...] radians.
-        index: refractive index, a number or [...].
+        refractive_index: of the surface, more than 1: a number or [...].
 
     Returns:
         Separation in units of S0, ``conditioned`` True everywhere.
 
     Raises:
-        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+        ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
     check_leading(stokes, 3, "stokes")
-    (rs, rp), (ts, tp) = reflectances(zenith, index), transmittances(zenith, index)
+    (rs, rp), (ts, tp) = reflectances(zenith, refractive_index), transmittances(zenith, refractive_index)
     s0 = stokes[0].clamp(min=0)
     reflected = ((rs + rp) / 2)[..., None]
     specular = s0 * reflected
@@ -118,12 +118,12 @@ def paper_intensities(
     zenith: Tensor,
     s_direction: Tensor,
     polarizer: float | Tensor,
-    index: float | Tensor = 1.5,
+    refractive_index: float | Tensor = 1.5,
 ) -> tuple[Tensor, Tensor]:
-    """The paper's cue behind a polarizer: both layers as functions of the polarizer angle.
+    """The reflection cue of PolarGuide-GSDR behind a polarizer: both layers as functions of its angle.
 
     ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - s_direction)`` with Imax, Imin = ``S0 / 2``
-    times Rs, Rp; for the diffuse layer the p-direction, the light left over, and Tp, Ts. (The paper writes
+    times Rs, Rp; for the diffuse layer the p-direction, the light left over, and Tp, Ts. (PolarGuide-GSDR has
     ``cos 2 theta`` with the angle from the image's x axis, which would change when the camera rolls.) The
     mean over the four polarizer angles is half of ``paper_separation``.
 
@@ -132,16 +132,16 @@ def paper_intensities(
         zenith: [...] radians.
         s_direction: [...] radians, the direction perpendicular to the plane of incidence: azimuth + pi/2.
         polarizer: radians, a number or [...].
-        index: refractive index, a number or [...].
+        refractive_index: of the surface, more than 1: a number or [...].
 
     Returns:
         (specular, diffuse) intensities, each [..., C].
 
     Raises:
-        ValueError: the first axis of ``stokes`` is not 3, or ``index`` is a number not above 1.
+        ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
     check_leading(stokes, 3, "stokes")
-    (rs, rp), (ts, tp) = reflectances(zenith, index), transmittances(zenith, index)
+    (rs, rp), (ts, tp) = reflectances(zenith, refractive_index), transmittances(zenith, refractive_index)
     wave = torch.cos(2 * (polarizer - s_direction))
     s0 = stokes[0].clamp(min=0)
     left = s0 * (1 - (rs + rp) / 2)[..., None]
@@ -152,7 +152,7 @@ def paper_intensities(
 
 
 def predicted_stokes(
-    specular: Tensor, diffuse: Tensor, normals: Tensor, rays: Tensor, index: float | Tensor = 1.5
+    specular: Tensor, diffuse: Tensor, normals: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5
 ) -> Tensor:
     """Stokes vector that a camera measures of two layers on a surface with a known normal.
 
@@ -166,16 +166,16 @@ def predicted_stokes(
         specular, diffuse: [..., C] units of S0, the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
-        index: refractive index, a number or [...].
+        refractive_index: of the surface, more than 1: a number or [...].
 
     Returns:
         [3, ..., C].
 
     Raises:
-        ValueError: ``index`` is a number not above 1.
+        ValueError: ``refractive_index`` is a number not above 1.
     """
     cosine, x, y = _components(normals, rays)
-    specular_slope, diffuse_slope = dolp_slopes(cosine, index)
+    specular_slope, diffuse_slope = dolp_slopes(cosine, refractive_index)
     # sin^2 times the cosine and sine of twice the azimuth; the slopes lack just that factor.
     double_cos, double_sin = x * x - y * y, 2 * x * y
     polarized = diffuse_slope[..., None] * diffuse - specular_slope[..., None] * specular

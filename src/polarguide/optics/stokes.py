@@ -1,4 +1,4 @@
-"""Linear Stokes vectors and what is read from them.
+"""Linear Stokes vectors, and the quantities derived from them.
 
 A Stokes tensor has the three linear components (S0, S1, S2) on its **first** axis and any shape after it. All
 values are linear radiance. Angles are radians, zero along the image's horizontal, counter-clockwise as
@@ -12,10 +12,8 @@ import math
 import torch
 from torch import Tensor
 
-from polarguide.optics._guard import check_leading, safe_atan2
-
-ANGLES = (0, 45, 90, 135)
-"""The polarizer angles of the four images, in degrees and in the order every function here expects."""
+from polarguide.optics._numerics import check_leading, safe_atan2
+from polarguide.polarizer import malus, stokes_of_four
 
 
 def stokes(intensities: Tensor) -> Tensor:
@@ -34,8 +32,7 @@ def stokes(intensities: Tensor) -> Tensor:
         ValueError: the first axis does not have four entries.
     """
     check_leading(intensities, 4, "intensities")
-    i0, i45, i90, i135 = intensities.unbind(0)
-    return torch.stack(((i0 + i45 + i90 + i135) / 2, i0 - i90, i45 - i135))
+    return torch.stack(stokes_of_four(intensities.unbind(0)))
 
 
 def intensity(stokes: Tensor, angle: float | Tensor) -> Tensor:
@@ -49,9 +46,7 @@ def intensity(stokes: Tensor, angle: float | Tensor) -> Tensor:
         [...] intensity.
     """
     check_leading(stokes, 3, "stokes")
-    s0, s1, s2 = stokes.unbind(0)
-    double = 2 * torch.as_tensor(angle, dtype=stokes.dtype, device=stokes.device)
-    return (s0 + s1 * torch.cos(double) + s2 * torch.sin(double)) / 2
+    return malus(stokes.unbind(0), torch.as_tensor(angle, dtype=stokes.dtype, device=stokes.device))
 
 
 def dolp(stokes: Tensor) -> Tensor:

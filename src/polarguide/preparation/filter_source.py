@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView
+from polarguide.progress import Advance
 
 _JUDGED_VIEWS = 8
 
@@ -78,11 +78,11 @@ class FilterSource:
         """All files that are read."""
         return [files[angle] for files in self._files.values() for angle in ANGLES]
 
-    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> dict[str, Any]:
         """The transfer of the capture, from a few views spread over it."""
         asked = self._settings
         notes: list[str] = []
-        transfer = asked.transfer
+        transfer: str = asked.transfer
         if transfer == "auto" and len(self._raw) == len(self.paths):
             transfer = "linear"
             notes.append("Transfer linear: camera raw, developed without tone curve, alike for all shots.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from polarguide.errors import PolarguideError
 from polarguide.preparation.mosaic_samples import block_intensities, gray_world, sample_blocks
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView
+from polarguide.progress import Advance
 
 _SMALLEST = 16
 
@@ -63,7 +63,7 @@ class MosaicSource:
             )
         self._settings = settings
         self._raw = RawFormat(settings.width, settings.height, settings.packing)
-        self._dark_path = None if settings.dark_frame is None else Path(settings.dark_frame)
+        self._dark_path = settings.dark_frame
         files = index_files(root, RAW_SUFFIXES)
         if self._dark_path is not None:
             dark = os.path.realpath(self._dark_path)
@@ -93,7 +93,7 @@ class MosaicSource:
         own = list(self._files.values()) if self._dataset is None else self._dataset.paths
         return [*own, *([] if self._dark_path is None else [self._dark_path])]
 
-    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> dict[str, Any]:
         """Levels, gains of the angles and white balance of the capture; every file is read once."""
         largest = used = 0
         container, shape = 0, None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.preparation.source import DevelopedView, Source
+from polarguide.progress import Advance
 
 
 class MaskedSource:
@@ -69,7 +70,7 @@ class MaskedSource:
         """All files that are read."""
         return [*self._pictures.paths, *self._masks.values()]
 
-    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> dict[str, Any]:
         """Measure the source, and note views without a mask."""
         measured = self._pictures.measure(advance)
         bare = [view for view in self.views if view not in self._masks]

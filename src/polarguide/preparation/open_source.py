@@ -31,7 +31,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             found="a file" if root.exists() else "nothing",
             remedy="Give the folder that holds the raw mosaics, or the shots through the filter.",
         )
-    kind = settings.format
+    kind: str = settings.format
     if kind == "auto":
         kind = detect_dataset(root) or "filter"
         if kind == "filter" and not angle_folders(root):
@@ -48,7 +48,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             found=describe_contents(root),
             remedy="See docs/formats.md for the layouts.",
         )
-    return found if settings.masks is None else MaskedSource(found, Path(settings.masks))
+    return found if settings.masks is None else MaskedSource(found, settings.masks)
 
 
 def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
@@ -59,9 +59,9 @@ def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
     dataset = open_dataset(root, kind, transfer=settings.transfer)
     if dataset.mosaics is None:
         return StokesSource(dataset, settings)
-    sensor = settings.sensor or PISR_SENSOR
     calibration = replace(settings.calibration, sense=settings.calibration.sense or dataset.sense)
-    return MosaicSource(dataset.mosaics, replace(settings, sensor=sensor, calibration=calibration), dataset)
+    settings = replace(settings, sensor=settings.sensor or PISR_SENSOR, calibration=calibration)
+    return MosaicSource(dataset.mosaics, settings, dataset)
 
 
 def origin_of_poses(pictures: Source, asked: str) -> str:

@@ -17,7 +17,7 @@ from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
 from polarguide.preparation.folder import SFM, SceneFolder
 from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses
-from polarguide.preparation.settings import PrepareSettings, check_settings
+from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
 from polarguide.preparation.working_folder import PHOTOGRAPHS, Workshop
 from polarguide.progress import Reporter
@@ -66,7 +66,7 @@ def prepare_scene(
     """
     settings, reporter = settings or PrepareSettings(), reporter or Reporter()
     root, target = Path(source), Path(out)
-    check_settings(settings)
+    settings = settings.checked()
     pictures = open_source(root, settings)
     settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
     if settings.poses != "sfm" and settings.intrinsics is not None:

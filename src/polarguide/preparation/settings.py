@@ -1,122 +1,161 @@
-"""What ``prepare`` was asked for."""
+"""What ``prepare`` may be asked for. Nothing here imports torch, OpenCV or pycolmap."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-from dataclasses import dataclass, field
-from typing import Any
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from polarguide.capture.calibration import Calibration, checked
-from polarguide.capture.datasets import DATASETS
-from polarguide.capture.sensor import DEMOSAIC_MODES, INTERPOLATIONS, PACKINGS, sensor_pattern
+import tyro
+from msgspec import Meta
+
+from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.errors import PolarguideError
+from polarguide.records import check_options, option_name
 
-FORMATS = ("auto", "mosaic", "filter", *DATASETS)
+Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp"]
+ORIGINS = ("auto", "dataset", "sfm", "none")
+"""What poses can be instead of a path."""
 _MOSAIC_ONLY = (
     "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
     "saturation", "white_balance", "demosaic", "interpolation", "register",
 )  # fmt: skip
-ORIGINS = ("auto", "dataset", "sfm", "none")
-"""What poses can be instead of a path."""
-_FLAGS = {
+_OPTIONS = {
     "mosaic": _MOSAIC_ONLY,
     "pisr": _MOSAIC_ONLY,
     "filter": ("transfer", "align", "white_balance"),
     "gnerp": ("transfer",),
 }
-"""Flags that mean something for some formats only."""
+"""Options that mean something for some formats only."""
+_NotNegative = Annotated[int, Meta(ge=0)]
+_Positive = Annotated[int, Meta(ge=1)]
 
 
 @dataclass(frozen=True)
 class PrepareSettings:
-    """Settings of a preparation; see the flags of ``polarguide prepare`` for what each means.
+    """What a scene folder is made from, and how.
 
     Attributes:
-        white_balance: "none", "gray" or three gains separated by commas.
-        register: whether half size brings the four angles of a cell to one place.
-        gains: "auto" or "none"; a calibration with gains goes first.
-        poses: "auto" (those of a published dataset, else "sfm"), "dataset", "sfm", "none" or the path of a
-            COLMAP model.
-        sfm_pictures: what features are found in: "photograph" (S0/2) or "minimum" (the least of the four angles).
-        intrinsics: of structure from motion, see ``known_intrinsics``; None: estimated.
-        refine_intrinsics: whether it may change them.
-        masks: folder of object masks.
+        format: What the source is; auto looks for datasets and the four shots of a filter, else takes mosaics.
+        sensor: Sensor of raw mosaics: MYR are color, MZR is monochrome.
+        packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
+        width: Width of .raw files in pixels.
+        height: Height of .raw files in pixels.
+        bits: Bits of a sensor value in 16-bit files; without it 12 if no value exceeds 4095, else 16.
+        offset_x: Column of the sensor at which the region of interest starts.
+        offset_y: Row of the sensor at which it starts.
+        black_level: Stored value without light.
+        dark_frame: Picture with the lens covered, subtracted in place of the black level.
+        saturation: Stored value from which the sensor saturates; without it full scale.
+        white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
+        demosaic: half, quarter or full resolution of the sensor.
+        interpolation: How half and full fill in colors and angles.
+        register: Bring the four angles of half size, which lie half a pixel apart, to one place.
+        transfer: Encoding of filter shots (auto: the one under which the pair sums agree best) and of GNeRP.
+        align: Estimate and correct small shifts between the four shots of a filter.
+        gains: auto corrects what the light tells of the gains of the angles; none leaves them. Gains of a calibration
+            go first.
+        calibration: gains, order, sense and zero of the angles.
+        poses: sfm, dataset, none, or the path of a COLMAP model; auto takes those of a dataset, else sfm.
+        matching: Pairs that SfM compares: all, or neighbors in the order of their names.
+        sfm_pictures: What SfM finds features in: the photograph, or the minimum over the angles, which has less glare.
+        intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all pictures as developed, for SfM; without it they are estimated.
+        refine_intrinsics: Let SfM change the focal lengths and distortion given.
+        masks: Folder of object masks called like the views; SfM looks at their white parts alone.
+        seed: Seed of SfM.
     """
 
-    format: str = "auto"
-    sensor: str | None = None
-    packing: str | None = None
-    width: int | None = None
-    height: int | None = None
-    bits: int | None = None
-    offset_x: int = 0
-    offset_y: int = 0
-    black_level: float = 0.0
-    dark_frame: str | None = None
-    saturation: int | None = None
+    format: Literal["auto", "mosaic", "filter"] | Dataset = "auto"
+    sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
+    packing: Literal["10p", "12p", "12packed"] | None = None
+    width: _Positive | None = None
+    height: _Positive | None = None
+    bits: Annotated[int, Meta(ge=8, le=16)] | None = None
+    offset_x: _NotNegative = 0
+    offset_y: _NotNegative = 0
+    black_level: Annotated[float, Meta(ge=0)] = 0.0
+    dark_frame: Path | None = None
+    saturation: _Positive | None = None
     white_balance: str = "none"
-    demosaic: str = "half"
-    interpolation: str = "bilinear"
+    demosaic: Literal["half", "quarter", "full"] = "half"
+    interpolation: Literal["bilinear", "guided"] = "bilinear"
     register: bool = True
-    transfer: str = "auto"
+    transfer: Literal["auto", "linear", "srgb"] = "auto"
     align: bool = True
-    gains: str = "auto"
-    calibration: Calibration = field(default_factory=Calibration)
+    gains: Literal["auto", "none"] = "auto"
+    calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
     poses: str = "auto"
-    matching: str = "exhaustive"
-    sfm_pictures: str = "photograph"
+    matching: Literal["exhaustive", "sequential"] = "exhaustive"
+    sfm_pictures: Literal["photograph", "minimum"] = "photograph"
     intrinsics: str | None = None
     refine_intrinsics: bool = False
-    masks: str | None = None
-    seed: int = 0
+    masks: Path | None = None
+    seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
+
+    def checked(self) -> PrepareSettings:
+        """The settings with absolute paths.
+
+        Raises:
+            PolarguideError: a value is out of range.
+        """
+        check_options(self)
+        checked(self.calibration, "calibration")
+        white_gains(self.white_balance)
+        if self.intrinsics is not None:
+            known_intrinsics(self.intrinsics)
+        elif self.refine_intrinsics:
+            raise PolarguideError(
+                "--refine-intrinsics",
+                expected="intrinsics to begin with",
+                found="no --intrinsics",
+                remedy="Leave it out: unknown intrinsics are always estimated.",
+            )
+        return replace(
+            self,
+            white_balance="gray" if self.white_balance == "grey" else self.white_balance,
+            dark_frame=_absolute(self.dark_frame),
+            poses=self.poses if self.poses in ORIGINS else os.path.realpath(self.poses),
+            masks=_absolute(self.masks),
+        )
 
     def record(self) -> dict[str, Any]:
         """All settings as plain JSON types."""
-        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self), default=str))
         return plain
 
 
-def check_settings(settings: PrepareSettings) -> None:
-    """Check values that need no file.
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """A calibration as the command line states it.
 
-    Raises:
-        PolarguideError: one is out of range.
+    Attributes:
+        calibration: JSON file with gains, order, sense and zero; the three options below go first.
+        order: Angle of the pictures called 0, 45, 90 and 135, such as 90,45,0,135.
+        sense: How the angles count as the picture is displayed; without it ccw, or as the dataset says.
+        zero: Where their zero lies, in degrees counter-clockwise from the image's horizontal.
     """
-    choices = {
-        "format": FORMATS,
-        "demosaic": tuple(DEMOSAIC_MODES),
-        "interpolation": INTERPOLATIONS,
-        "transfer": ("auto", "linear", "srgb"),
-        "gains": ("auto", "none"),
-        "matching": ("exhaustive", "sequential"),
-        "sfm_pictures": ("photograph", "minimum"),
-        "packing": (None, *PACKINGS),
-    }
-    for name, allowed in choices.items():
-        _require(
-            name, getattr(settings, name) in allowed, ", ".join(map(str, filter(None, allowed))), settings
-        )
-    for name, least in (("offset_x", 0), ("offset_y", 0), ("width", 1), ("height", 1), ("saturation", 1)):
-        value = getattr(settings, name)
-        _require(name, value is None or value >= least, f"{least} or more", settings)
-    _require("bits", settings.bits is None or 8 <= settings.bits <= 16, "8 to 16", settings)
-    _require("seed", 0 <= settings.seed < 2**31, "a whole number from 0 to 2147483647", settings)
-    level = settings.black_level
-    _require("black_level", math.isfinite(level) and level >= 0, "0 or more", settings)
-    checked(settings.calibration, "calibration")
-    if settings.intrinsics is not None:
-        known_intrinsics(settings.intrinsics)
-    elif settings.refine_intrinsics:
-        raise PolarguideError(
-            "--refine-intrinsics",
-            expected="intrinsics to begin with",
-            found="no --intrinsics",
-            remedy="Leave it out: unknown intrinsics are always estimated.",
-        )
-    if settings.sensor is not None:
-        sensor_pattern(settings.sensor)
+
+    calibration: Path | None = None
+    order: str | None = None
+    sense: Sense | None = None
+    zero: float | None = None
+
+    def read(self) -> Calibration:
+        """The calibration of the file, with what is given beside it.
+
+        Raises:
+            PolarguideError: the file or the order is wrong.
+        """
+        found = Calibration() if self.calibration is None else read_calibration(self.calibration)
+        if self.order is not None:
+            found = replace(found, order=_four_angles(self.order))
+        if self.sense is not None:
+            found = replace(found, sense=self.sense)
+        return found if self.zero is None else replace(found, zero=self.zero)
 
 
 def check_format(settings: PrepareSettings, kind: str) -> None:
@@ -126,16 +165,16 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
         PolarguideError: one is set.
     """
     default = PrepareSettings()
-    mine = _FLAGS.get(kind, ())
-    for name in sorted({name for names in _FLAGS.values() for name in names} - set(mine)):
+    mine = _OPTIONS.get(kind, ())
+    for name in sorted({name for names in _OPTIONS.values() for name in names} - set(mine)):
         if getattr(settings, name) != getattr(default, name):
             raise PolarguideError(
-                flag(name),
+                option_name(name),
                 expected=f"only flags that apply to the format {kind}",
                 found=f"one for {_owners(name)}",
                 remedy="Leave it out, or choose another --format.",
             )
-    if kind in DATASETS and kind != "pisr" and settings.calibration.gains is not None:
+    if kind not in ("mosaic", "filter", "pisr") and settings.calibration.gains is not None:
         raise PolarguideError(
             "calibration (gains)",
             expected=f"none for the format {kind}, whose four intensities are made from Stokes vectors",
@@ -145,9 +184,9 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
 
 
 def _owners(name: str) -> str:
-    """The formats that a flag is for, in words."""
+    """The formats that an option is for, in words."""
     words = {"mosaic": "raw mosaics", "filter": "rotating filters"}
-    return " and ".join(words.get(kind, kind) for kind, names in _FLAGS.items() if name in names)
+    return " and ".join(words.get(kind, kind) for kind, names in _OPTIONS.items() if name in names)
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:
@@ -156,7 +195,7 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
     Raises:
         PolarguideError: it is none of the forms.
     """
-    if text in ("none", "gray"):
+    if text in ("none", "gray", "grey"):
         return (1.0, 1.0, 1.0) if text == "none" else None
     try:
         red, green, blue = (float(part) for part in text.split(","))
@@ -193,13 +232,18 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
     return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
 
 
-def flag(name: str) -> str:
-    """The flag that sets a field."""
-    return "--" + name.replace("_", "-")
-
-
-def _require(name: str, right: bool, expected: str, settings: PrepareSettings) -> None:
-    if not right:
+def _four_angles(text: str) -> tuple[int, int, int, int]:
+    try:
+        first, second, third, fourth = (int(angle) for angle in text.split(","))
+    except ValueError:
         raise PolarguideError(
-            flag(name), expected=expected, found=str(getattr(settings, name)), remedy="Correct the value."
-        )
+            "--order",
+            expected="four angles such as 90,45,0,135",
+            found=repr(text),
+            remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
+        ) from None
+    return first, second, third, fourth
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else Path(os.path.realpath(path))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.colmap.write import PosedCamera
+from polarguide.progress import Advance
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,7 @@ class Source(Protocol):
     def paths(self) -> list[Path]:
         """All files that are read."""
 
-    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> dict[str, Any]:
         """Measure what is common to the whole capture, as JSON types; ``notes`` are messages for the user."""
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,10 @@ from polarguide.capture.calibration import oriented
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.datasets import Dataset, resized_mask
 from polarguide.errors import PolarguideError
+from polarguide.polarizer import four_intensities
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import DevelopedView
+from polarguide.progress import Advance
 
 PAIR_SUMS = (
     "n/a: the four intensities were made from Stokes vectors, so that I0 + I90 = I45 + I135 by construction"
@@ -46,7 +47,7 @@ class StokesSource:
         """All files that are read."""
         return self._dataset.paths
 
-    def measure(self, advance: Callable[[int], None]) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> dict[str, Any]:
         """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
 
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
@@ -57,7 +58,7 @@ class StokesSource:
         for number, view in enumerate(self.views, 1):
             stokes, _ = self._stokes(view)
             finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
-            intensities = analyzer_intensities(np.where(finite[..., None], stokes, 0))
+            intensities = np.stack(four_intensities(np.where(finite[..., None], stokes, 0)))
             peak = intensities.max(axis=(0, 3))
             peaks.append(peak.ravel()[:: max(1, peak.size // _SAMPLES)])
             largest = max(largest, float(peak.max()))
@@ -101,7 +102,7 @@ class StokesSource:
         stokes, clipped = self._stokes(view)
         finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
         scaled = np.where(finite[..., None], stokes, 0) * np.float32(measured["scale"])
-        intensities = analyzer_intensities(scaled)
+        intensities = np.stack(four_intensities(scaled))
         # Rounding of the scale may leave the largest intensity a hair above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
@@ -122,9 +123,3 @@ class StokesSource:
         assert self._dataset.read_stokes is not None
         image = self._dataset.read_stokes(view)
         return image.stokes, image.clipped
-
-
-def analyzer_intensities(stokes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Intensities (S0 + S1 cos 2a + S2 sin 2a) / 2 at 0, 45, 90 and 135 degrees: [3, ...] -> [4, ...]."""
-    s0, s1, s2 = stokes
-    return np.asarray(np.stack([s0 + s1, s0 + s2, s0 - s1, s0 - s2]) / 2, np.float32)

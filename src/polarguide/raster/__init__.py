@@ -1,7 +1,8 @@
-"""Splatting of Gaussians with any channels: one interface, a slow twin, and fast backends."""
+"""Splatting of Gaussians with any channels: one interface, a reference implementation, and fast backends."""
 
-from polarguide.raster.backends import Backend, DeviceName, choose_backend
-from polarguide.raster.interface import Rasterize, Rasterized, ScreenStatistic
+from polarguide.options import DeviceName
+from polarguide.raster.backends import Backend, choose_backend, use_threads
+from polarguide.raster.interface import Rasterize, Rasterized, ScreenStatistic, Splats
 from polarguide.raster.reference import rasterize_reference
 
 __all__ = [
@@ -10,6 +11,8 @@ __all__ = [
     "Rasterize",
     "Rasterized",
     "ScreenStatistic",
+    "Splats",
     "choose_backend",
     "rasterize_reference",
+    "use_threads",
 ]

@@ -1,18 +1,18 @@
-"""The one place where a backend is chosen."""
+"""The choice of a backend."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 
+from polarguide import _native
 from polarguide.errors import PolarguideError
+from polarguide.options import DeviceName
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
 from polarguide.raster.interface import Rasterize
-
-DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 class Backend(NamedTuple):
@@ -22,7 +22,9 @@ class Backend(NamedTuple):
     rasterize: Rasterize
 
 
-def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = print) -> Backend:
+def choose_backend(
+    name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = lambda _: None
+) -> Backend:
     """The backend for ``--device``: ``auto`` takes the GPU where there is one and gsplat is installed.
 
     Args:
@@ -51,3 +53,10 @@ def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str]
     torch.cuda.set_device(device)
     load_gsplat(say)
     return Backend(device, rasterize_cuda)
+
+
+def use_threads(threads: int) -> None:
+    """Use this many threads everywhere in this process; 0 leaves things as they are."""
+    if threads:
+        _native.set_thread_count(threads)
+        torch.set_num_threads(threads)

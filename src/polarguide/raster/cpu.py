@@ -15,8 +15,9 @@ from polarguide.raster.interface import (
     NEAR_PLANE,
     Rasterized,
     ScreenStatistic,
+    Splats,
     check_shapes,
-    refuse_not_finite,
+    not_finite,
 )
 
 
@@ -41,18 +42,18 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any,
         means: Tensor,
-        quats: Tensor,
+        rotations: Tensor,
         scales: Tensor,
         opacities: Tensor,
         features: Tensor,
         camera: Camera,
         statistic: ScreenStatistic | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = [t.detach().contiguous() for t in (means, quats, scales, opacities, features)]
-        for name, tensor in zip(("means", "quats", "scales", "opacities", "features"), inputs, strict=True):
+        inputs = [t.detach().contiguous() for t in (means, rotations, scales, opacities, features)]
+        for name, tensor in zip(Splats._fields, inputs, strict=True):
             bad = _native.first_not_finite(tensor)
             if bad >= 0:
-                raise refuse_not_finite(name, bad // max(1, tensor[0].numel()))
+                raise not_finite(name, bad // max(1, tensor[0].numel()))
         rasterizer = native_rasterizer(camera, features.shape[1], statistic)
         out = torch.empty(camera.height, camera.width, features.shape[1])
         alpha = torch.empty(camera.height, camera.width)
@@ -78,25 +79,15 @@ class _Rasterize(torch.autograd.Function):
         return (*gradients, None, None)
 
 
-def rasterize_cpu(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    camera: Camera,
-    *,
-    statistic: ScreenStatistic | None = None,
-) -> Rasterized:
+def rasterize_cpu(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
     """See ``polarguide.raster.interface``. CPU tensors, float32; deterministic for any number of threads."""
-    check_shapes(means, quats, scales, opacities, features, statistic)
-    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
-    for name, tensor in named.items():
+    check_shapes(splats, statistic)
+    for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise PolarguideError(
                 f"rasterize({name})",
                 expected="float32 on the CPU",
                 found=f"{tensor.dtype} on {tensor.device}",
-                remedy="Convert it, or use the plain-torch twin.",
+                remedy="Convert it, or use rasterize_reference.",
             )
-    return Rasterized(*_Rasterize.apply(means, quats, scales, opacities, features, camera, statistic))
+    return Rasterized(*_Rasterize.apply(*splats, camera, statistic))

@@ -1,12 +1,13 @@
 """The CUDA backend: gsplat's projection, tiling and blending behind the interface. The only file that knows gsplat.
 
-gsplat is found, and its kernels are compiled, by ``load_gsplat``; nothing of it is imported before. Of its interface
-only what 1.5.3 and 1.6.0 share is used, by keyword; what differs between them is in ``load_gsplat`` and ``COMPILED``.
+gsplat is found, and its kernels are compiled, by ``load_gsplat``; nothing of it is imported before. Only the
+interface that 1.5.3 and 1.6.0 share is used, by keyword; what differs between them is in ``load_gsplat`` and
+``COMPILED``.
 
 Where its definition departs from ours (docs/gpu.md has the table): alpha is at most 0.999 in 1.5.3, and 0.99 as here in
 1.6.0; a pixel ends at a transmittance of 1e-4 exactly, too; the radius is that of the wider side of the box that is
-drawn, whole pixels, and at most 3.33 standard deviations; exponentials are fast ones. Inputs are not searched for NaN,
-since the answer would have to be waited for.
+drawn, whole pixels, and at most 3.33 standard deviations; exponentials are approximate. Inputs are not searched for
+NaN, since the process would wait for the answer.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from torch.autograd.function import once_differentiable
 
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
-from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterized, ScreenStatistic, check_shapes
+from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterized, ScreenStatistic, Splats, check_shapes
 
 TILE = 16
 # A load that takes longer than this is compiling.
@@ -42,7 +43,7 @@ class _View(NamedTuple):
     intrinsics: Tensor
 
 
-class _Splats(NamedTuple):
+class _Projected(NamedTuple):
     """Projected Gaussians, sorted into tiles. The first axis is that of pictures, of which there is one."""
 
     means2d: Tensor  # [1, N, 2] pixels
@@ -57,13 +58,11 @@ _views: WeakKeyDictionary[Camera, dict[torch.device, _View]] = WeakKeyDictionary
 
 
 def _view(camera: Camera, device: torch.device) -> _View:
-    """Kept for each camera, so that a second rendering copies nothing to the device."""
+    """The camera on a device, kept for each camera, so that a second rendering copies nothing there."""
     kept = _views.setdefault(camera, {})
     if device not in kept:
-        matrix = torch.eye(4, dtype=torch.float64)
-        matrix[:3, :3], matrix[:3, 3] = camera.rotation, camera.translation
-        intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        kept[device] = _View(*(t[None].to(device, torch.float32) for t in (matrix, intrinsics)))
+        matrices = (camera.world_to_camera, camera.intrinsics)
+        kept[device] = _View(*(t[None].to(device, torch.float32) for t in matrices))
     return kept[device]
 
 
@@ -79,7 +78,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
     CUDA toolkit; a failed compilation is whatever exception the compiler's driver raises.
 
     Args:
-        say: takes a line for the user once it is clear that this will take a while.
+        say: takes a line for the user once compiling has begun.
 
     Raises:
         PolarguideError: it is not installed, or its kernels cannot be had.
@@ -96,20 +95,20 @@ def load_gsplat(say: Callable[[str], None]) -> None:
     timer.daemon = True
     timer.start()
     try:
-        _offer_headers()
+        _add_headers()
         kernels = importlib.import_module("gsplat.cuda._backend")._C
     except Exception as error:  # compilers, loaders and their drivers raise all kinds
         lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-        told = next((line for line in lines if "error" in line.lower()), lines[0])
-        raise _no_kernels(told.strip()[:200]) from error
+        cause = next((line for line in lines if "error" in line.lower()), lines[0])
+        raise _no_kernels(cause.strip()[:200]) from error
     finally:
         timer.cancel()
     if kernels is None:
         raise _no_kernels("no CUDA toolkit (nvcc)")
 
 
-def _offer_headers() -> None:
-    """Show the compiler the headers of PyTorch's CUDA packages where the toolkit comes without.
+def _add_headers() -> None:
+    """Add the headers of PyTorch's CUDA packages to the compiler's path where the toolkit lacks them.
 
     PyTorch's own headers include those of cuBLAS, cuSOLVER and cuSPARSE, which a bare compiler package lacks.
     """
@@ -138,46 +137,44 @@ def _gsplat() -> Any:
     return importlib.import_module("gsplat")
 
 
-def _project(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, view: _View
-) -> _Splats:
-    gsplat, size = _gsplat(), (camera.width, camera.height)
+def _project(splats: Splats, camera: Camera) -> _Projected:
+    gsplat, size, view = _gsplat(), (camera.width, camera.height), _view(camera, splats.means.device)
     radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
-        means,
+        splats.means,
         None,
-        quats,
-        scales,
+        splats.rotations,
+        splats.scales,
         view.viewmats,
         view.intrinsics,
         *size,
         eps2d=BLUR,
         near_plane=NEAR_PLANE,
-        opacities=opacities.detach(),  # for the size of the box, and to cull what is too faint
+        opacities=splats.opacities.detach(),  # for the size of the box, and to cull what is too faint
     )
     columns, rows = (-(-side // TILE) for side in size)
     _, keys, order = gsplat.isect_tiles(
         means2d.detach(), radii, depths.detach(), TILE, columns, rows, n_images=1
     )
     offsets = gsplat.isect_offset_encode(keys, 1, columns, rows).reshape(1, rows, columns)
-    return _Splats(means2d, conics, opacities[None], offsets, order, radii)
+    return _Projected(means2d, conics, splats.opacities[None], offsets, order, radii)
 
 
-def _blend(splats: _Splats, features: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+def _blend(projected: _Projected, features: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pictures [H, W, D] and alpha [H, W] of features [N, D]."""
     channels = features.shape[1]
     padding = next(count for count in COMPILED if count >= channels) - channels
     if padding:
         features = torch.cat((features, features.new_zeros(features.shape[0], padding)), dim=1)
     picture, alpha = _gsplat().rasterize_to_pixels(
-        splats.means2d,
-        splats.conics,
+        projected.means2d,
+        projected.conics,
         features[None],
-        splats.opacities,
+        projected.opacities,
         camera.width,
         camera.height,
         TILE,
-        splats.offsets,
-        splats.order,
+        projected.offsets,
+        projected.order,
     )
     return picture[0, ..., :channels], alpha[0, ..., 0]
 
@@ -185,7 +182,7 @@ def _blend(splats: _Splats, features: Tensor, camera: Camera) -> tuple[Tensor, T
 class _AlphaAlone(torch.autograd.Function):
     """Alpha that is known already; its gradient is found by blending nothing a second time, if it is asked for.
 
-    So a statistic over all channels costs nothing, as long as no loss looks at alpha.
+    So a statistic over all channels costs nothing, as long as no loss depends on alpha.
     """
 
     @staticmethod
@@ -195,11 +192,11 @@ class _AlphaAlone(torch.autograd.Function):
         conics: Tensor,
         opacities: Tensor,
         alpha: Tensor,
-        splats: _Splats,
+        projected: _Projected,
         camera: Camera,
     ) -> Tensor:
         ctx.save_for_backward(means2d, conics, opacities)
-        ctx.splats, ctx.camera = _Splats(*(t.detach() for t in splats)), camera
+        ctx.projected, ctx.camera = _Projected(*(t.detach() for t in projected)), camera
         return alpha.detach().clone()
 
     @staticmethod
@@ -207,45 +204,45 @@ class _AlphaAlone(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         with torch.enable_grad():
             leaves = [t.detach().requires_grad_() for t in ctx.saved_tensors]
-            splats = ctx.splats._replace(means2d=leaves[0], conics=leaves[1], opacities=leaves[2])
+            projected = ctx.projected._replace(means2d=leaves[0], conics=leaves[1], opacities=leaves[2])
             nothing = leaves[0].new_zeros(leaves[0].shape[1], 1)
-            _, alpha = _blend(splats, nothing, ctx.camera)
+            _, alpha = _blend(projected, nothing, ctx.camera)
             gradients = torch.autograd.grad(alpha, leaves, grad)
         return (*gradients, None, None, None)
 
 
-def _watched(
-    splats: _Splats, features: Tensor, camera: Camera, statistic: ScreenStatistic
+def _blend_with_statistic(
+    projected: _Projected, features: Tensor, camera: Camera, statistic: ScreenStatistic
 ) -> tuple[Tensor, Tensor]:
     """``_blend``, with the statistic filled by the backward pass.
 
     gsplat's gradient of the projected means sums over all channels. But channels blend independently of each other, so
-    those that count are blended in a call of their own, with projected means of their own: their gradient is the
-    statistic, exactly, and both add up to the whole. It costs the alphas of every Gaussian and pixel twice; where all
-    channels count, nothing.
+    those of the statistic are blended in a call of their own, with a copy of the projected means: the gradient of the
+    copy is the statistic, exactly, and both gradients add up to the whole. This evaluates the alphas of every Gaussian
+    and pixel twice; where all channels count, it costs nothing.
     """
     chosen = list(statistic.channels)
     others = [channel for channel in range(features.shape[1]) if channel not in chosen]
     if not chosen:
-        statistic.gradient = torch.zeros_like(splats.means2d[0])
-        return _blend(splats, features, camera)
+        statistic.gradient = torch.zeros_like(projected.means2d[0])
+        return _blend(projected, features, camera)
 
     def fill(gradient: Tensor) -> None:
         statistic.gradient = gradient[0]
 
-    own = splats.means2d.clone()
+    own = projected.means2d.clone()
     own.register_hook(fill)
-    picture, alpha = _blend(splats._replace(means2d=own), _columns(features, chosen), camera)
+    picture, alpha = _blend(projected._replace(means2d=own), _channels(features, chosen), camera)
     if others:
-        rest, alpha = _blend(splats, _columns(features, others), camera)
+        rest, alpha = _blend(projected, _channels(features, others), camera)
         picture = torch.cat((picture, rest), dim=-1)
     else:
-        inputs = (splats.means2d, splats.conics, splats.opacities)
-        alpha = _AlphaAlone.apply(*inputs, alpha, splats, camera)
-    return _in_place(picture, chosen + others), alpha
+        inputs = (projected.means2d, projected.conics, projected.opacities)
+        alpha = _AlphaAlone.apply(*inputs, alpha, projected, camera)
+    return _sorted_channels(picture, chosen + others), alpha
 
 
-def _columns(features: Tensor, chosen: list[int]) -> Tensor:
+def _channels(features: Tensor, chosen: list[int]) -> Tensor:
     """Some channels of [N, D], without an index that would be copied to the device."""
     first, last = chosen[0], chosen[-1] + 1
     if chosen == list(range(first, last)):
@@ -253,28 +250,19 @@ def _columns(features: Tensor, chosen: list[int]) -> Tensor:
     return torch.stack([features[:, channel] for channel in chosen], dim=1)
 
 
-def _in_place(picture: Tensor, channels: list[int]) -> Tensor:
-    """A picture whose channels came in another order, in the order of their numbers."""
+def _sorted_channels(picture: Tensor, channels: list[int]) -> Tensor:
+    """A picture whose last axis holds these channels, with the channels in order."""
     if channels == sorted(channels):
         return picture
     return torch.stack([picture[..., channels.index(k)] for k in range(len(channels))], dim=-1)
 
 
-def rasterize_cuda(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    camera: Camera,
-    *,
-    statistic: ScreenStatistic | None = None,
-) -> Rasterized:
+def rasterize_cuda(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
     """See ``polarguide.raster.interface``, and the module for the differences. CUDA tensors, float32."""
-    check_shapes(means, quats, scales, opacities, features, statistic)
-    splats = _project(means, quats, scales, opacities, camera, _view(camera, means.device))
-    if statistic is not None and torch.is_grad_enabled() and splats.means2d.requires_grad:
-        picture, alpha = _watched(splats, features, camera, statistic)
+    check_shapes(splats, statistic)
+    projected = _project(splats, camera)
+    if statistic is not None and torch.is_grad_enabled() and projected.means2d.requires_grad:
+        picture, alpha = _blend_with_statistic(projected, splats.features, camera, statistic)
     else:
-        picture, alpha = _blend(splats, features, camera)
-    return Rasterized(picture, alpha, splats.radii[0].amax(dim=-1).to(means.dtype))
+        picture, alpha = _blend(projected, splats.features, camera)
+    return Rasterized(picture, alpha, projected.radii[0].amax(dim=-1).to(splats.means.dtype))

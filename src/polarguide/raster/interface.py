@@ -1,10 +1,9 @@
-"""The narrow waist: what every rasterizer takes and gives.
+"""The interface of the rasterizers.
 
-``rasterize(means, quats, scales, opacities, features, camera)`` splats N Gaussians with D feature channels each into
-one picture. It takes tensors, never a scene, and knows nothing of colors: base color, normal, strength or depth
-are channels like any other.
+``rasterize(splats, camera)`` splats N Gaussians with D feature channels each into one picture. It takes tensors, never
+a scene, and knows nothing of colors: base color, normal, strength or depth are channels like any other.
 
-Definition, the same in every backend up to the differences that a backend's page names: EWA projection of the
+Definition, the same in every backend up to the differences that the backend's module names: EWA projection of the
 covariance (Zwicker et al. 2001; Kerbl et al. 2023, Eq. 5) with 0.3 px^2 added, alpha = min(0.99, opacity *
 exp(-d^T conic d / 2)), contributions with alpha < 1/255 dropped, a pixel ends before the Gaussian that would bring
 its transmittance below 1e-4, front to back in order of camera depth (ties: by index). Behind the last Gaussian is 0.
@@ -30,14 +29,32 @@ MINIMUM_TRANSMITTANCE = 1e-4
 JACOBIAN_MARGIN = 0.15
 
 
+class Splats(NamedTuple):
+    """Gaussians as a rasterizer takes them.
+
+    Attributes:
+        means: [N, 3] world positions.
+        rotations: [N, 4] quaternions (w, x, y, z), not necessarily unit.
+        scales: [N, 3] standard deviations along the Gaussians' own axes, world units, positive.
+        opacities: [N] in (0, 1).
+        features: [N, D], 1 <= D <= 32.
+    """
+
+    means: Tensor
+    rotations: Tensor
+    scales: Tensor
+    opacities: Tensor
+    features: Tensor
+
+
 class Rasterized(NamedTuple):
     """A splatted picture.
 
     Attributes:
         features: [H, W, D], the blended channels.
         alpha: [H, W] in [0, 1], 1 - transmittance.
-        radii: [N] pixels, three standard deviations of the wider axis of each projected Gaussian, or what a backend's
-            page says; 0 where culled.
+        radii: [N] pixels, three standard deviations of the wider axis of each projected Gaussian, or what the
+            backend's module says; 0 where culled.
     """
 
     features: Tensor
@@ -49,8 +66,8 @@ class Rasterized(NamedTuple):
 class ScreenStatistic:
     """Asks for the gradient of the loss with respect to the projected means, through some channels alone.
 
-    Densification wants to know how much the colors pull at a Gaussian's place in the picture, and normals or
-    strengths must not count (Ye et al. 2024). Passed to ``rasterize``, it is filled by the backward pass.
+    Densification needs the positional gradient of the colors alone: normals and strengths do not count (Ye et al.
+    2024). The backward pass of the ``rasterize`` call that it is given to fills it.
 
     Attributes:
         channels: which feature channels count.
@@ -65,56 +82,36 @@ class Rasterize(Protocol):
     """The signature of a backend.
 
     Args:
-        means: [N, 3] world positions.
-        quats: [N, 4] rotations (w, x, y, z), not necessarily unit.
-        scales: [N, 3] standard deviations along the Gaussians' own axes, world units, positive.
-        opacities: [N] in (0, 1).
-        features: [N, D], 1 <= D <= 32.
+        splats: the Gaussians.
         camera: the view.
         statistic: filled by the backward pass, if given.
 
     Raises:
-        PolarguideError: shapes that do not fit, or values that are not finite (these only where finding out does not
-            mean waiting for the device).
+        PolarguideError: shapes that do not fit, or values that are not finite (checked only where that does not mean
+            waiting for the device).
     """
 
     def __call__(
-        self,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        features: Tensor,
-        camera: Camera,
-        *,
-        statistic: ScreenStatistic | None = None,
+        self, splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None
     ) -> Rasterized: ...
 
 
-def check_shapes(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    statistic: ScreenStatistic | None,
-) -> None:
-    """Refuse inputs whose shapes do not fit each other, or a statistic over channels that do not exist."""
-    count = means.shape[0] if means.ndim else 0
-    channels = features.shape[-1]
-    for name, tensor, shape in (
-        ("means", means, (count, 3)),
-        ("quats", quats, (count, 4)),
-        ("scales", scales, (count, 3)),
-        ("opacities", opacities, (count,)),
-        ("features", features, (count, channels)),
-    ):
+def check_shapes(splats: Splats, statistic: ScreenStatistic | None) -> None:
+    """Check that the shapes fit each other, and that the statistic's channels exist.
+
+    Raises:
+        PolarguideError: they do not.
+    """
+    count = splats.means.shape[0] if splats.means.ndim else 0
+    channels = splats.features.shape[-1]
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, channels))
+    for name, tensor, shape in zip(Splats._fields, splats, shapes, strict=True):
         if tuple(tensor.shape) != shape:
             raise PolarguideError(
                 f"rasterize({name})",
                 expected=f"shape {list(shape)}",
                 found=str(list(tensor.shape)),
-                remedy="Give one row per Gaussian.",
+                remedy="Give every tensor one entry for each Gaussian.",
             )
     if not 1 <= channels <= 32:
         raise PolarguideError(
@@ -133,11 +130,11 @@ def check_shapes(
         )
 
 
-def refuse_not_finite(name: str, row: int) -> PolarguideError:
-    """The error for a NaN or an infinity in the inputs."""
+def not_finite(name: str, index: int) -> PolarguideError:
+    """The error for a NaN or an infinity in the tensor ``name`` of the Gaussian ``index``."""
     return PolarguideError(
         f"rasterize({name})",
         expected="finite numbers",
-        found=f"NaN or infinity in row {row}",
+        found=f"NaN or infinity in Gaussian {index}",
         remedy="A diverged optimization: lower the learning rate or resume from an earlier checkpoint.",
     )

@@ -1,4 +1,4 @@
-"""The slow twin: the definition of the rasterizer in plain torch, for any dtype and device.
+"""The reference implementation: the definition of the rasterizer in plain torch, for any dtype and device.
 
 Every Gaussian is evaluated at every pixel, so memory grows as N x H x W: for tests and tiny pictures.
 """
@@ -19,13 +19,15 @@ from polarguide.raster.interface import (
     NEAR_PLANE,
     Rasterized,
     ScreenStatistic,
+    Splats,
     check_shapes,
-    refuse_not_finite,
+    not_finite,
 )
 
 
-def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     """Projected means [N, 2], covariances [N, 2, 2] with the blur, and camera depths [N]."""
+    means = splats.means
     rotation = camera.rotation.to(means)
     local = means @ rotation.T + camera.translation.to(means)
     depth = local[:, 2]
@@ -44,28 +46,21 @@ def _project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tu
         ),
         dim=-2,
     )
-    half = jacobian @ rotation @ quaternions_to_rotations(quats) * scales[:, None, :]
+    half = jacobian @ rotation @ quaternions_to_rotations(splats.rotations) * splats.scales[:, None, :]
     return means2d, half @ half.mT + BLUR * torch.eye(2).to(means), depth
 
 
 def rasterize_reference(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    camera: Camera,
-    *,
-    statistic: ScreenStatistic | None = None,
+    splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None
 ) -> Rasterized:
     """See ``polarguide.raster.interface``; differentiable by autograd, exact but slow."""
-    check_shapes(means, quats, scales, opacities, features, statistic)
-    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
-    for name, tensor in named.items():
+    check_shapes(splats, statistic)
+    for name, tensor in splats._asdict().items():
         bad = (~torch.isfinite(tensor)).nonzero()
         if len(bad):
-            raise refuse_not_finite(name, int(bad[0, 0]))
-    means2d, covariances, depth = _project(means, quats, scales, camera)
+            raise not_finite(name, int(bad[0, 0]))
+    means, opacities, features = splats.means, splats.opacities, splats.features
+    means2d, covariances, depth = _project(splats, camera)
     determinant = torch.linalg.det(covariances)
     visible = (depth > NEAR_PLANE) & (opacities >= MINIMUM_ALPHA) & (determinant > 0)
     order = torch.argsort(depth.detach(), stable=True)
@@ -87,7 +82,7 @@ def rasterize_reference(
     shape = (camera.height, camera.width)
     image = blended.reshape(*shape, features.shape[1])
     if statistic is not None and image.requires_grad:
-        image = _watched(image, means2d, statistic)
+        image = _with_statistic(image, means2d, statistic)
     with torch.no_grad():
         middle = 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
         radii = 3 * torch.sqrt(middle + torch.sqrt((middle**2 - determinant).clamp(min=0.1)))
@@ -99,7 +94,7 @@ def rasterize_reference(
     return Rasterized(image, coverage.reshape(shape), radii)
 
 
-def _watched(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> Tensor:
+def _with_statistic(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> Tensor:
     """The same picture; when its gradient arrives, the statistic is filled."""
 
     def fill(gradient: Tensor) -> None:

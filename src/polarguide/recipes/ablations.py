@@ -1,4 +1,4 @@
-"""Ablations: a recipe with one thing changed, each a row of data."""
+"""Ablations: a recipe with one thing changed, each a piece of data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
-from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_STOKES
+from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_STOKES, SHADING_STOKES
 from polarguide.training.recipe import Action, Recipe, Weights
 
 
@@ -166,14 +166,13 @@ ABLATIONS_STOKES: tuple[Recipe, ...] = (
         RECIPE_POLARGUIDE_STOKES,
         "without-fresnel",
         "Strength does not depend on the angle: the lerp of 3DGS-DR.",
-        blend="lerp",
-        first_strength=0.05,
+        shading=replace(SHADING_STOKES, blend="lerp", first_strength=0.05),
     ),
     varied(
         RECIPE_POLARGUIDE_STOKES,
         "without-local",
         "Nothing near is reflected: the environment alone.",
-        local=False,
+        shading=replace(SHADING_STOKES, local=False),
     ),
     varied(
         RECIPE_POLARGUIDE_STOKES,

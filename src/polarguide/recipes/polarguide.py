@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from polarguide.recipes.baselines import RECIPE_3DGS_DR
+from polarguide.recipes.baselines import RECIPE_3DGS_DR, SHADING_3DGS_DR
 from polarguide.training.recipe import Action, Priors, Recipe, Repeat, Stage, Weights
 
 REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)
@@ -66,9 +66,11 @@ RECIPE_POLARGUIDE: Recipe = replace(
         _FINAL,
         final_rates=_SLOW,
     ),
-    # An ideal sensor tells the azimuth down to a DoLP of a percent; noise has its own mask.
+    # An ideal sensor measures the azimuth down to a DoLP of a percent; noise has its own mask.
     priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0, snr=3.0, chromatic=True),
 )
+
+SHADING_STOKES = replace(SHADING_3DGS_DR, blend="fresnel", local=True, first_strength=0.5)
 
 RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     RECIPE_POLARGUIDE,
@@ -81,10 +83,7 @@ RECIPE_POLARGUIDE_STOKES: Recipe = replace(
         oriented=True,
     ),
     oriented=True,
-    blend="fresnel",
-    local=True,
-    first_strength=0.5,
-    rates={**RECIPE_3DGS_DR.rates, "local_dc": 2.5e-3, "local_rest": 2.5e-3 / 20},
+    shading=SHADING_STOKES,
 )
 
 RECIPE_POLARGUIDE_PAPER: Recipe = replace(

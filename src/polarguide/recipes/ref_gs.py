@@ -18,12 +18,8 @@ RECIPE_REF_GS = Recipe(
     rates={
         **RATES_3DGS,
         "quaternions": 1e-2,
-        "log_albedo": 1e-3,
-        "roughness_logits": 2e-3,
-        "features": 2e-3,
     },
-    directional=DirectionalShading(width=64),
-    environment_spread=0.5,
-    environment_rate=1e-2,
-    environment_resolution=32,
+    shading=DirectionalShading(
+        width=64, environment_spread=0.5, environment_rate=1e-2, environment_resolution=32
+    ),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -10,35 +11,47 @@ from torch import Tensor
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display, write_ply
 from polarguide.color import srgb_encode
-from polarguide.shading.model import ShadingModel
-from polarguide.shading.deferred import harmonic_colors
+from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.files import atomic
 from polarguide.training.state import TrainingState
 
 
 @torch.no_grad()
-def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor) -> Tensor:
-    """Display colors of every Gaussian toward viewing directions, reflections included.
+def gaussian_colors(
+    gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel, directions: Tensor
+) -> Tensor:
+    """Linear colors of every Gaussian toward viewing directions, reflections included.
 
     Args:
-        state: of a training. shading: of its recipe. directions: [K, 3] unit, from the camera to the Gaussian.
+        gaussians: the Gaussians. light: learned, by name. shading: of the recipe.
+        directions: [K, 3] unit, from the camera to the Gaussian.
 
     Returns:
-        [N, K, 3] in [0, 1]. Reflection is shaded per Gaussian at its own normal, as far as a splat can carry it.
+        [N, K, 3]. Each Gaussian is shaded at its own normal, as far as a splat can carry a reflection.
     """
-    gaussians = state.gaussians
-    columns = []
-    normals = shortest_axis_normals(gaussians["means"], gaussians["quaternions"], gaussians["log_scales"], torch.zeros(3))
-    for direction in directions.to(gaussians["means"].device):
+    return torch.stack(_toward(gaussians, light, shading, directions), dim=1)
+
+
+@torch.no_grad()
+def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor) -> Tensor:
+    """``gaussian_colors`` of a training for display, [N, K, 3] in [0, 1]."""
+    linear = _toward(state.gaussians, state.light, shading, directions)
+    return torch.stack([srgb_encode(color.clamp(0, 1)) for color in linear], dim=1)
+
+
+def _toward(
+    gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel, directions: Tensor
+) -> list[Tensor]:
+    """``gaussian_colors`` direction by direction: K of [N, 3]."""
+    means = gaussians["means"]
+    center = means.new_zeros(3)
+    normals = shortest_axis_normals(means, gaussians["quaternions"], gaussians["log_scales"], center)
+    colors = []
+    for direction in directions.to(means.device):
         # A camera far behind each Gaussian sees it along one direction.
-        rays = direction.expand(len(gaussians), 3)
-        if state.environment is None:
-            color = harmonic_colors(gaussians, rays)
-        else:
-            facing = torch.where((normals @ direction)[:, None] > 0, -normals, normals)
-            color = shading.colors(gaussians, state.environment.parameters, rays, facing)
-        columns.append(srgb_encode(color.clamp(0, 1)))
-    return torch.stack(columns, dim=1)
+        facing = torch.where((normals @ direction)[:, None] > 0, -normals, normals)
+        colors.append(shading.colors(gaussians, light, direction.expand(len(means), 3), facing))
+    return colors
 
 
 @torch.no_grad()
@@ -49,7 +62,8 @@ def write_run_ply(path: Path, state: TrainingState, shading: ShadingModel) -> No
         lambda directions: shown_colors(state, shading, directions).cpu(), len(gaussians)
     )
     plain = {
-        name: gaussians[name].detach().cpu() for name in ("means", "log_scales", "quaternions", "opacity_logits")
+        name: gaussians[name].detach().cpu()
+        for name in ("means", "log_scales", "quaternions", "opacity_logits")
     }
     with atomic(path) as temporary:
         write_ply(

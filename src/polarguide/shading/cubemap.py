@@ -16,7 +16,7 @@ face major s     t
 so that the direction of face 0 at (s, t) is (1, -t, -s). Seen from within the cube, pictures are upright with +y up.
 At a face's edge the taps beyond it are the texels of the neighboring face; beyond a corner, where only three faces
 meet, the missing tap is the mean of their three corner texels. So the look-up is continuous everywhere. On the CPU in
-float32 it is a native kernel; ``cubemap_lookup_reference`` is its twin in plain torch.
+float32 it is a native kernel; ``cubemap_lookup_reference`` is its reference implementation in plain torch.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def bilinear(
 
 
 def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
-    """The slow twin of ``cubemap_lookup``: plain torch, any dtype and device."""
+    """The reference implementation of ``cubemap_lookup``: plain torch, any dtype and device."""
     return bilinear(ringed_texels(texture), face_coordinates(directions), texture.shape[1])
 
 

@@ -16,6 +16,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -23,7 +24,15 @@ from torch.nn.functional import relu
 
 from polarguide.camera import Camera
 from polarguide.shading.mips import box_mips, mip_lookup
-from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, Parameters, mirrored
+from polarguide.shading.model import (
+    MAXIMUM_LOG_LIGHT,
+    GBuffer,
+    PageShading,
+    Parameter,
+    Parameters,
+    ShadingModel,
+    mirrored,
+)
 from polarguide.vectors import unit
 
 CHANNELS, FEATURES = 16, 4
@@ -36,34 +45,60 @@ _DARKEST = 1e-3  # a black point's first albedo, so that its logarithm is finite
 
 
 def albedo_of(gaussians: Parameters) -> Tensor:
-    """Albedo [N, 3], ``exp(min(x, 5)) / 5`` of the rows ``log_albedo``."""
+    """Albedo [N, 3], ``exp(min(x, 5)) / 5`` of the parameter ``log_albedo``."""
     return ALBEDO_SCALE * gaussians["log_albedo"].clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
 
 @dataclass(frozen=True)
-class DirectionalShading:
-    """The shading model, and what it begins with.
+class DirectionalShading(ShadingModel):
+    """Light of a learned grid of feature vectors that a small network reads; see the module's text.
 
     Attributes:
         width: of the MLP's two hidden layers.
         mlp_rate: learning rate of the MLP.
+        albedo_rate: learning rate of the albedo. feature_rate: of roughness and features.
         first_albedo: share of the first points' colors that albedo begins with, in (0, 1].
         first_roughness: that Gaussians begin with, in (0, 1).
         first_light: specular radiance before the first step (the MLP's output bias is its logarithm).
+        environment_spread: first texels of the grid are uniform in plus or minus this.
+        environment_rate: learning rate of the texels.
+        environment_resolution: texels along a cube face's side, a power of two.
     """
 
     width: int = 256
     mlp_rate: float = 5e-4
+    albedo_rate: float = 1e-3
+    feature_rate: float = 2e-3
     first_albedo: float = 0.5
     first_roughness: float = 0.5
     first_light: float = 0.25
+    environment_spread: float = 5.0
+    environment_rate: float = 0.05
+    environment_resolution: int = 128
 
-    def first_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """The side tensors ``log_albedo`` [N, 3], ``roughness_logits`` [N] and ``features`` [N, 4] to begin with.
+    stream: ClassVar[int] = 5
 
-        Args:
-            colors: [N, 3] linear, of the first Gaussians. generator: draws the features.
-        """
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """``log_albedo`` [N, 3], ``roughness_logits`` [N] and ``features`` [N, 4]."""
+        return {
+            "log_albedo": Parameter((3,), self.albedo_rate),
+            "roughness_logits": Parameter((), self.feature_rate),
+            "features": Parameter((FEATURES,), self.feature_rate),
+        }
+
+    @property
+    def light_parameters(self) -> Mapping[str, Parameter]:
+        """``texels`` [6, R, R, 16], and ``mlp_weight_K`` [inputs, outputs], ``mlp_bias_K`` [outputs], K = 0, 1, 2."""
+        side = self.environment_resolution
+        table = {"texels": Parameter((6, side, side, CHANNELS), self.environment_rate)}
+        for layer, (inputs, outputs) in enumerate(pairwise((INPUTS, self.width, self.width, 3))):
+            table[f"mlp_weight_{layer}"] = Parameter((inputs, outputs), self.mlp_rate)
+            table[f"mlp_bias_{layer}"] = Parameter((outputs,), self.mlp_rate)
+        return table
+
+    def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        """Albedo from the colors, one roughness, random features."""
         count = colors.shape[0]
         albedo = (self.first_albedo * colors).clamp(min=_DARKEST)
         logit = math.log(self.first_roughness / (1 - self.first_roughness))
@@ -73,33 +108,20 @@ class DirectionalShading:
             "features": torch.randn(count, FEATURES, generator=generator),
         }
 
-    def first_light_values(
-        self, resolution: int, spread: float, generator: torch.Generator
-    ) -> dict[str, Tensor]:
-        """The light's parameters to begin with.
+    def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Uniform texels, then the MLP: uniform within 1 / sqrt(inputs), as torch's Linear."""
+        table = self.light_parameters
 
-        Args:
-            resolution: texels along a cube face's side, a power of two. spread: texels are uniform in plus or minus
-                this. generator: draws the texels, then the MLP (uniform within 1 / sqrt(inputs), as torch's Linear).
+        def uniform(name: str, bound: float) -> Tensor:
+            return (torch.rand(table[name].shape, generator=generator) * 2 - 1) * bound
 
-        Returns:
-            ``texels`` [6, R, R, 16], and ``mlp_weight_K`` [inputs, outputs], ``mlp_bias_K`` [outputs], K = 0, 1, 2.
-        """
-        size = (6, resolution, resolution, CHANNELS)
-        values = {"texels": (torch.rand(size, generator=generator) * 2 - 1) * spread}
-        sizes = (INPUTS, self.width, self.width, 3)
-        for layer, (inputs, outputs) in enumerate(pairwise(sizes)):
-            bound = 1 / math.sqrt(inputs)
-            for name, shape in (("weight", (inputs, outputs)), ("bias", (outputs,))):
-                uniform = torch.rand(shape, generator=generator) * 2 - 1
-                values[f"mlp_{name}_{layer}"] = uniform * bound
+        values = {"texels": uniform("texels", self.environment_spread)}
+        for layer in range(3):
+            bound = 1 / math.sqrt(table[f"mlp_weight_{layer}"].shape[0])
+            for name in (f"mlp_weight_{layer}", f"mlp_bias_{layer}"):
+                values[name] = uniform(name, bound)
         values["mlp_bias_2"] = torch.full((3,), math.log(self.first_light))
         return values
-
-    def rates(self, texel_rate: float) -> dict[str, float]:
-        """Learning rates of the light's parameters by name; texels learn at ``texel_rate``."""
-        mlp = {f"mlp_{name}_{layer}": self.mlp_rate for layer in range(3) for name in ("weight", "bias")}
-        return {"texels": texel_rate, **mlp}
 
     def radiance(
         self, light: Mapping[str, Tensor], directions: Tensor, roughness: Tensor, features: Tensor
@@ -107,7 +129,7 @@ class DirectionalShading:
         """Specular radiance [P, 3], in (0, e^5].
 
         Args:
-            light: parameters as of ``first_light_values``.
+            light: parameters as of ``light_parameters``.
             directions: [P, 3] mirrored rays, of any length.
             roughness: [P] in [0, 1]; from ``1 - 1 / L`` on, with L mip levels, it reads the mean of the grid.
             features: [P, 4] of any length; zero reads the light without them.
@@ -155,6 +177,10 @@ class DirectionalShading:
         roughness, features = torch.sigmoid(gaussians["roughness_logits"]), torch.tanh(gaussians["features"])
         return albedo_of(gaussians) + self.radiance(light, mirrored(rays, normals), roughness, features)
 
+    def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
+        """Albedo [N, 3]."""
+        return albedo_of(gaussians)
+
     def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
         """What a PLY of the Gaussians keeps besides display colors: ``albedo``, ``roughness``, ``feature``."""
         return {
@@ -162,3 +188,15 @@ class DirectionalShading:
             "roughness": torch.sigmoid(gaussians["roughness_logits"]),
             "feature": torch.tanh(gaussians["features"]),
         }
+
+    def page(self, gaussians: Parameters, light: Mapping[str, Tensor]) -> PageShading | None:
+        """Albedo, roughness, features; the grid's levels and the MLP."""
+        fields = self.fields(gaussians)
+        layers = range(3)
+        return PageShading(
+            kind="directional",
+            values={"color": fields["albedo"], "share": fields["roughness"], "features": fields["feature"]},
+            light=box_mips(light["texels"]),
+            network=[m for k in layers for m in (light[f"mlp_weight_{k}"], light[f"mlp_bias_{k}"][None])],
+            constants={"width": self.width},
+        )

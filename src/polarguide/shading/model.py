@@ -1,24 +1,54 @@
-"""What every shading model of deferred reflection offers to rendering and to export."""
+"""The shading model: all that tells one way of making a picture of Gaussians from another.
+
+A recipe holds one. Training, rendering, the viewer and the exports ask it for everything that depends on how light is
+reflected, so that a new model is one new class, and nothing else changes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
+from polarguide import optics
 from polarguide.camera import Camera
+from polarguide.errors import PolarguideError
+from polarguide.gaussians.harmonics import evaluate_sh
+from polarguide.shading.result import RenderResult
 from polarguide.vectors import dot
 
 # Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
 MAXIMUM_LOG_LIGHT = 5.0
+PLAIN_LAYERS = ("final", "normal", "depth", "alpha")
+
+Model = TypeVar("Model", bound="ShadingModel")
 
 
 class Parameters(Protocol):
-    """Named per-Gaussian tensors: the trainable rows, or a frozen copy of them."""
+    """Per-Gaussian tensors by name: those in training, or a frozen copy of them."""
 
     def __getitem__(self, name: str, /) -> Tensor: ...
-    def __contains__(self, name: str, /) -> bool: ...
+    def get(self, name: str, /) -> Tensor | None:
+        """The tensor, or None if there is none of that name."""
+
+
+class Parameter(NamedTuple):
+    """A tensor that a shading model trains.
+
+    Attributes:
+        shape: of one Gaussian's values; of the whole tensor for a parameter of the light.
+        rate: learning rate (Adam).
+        reset_minimum: a reset of the opacities raises values to at least this; None: it leaves them.
+    """
+
+    shape: tuple[int, ...]
+    rate: float
+    reset_minimum: float | None = None
 
 
 class GBuffer(NamedTuple):
@@ -49,27 +79,231 @@ class GBuffer(NamedTuple):
         return self.features[..., 6:]
 
 
-class ShadingModel(Protocol):
-    """What a recipe's reflection splats, and how it makes the picture of it.
+class RadianceCubemap(NamedTuple):
+    """A parameter of the light that is radiance from afar: it can be exported, turned and replaced.
 
-    ``light`` is the learned environment: its parameters by name.
+    Attributes:
+        name: of the parameter, raw texels [6, R, R, 3].
+        radiance: linear radiance of raw values, [..., 3].
+        raw: the inverse, as far as raw values can hold the radiance.
     """
 
+    name: str
+    radiance: Callable[[Tensor], Tensor]
+    raw: Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class PageShading:
+    """What an exported page needs in order to shade Gaussians as the model does.
+
+    Attributes:
+        kind: the page's shaders are compiled with its name, in capitals, defined.
+        values: per Gaussian, by the names of ``export.records.SLOTS``, [N, ...].
+        light: cubemaps [6, R, R, C], the finest first.
+        network: matrices [rows, columns] in the order in which the shaders read them.
+        constants: further entries of the page's scene, plain JSON values.
+        notes: sentences for whoever looks at the page.
+    """
+
+    kind: str
+    values: Mapping[str, Tensor]
+    light: Sequence[Tensor] = ()
+    network: Sequence[Tensor] = ()
+    constants: Mapping[str, Any] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class ShadingModel(ABC):
+    """How a recipe shades: what it learns, what it splats, and how it makes the picture of it.
+
+    Subclasses are frozen dataclasses. Their fields are part of the recipe and are recorded in a run's folder; the
+    refractive index is the run's own, see ``bind``. ``light`` is the learned light: its parameters by name.
+
+    Attributes:
+        refractive_index: of all surfaces.
+    """
+
+    refractive_index: float = field(default=1.5, kw_only=True)
+
+    stream: ClassVar[int] = 6
+    """Which of a seed's sequences of random numbers the first values are drawn from."""
+
+    needs_normals: ClassVar[bool] = True
+    """Whether shading reads the normals, so that they are always splatted."""
+
+    def bind(self: Model, refractive_index: float) -> Model:
+        """The same model for surfaces of a refractive index."""
+        return dataclasses.replace(self, refractive_index=refractive_index)
+
+    def data(self) -> dict[str, Any]:
+        """The class's name and all fields of the recipe, for a run's folder; plain JSON values."""
+        values = dataclasses.asdict(self)
+        del values["refractive_index"]
+        return {"model": type(self).__name__, **values}
+
+    # What is learned
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Per-Gaussian tensors besides those that every recipe trains."""
+        return {}
+
+    @property
+    def light_parameters(self) -> Mapping[str, Parameter]:
+        """Parameters of the learned light; none: it has no light to learn."""
+        return {}
+
+    def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        """The tensors of ``parameters`` before the first step, [N, ...].
+
+        Args:
+            colors: [N, 3] linear, of the first Gaussians. generator: of random numbers; the light draws from it next.
+        """
+        return {}
+
+    def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """The tensors of ``light_parameters`` before the first step."""
+        return {}
+
+    def strength(self, gaussians: Parameters) -> Tensor:
+        """Reflection strength [N] in [0, 1]: what tells glossy from matte Gaussians (for normal propagation).
+
+        Raises:
+            PolarguideError: the model has none.
+        """
+        raise PolarguideError(
+            "recipe",
+            expected="a shading model with a reflection strength",
+            found=type(self).__name__,
+            remedy='Take the action "propagate_normals" out of the recipe, or define strength().',
+        )
+
+    # What it renders
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers in its pictures, as in ``shading.result.LAYERS``; with "specular" if it reflects."""
+        return ("final", "base", "specular", "diffuse", "normal", "depth", "alpha")
+
+    @property
+    def reflects(self) -> bool:
+        """Whether pictures have a specular layer."""
+        return "specular" in self.layers
+
+    @abstractmethod
     def channels(
         self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
     ) -> list[Tensor]:
-        """Per Gaussian: colors [N, 3], then what is blended behind color and normal, each [N, C]."""
+        """Per Gaussian: colors [N, 3], then what is blended behind color and normal, each [N, C].
 
+        Args:
+            normals: [N, 3] unit, world axes. center: [3] of the camera. sh_degree: of the base color, 0 to 3.
+        """
+
+    @abstractmethod
     def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
         """Layers of a picture by their names in ``RenderResult``; ``final`` at least."""
 
+    def predicted_stokes(self, result: RenderResult, camera: Camera) -> Tensor:
+        """Stokes vectors [3, H, W, 3] of a rendered picture; here of a smooth dielectric.
+
+        Args:
+            result: with the specular and diffuse layers and the normal.
+        """
+        assert result.specular is not None
+        assert result.diffuse is not None
+        assert result.normal is not None
+        return optics.predicted_stokes(
+            2 * result.specular,
+            2 * result.diffuse,
+            camera.to_camera(result.normal),
+            camera.rays(device=result.normal.device),
+            self.refractive_index,
+        )
+
+    # What exports need
+
+    @property
+    def radiance_cubemap(self) -> RadianceCubemap | None:
+        """The light's radiance from afar; None where the light is not such a cubemap."""
+        return None
+
+    @property
+    def local_note(self) -> str:
+        """What does not follow when the light from afar is turned or replaced; empty: everything does."""
+        return ""
+
+    @abstractmethod
     def colors(
         self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
     ) -> Tensor:
         """Linear colors [N, 3] of Gaussians shaded one by one, along unit rays [N, 3] at facing normals [N, 3]."""
 
+    def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
+        """Linear colors [N, 3] without reflections, along unit rays [N, 3]."""
+        return harmonic_colors(gaussians, rays)
+
     def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """What a PLY of the Gaussians keeps besides display colors, [N, ...] by name."""
+        """What a PLY of the Gaussians keeps besides display colors, [N, ...] by name: linear harmonics."""
+        return {"linear_dc": gaussians["sh_dc"], "linear_rest": gaussians["sh_rest"].flatten(1)}
+
+    def page(self, gaussians: Parameters, light: Mapping[str, Tensor]) -> PageShading | None:
+        """What an exported page needs; None where it has no shaders for the model (colors are then baked)."""
+        return None
+
+
+@dataclass(frozen=True)
+class PlainShading(ShadingModel):
+    """Plain 3D Gaussian splatting (Kerbl et al. 2023): the blended base color is the picture."""
+
+    needs_normals: ClassVar[bool] = False
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Without reflection there is one color."""
+        return PLAIN_LAYERS
+
+    def channels(
+        self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
+    ) -> list[Tensor]:
+        """Base color [N, 3]."""
+        return [base_colors(gaussians, center, sh_degree)]
+
+    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+        """``final`` [H, W, 3]."""
+        return {"final": splatted.color}
+
+    def colors(
+        self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
+    ) -> Tensor:
+        """Base colors [N, 3]; see ``ShadingModel``."""
+        return self.diffuse_colors(gaussians, rays)
+
+    def page(self, gaussians: Parameters, light: Mapping[str, Tensor]) -> PageShading | None:
+        """Harmonics alone."""
+        return PageShading("plain", harmonic_values(gaussians))
+
+
+PLAIN = PlainShading()
+
+
+def base_colors(gaussians: Parameters, center: Tensor, sh_degree: int) -> Tensor:
+    """Linear base colors [N, 3] toward a camera center [3], not negative."""
+    sh = evaluate_sh(gaussians["means"], center, gaussians["sh_dc"], gaussians["sh_rest"], sh_degree)
+    return (sh + 0.5).clamp(min=0)
+
+
+def harmonic_colors(gaussians: Parameters, rays: Tensor) -> Tensor:
+    """Linear base colors [N, 3] along unit rays [N, 3], of degree 3, not negative."""
+    origin = rays.new_zeros(3)
+    return (evaluate_sh(rays, origin, gaussians["sh_dc"], gaussians["sh_rest"], 3) + 0.5).clamp(min=0)
+
+
+def harmonic_values(gaussians: Parameters) -> dict[str, Tensor]:
+    """The base color's harmonics as values of a page."""
+    return {"color": gaussians["sh_dc"], "harmonics": gaussians["sh_rest"]}
 
 
 def mirrored(rays: Tensor, normals: Tensor) -> Tensor:

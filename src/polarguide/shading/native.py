@@ -1,4 +1,4 @@
-"""Deferred reflection on the CPU in one native pass; ``render.reflect`` is its twin in plain torch."""
+"""Deferred reflection on the CPU in one native pass; ``deferred.reflect_reference`` is its reference implementation."""
 
 from __future__ import annotations
 
@@ -14,16 +14,22 @@ from polarguide import _native
 class _Reflect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, features: Tensor, rays: Tensor, texels: Tensor, fresnel: bool, local: bool, index: float
+        ctx: Any,
+        features: Tensor,
+        rays: Tensor,
+        texels: Tensor,
+        fresnel: bool,
+        local: bool,
+        refractive_index: float,
     ) -> tuple[Tensor, ...]:
         features, rays, texels = (t.detach().contiguous() for t in (features, rays, texels))
         directions, seen = torch.empty_like(rays), torch.empty_like(rays)
         layers = tuple(torch.empty_like(rays) for _ in range(4))
         _native.reflect_directions(features, rays, directions)
         _native.cubemap_forward(texels, directions, seen)
-        _native.reflect_layers(features, rays, seen, fresnel, local, index, *layers)
+        _native.reflect_layers(features, rays, seen, fresnel, local, refractive_index, *layers)
         ctx.save_for_backward(features, rays, texels, directions, seen)
-        ctx.model = (fresnel, local, index)
+        ctx.model = (fresnel, local, refractive_index)
         ctx.set_materialize_grads(False)
         return layers
 
@@ -31,7 +37,7 @@ class _Reflect(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         features, rays, texels, directions, seen = ctx.saved_tensors
-        fresnel, local, index = ctx.model
+        fresnel, local, refractive_index = ctx.model
         final, specular, diffuse, reflection = (None if g is None else g.contiguous() for g in grads)
         to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
         _native.reflect_backward_layers(
@@ -40,7 +46,7 @@ class _Reflect(torch.autograd.Function):
             seen,
             fresnel,
             local,
-            index,
+            refractive_index,
             final,
             specular,
             diffuse,
@@ -55,7 +61,7 @@ class _Reflect(torch.autograd.Function):
 
 
 def reflect_native(
-    features: Tensor, rays: Tensor, texels: Tensor, *, fresnel: bool, local: bool, index: float
+    features: Tensor, rays: Tensor, texels: Tensor, *, fresnel: bool, local: bool, refractive_index: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The layers of a picture from its G-buffer (Ye et al. 2024, Eq. 5, or Fresnel-weighted).
 
@@ -64,7 +70,7 @@ def reflect_native(
         rays: [P, 3] unit, world. texels: [6, R, R, 3] raw. All float32 on the CPU.
         fresnel: Fresnel's weight and exponential light in place of the lerp and the logistic function.
         local: whether channels 7 to 9 are light that is added to the environment's.
-        index: refractive index of Fresnel's weight.
+        refractive_index: of Fresnel's weight.
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and texels;
@@ -73,5 +79,7 @@ def reflect_native(
     Raises:
         ValueError: if a shape is not as above.
     """
-    final, specular, diffuse, reflection = _Reflect.apply(features, rays, texels, fresnel, local, index)
+    final, specular, diffuse, reflection = _Reflect.apply(
+        features, rays, texels, fresnel, local, refractive_index
+    )
     return final, specular, diffuse, reflection

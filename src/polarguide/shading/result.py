@@ -26,7 +26,7 @@ class RenderResult:
         normal: blended normal in world axes, not normalized; None where the stage does not splat it.
         depth: [H, W] expected camera depth over alpha; None where not asked for.
         alpha: [H, W] in [0, 1].
-        radii: [N] pixels, of the projected Gaussians; 0 where culled.
+        radii: [N] pixels, of the projected Gaussians; 0 where culled; None where there are no Gaussians.
     """
 
     final: Tensor
@@ -38,7 +38,7 @@ class RenderResult:
     normal: Tensor | None
     depth: Tensor | None
     alpha: Tensor
-    radii: Tensor
+    radii: Tensor | None = None
 
     def to(self, device: torch.device | str) -> RenderResult:
         """The same on a device; nothing is copied that is there already."""

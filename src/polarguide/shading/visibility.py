@@ -9,7 +9,8 @@ from torch import Tensor
 
 from polarguide.capture import View
 from polarguide.raster import Rasterize
-from polarguide.shading.deferred import Parameters, render
+from polarguide.shading.gbuffer import render
+from polarguide.shading.model import Parameters
 from polarguide.vectors import unit
 
 # A Gaussian at most this much behind the rendered surface, relative to its depth, is seen.
@@ -23,7 +24,7 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
     A camera sees it where its center lies in the picture and not behind the rendered depth.
 
     Args:
-        gaussians: the Gaussians. views: whose cameras look. rasterize: of the backend.
+        gaussians: the Gaussians. views: with the cameras. rasterize: of the backend.
 
     Returns:
         [N, 3]; zero where no camera sees it.

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
-from polarguide.camera import Camera
-from polarguide.synth.mesh import Array, unit
+from polarguide.camera import Camera, look_at
 from polarguide.synth.schema import CameraPath
 
 TEST_EVERY = 8
@@ -22,6 +20,7 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
     ends = np.round(np.cumsum(shares) / shares.sum() * path.views).astype(int)
     counts = np.diff(np.concatenate([[0], ends]))
     focal = float(width / 2 / np.tan(np.radians(path.fov) / 2))
+    size, center = (width, height), (width / 2, height / 2)
     cameras = []
     for ring, count in zip(path.rings, counts, strict=True):
         start, stop = float(ring.get("from", 0.0)), float(ring.get("to", 360.0))
@@ -42,19 +41,8 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
                 radius * np.sin(angle),
                 z,
             ]
-            cameras.append(look_at(eye, target, width, height, focal))
+            cameras.append(Camera(*size, focal, focal, *center, *look_at(eye, target, (0.0, 0.0, 1.0))))
     return cameras
-
-
-def look_at(eye: Array, target: Array, width: int, height: int, focal: float) -> Camera:
-    """A camera at ``eye`` that looks at ``target`` with the world's z upwards in its picture."""
-    forward = unit(target - eye)
-    right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
-    rotation = np.stack((right, np.cross(forward, right), forward))
-    return Camera(
-        width, height, focal, focal, width / 2, height / 2,
-        torch.from_numpy(rotation), torch.from_numpy(-rotation @ eye),
-    )  # fmt: skip
 
 
 def view_names(count: int) -> list[str]:

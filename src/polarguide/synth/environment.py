@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.errors import PolarguideError
-from polarguide.synth.mesh import Array, unit
+from polarguide.synth.mesh import Array
 from polarguide.synth.noise import fractal_noise
 from polarguide.synth.textures import image
+from polarguide.vectors import unit_array as unit
 
 HEIGHT = 256
 Color = tuple[float, float, float]

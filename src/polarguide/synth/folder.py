@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.view import ANGLES
 from polarguide.capture.write import picture_name
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
+from polarguide.polarizer import ANGLES, malus
+from polarguide.records import read_record
 from polarguide.synth.mesh import Array
+from polarguide.synth.schema import with_current_keys
 
 REQUEST = "request.json"
 STEP = 16
@@ -32,6 +34,7 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
     """
     path = out / REQUEST
     text = json.dumps(request, indent=1)
+    remedy = "Give another --out, or remove the folder."
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         out.mkdir(parents=True, exist_ok=True)
         write_file(path, text.encode())
@@ -43,12 +46,13 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
             found="one with other files",
             remedy="Give another --out.",
         )
-    if path.read_text(encoding="utf-8") != text:
+    before = with_current_keys(read_record(path, dict[str, Any], remedy=remedy))
+    if before != json.loads(text):
         raise PolarguideError(
             out,
             expected="a scene that was begun with the same settings",
             found="a scene with other settings",
-            remedy="Give another --out, or remove the folder.",
+            remedy=remedy,
         )
     return (out / "scene.json").exists()
 
@@ -70,8 +74,7 @@ def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.
         stokes: [3, H, W, 3], full scale 1.
         change: applied to the intensities [4, H, W, 3] before they are stored (noise).
     """
-    twice = [2 * np.radians(angle) for angle in ANGLES]
-    light = np.stack([(stokes[0] + stokes[1] * np.cos(a) + stokes[2] * np.sin(a)) / 2 for a in twice])
+    light = np.stack([malus(stokes, np.radians(angle)) for angle in ANGLES])
     return np.clip(np.round(change(light) * (65535 / STEP)), 0, TOP).astype(np.uint16) * STEP
 
 

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.synth.mesh import Array, Mesh, unit
+from polarguide.synth.mesh import Array, Mesh
 from polarguide.synth.signed_distance import primitive_distance
 from polarguide.synth.surface_nets import surface_nets
+from polarguide.vectors import unit_array as unit
 
 NEWTON_STEPS = 2
 COARSE = 4

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.vectors import unit_array
+
 Array = NDArray[np.float64]
 
 
@@ -56,7 +58,7 @@ def smooth_normals(points: Array, faces: NDArray[np.int64]) -> Array:
     total = np.zeros_like(points)
     for k in range(3):
         np.add.at(total, place.reshape(-1)[faces[:, k]], across)
-    return unit(total[place.reshape(-1)])
+    return unit_array(total[place.reshape(-1)])
 
 
 def grid_faces(rows: int, columns: int, *, wrap: bool = False) -> NDArray[np.int64]:
@@ -66,12 +68,6 @@ def grid_faces(rows: int, columns: int, *, wrap: bool = False) -> NDArray[np.int
     a, b = row * columns + column, row * columns + after
     c, d = (row + 1) * columns + column, (row + 1) * columns + after
     return np.concatenate([np.stack((a, b, d), -1).reshape(-1, 3), np.stack((a, d, c), -1).reshape(-1, 3)])
-
-
-def unit(vectors: Array) -> Array:
-    """Vectors at length 1; zero stays zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, 1e-300))
 
 
 def rotation(degrees: tuple[float, float, float]) -> Array:

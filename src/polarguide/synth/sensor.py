@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.sensor.pattern import sensor_pattern
+from polarguide.polarizer import malus
 from polarguide.synth.mesh import Array
 
 
@@ -77,8 +78,7 @@ def mosaic(
         colors = np.tile(pattern.colors, repeat)[:height, :width]
         light = np.take_along_axis(stokes, colors[None, ..., None], -1)[..., 0]
     contrast = (sensor.extinction - 1) / (sensor.extinction + 1)
-    twice = 2 * np.radians(angles)
-    value = (light[0] + contrast * (light[1] * np.cos(twice) + light[2] * np.sin(twice))) / 2
+    value = malus((light[0], contrast * light[1], contrast * light[2]), np.radians(angles))
     value = noisy(value, noise, random, sensor) * np.array(sensor.gains)[angles // 45]
     top = (1 << sensor.bits) - 1
     return np.clip(np.round(sensor.black + value * (top - sensor.black)), 0, top).astype(np.uint16)

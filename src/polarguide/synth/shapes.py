@@ -12,8 +12,9 @@ import numpy as np
 
 from polarguide.errors import PolarguideError
 from polarguide.synth.implicit_surface import solid
-from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals, unit
+from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals
 from polarguide.synth.noise import fractal_noise
+from polarguide.vectors import unit_array as unit
 
 
 def sphere(radius: float = 1.0, detail: int = 96) -> Mesh:

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, quaternion
 from polarguide.synth.build import BuiltScene
 from polarguide.synth.geometry import intersect
 from polarguide.synth.mesh import Array
@@ -183,7 +182,7 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
     (folder / "points3D.txt").write_text("# points\n" + "\n".join(rows) + "\n")
     lines = []
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-        x, y, z, w = Rotation.from_matrix(camera.rotation.numpy()).as_quat()
-        pose = " ".join(f"{v:.15g}" for v in (w, x, y, z, *camera.translation.tolist()))
+        numbers = (*quaternion(camera.rotation), *camera.translation.tolist())
+        pose = " ".join(f"{v:.15g}" for v in numbers)
         lines += [f"{number + 1} {pose} 1 {name}.png", " ".join(seen[number])]
     (folder / "images.txt").write_text("# two lines an image\n" + "\n".join(lines) + "\n")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
+from polarguide.shading.model import ShadingModel
 from polarguide.training.recipe import Propagation
 from polarguide.training.state import TrainingState
 
 RESET_OPACITY = 0.01
-RESET_STRENGTH = 1e-3
 # Steps for which opacities do not train after a propagation (Ye et al. 2024, release).
 OPACITY_REST = 200
 
@@ -18,18 +18,26 @@ def _logit(value: float) -> float:
 
 
 @torch.no_grad()
-def reset_opacity(state: TrainingState) -> None:
-    """Opacities down to at most 0.01, so that what is not needed stays transparent (Kerbl et al. 2023)."""
+def reset_opacity(state: TrainingState, shading: ShadingModel) -> None:
+    """Opacities down to at most 0.01, so that what is not needed stays transparent (Kerbl et al. 2023).
+
+    Parameters of the shading model rise to their minimum after a reset, where they have one.
+    """
     gaussians = state.gaussians
     gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(max=_logit(RESET_OPACITY)))
-    if "strength_logits" in gaussians:
-        gaussians.overwrite("strength_logits", gaussians["strength_logits"].clamp(min=_logit(RESET_STRENGTH)))
+    for name, parameter in shading.parameters.items():
+        if parameter.reset_minimum is not None:
+            gaussians.overwrite(name, gaussians[name].clamp(min=parameter.reset_minimum))
     state.opacity_was_reset = True
 
 
 @torch.no_grad()
 def propagate_normals(
-    state: TrainingState, settings: Propagation, generator: torch.Generator, rest: int
+    state: TrainingState,
+    shading: ShadingModel,
+    settings: Propagation,
+    generator: torch.Generator,
+    rest: int,
 ) -> None:
     """Let Gaussians with a right normal take over their neighborhood (Ye et al. 2024, Sec. 3.3).
 
@@ -37,7 +45,7 @@ def propagate_normals(
     glossy ones grow along their surface.
     """
     gaussians = state.gaussians
-    strength = torch.sigmoid(gaussians["strength_logits"])
+    strength = shading.strength(gaussians)
     gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(min=_logit(settings.opacity)))
     # Drawn on the CPU, so that every device gets the same noise.
     noise = (torch.rand(gaussians["sh_dc"].shape, generator=generator) * 2 - 1) * settings.color_noise

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
+from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
@@ -61,9 +61,9 @@ def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
 
 
 def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Mean distance of the normal from the plane of incidence that the AoLP names, |n . e|.
+    """Mean distance of the normal from the plane of incidence that the AoLP gives, |n . e|.
 
-    Unlike the zenith of a pure-lobe inversion, the plane does not depend on the index or on how lobes mix.
+    Unlike the zenith of a pure-lobe inversion, the plane does not depend on the refractive index or on how lobes mix.
     """
     distance = dot(unit(normal, 1e-2), priors.plane).abs()
     return (distance * priors.weight).sum() / priors.weight.sum().clamp(min=1)
@@ -79,26 +79,17 @@ def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
     return ((1 - cosine) * priors.chromatic_weight).sum() / priors.chromatic_weight.sum().clamp(min=1)
 
 
-def stokes_loss(result: RenderResult, priors: ViewPriors, index: float) -> Tensor:
+def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel) -> Tensor:
     """Mean distance of the predicted S1 and S2 from the measured ones, over the square root of S0.
 
-    The prediction is Fresnel's for the rendered layers and the rendered normal, so that one explanation of
+    The shading model predicts from the rendered layers and the rendered normal, so that one explanation of
     geometry and layers has to fit the polarization of all views. The variance of S1 and S2 grows with S0 where light
     itself is the noise; the root evens that out.
 
     Args:
-        result: with both layers and the normal.
+        result: with both layers and the normal. shading: of the recipe, for the run's refractive index.
     """
-    assert result.specular is not None
-    assert result.diffuse is not None
-    assert result.normal is not None
-    predicted = optics.predicted_stokes(
-        2 * result.specular,
-        2 * result.diffuse,
-        priors.camera.to_camera(result.normal),
-        priors.camera.rays(device=result.normal.device),
-        index,
-    )
+    predicted = shading.predicted_stokes(result, priors.camera)
     distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))
     scale = (priors.stokes[0].mean(dim=-1) + 0.01).rsqrt()
     return (priors.reliable * scale * distance).mean()
@@ -123,7 +114,7 @@ def step_loss(
     priors: ViewPriors | None,
     *,
     ssim_weight: float,
-    index: float,
+    shading: ShadingModel,
     log_scales: Tensor,
     extent: float,
     camera: Camera | None = None,
@@ -137,7 +128,7 @@ def step_loss(
         weights: of the stage.
         priors: of the view; needed where a weight asks for them.
         ssim_weight: lambda of the image terms.
-        index: refractive index.
+        shading: of the stage, for the run's refractive index.
         log_scales: [N, 3] of the Gaussians. extent: of the scene.
         camera: of the view; needed where a weight asks for the normals of the depth.
     """
@@ -145,9 +136,9 @@ def step_loss(
     total = weights.photometric * photometric
     if priors is not None:
         total = total + _prior_terms(result, weights, priors, ssim_weight)
-        if weights.stokes and result.specular is not None:
-            total = total + weights.stokes * stokes_loss(result, priors, index)
-    if weights.flatness:
+        if weights.stokes and shading.reflects:
+            total = total + weights.stokes * stokes_loss(result, priors, shading)
+    if weights.flatness and result.radii is not None:
         total = total + weights.flatness * flatness_loss(log_scales, result.radii, extent)
     if weights.consistency and camera is not None:
         total = total + weights.consistency * consistency_loss(
@@ -161,7 +152,7 @@ def step_loss(
 def refuse_diverged(total: Tensor) -> None:
     """Raise PolarguideError unless all of ``total`` is finite.
 
-    On a GPU this waits for the device, so the loop asks it about many steps at once.
+    On a GPU this waits for the device, so the loop asks for many steps at once.
     """
     if not bool(torch.isfinite(total).all()):
         raise PolarguideError(

@@ -18,7 +18,7 @@ from polarguide.color import srgb_encode
 from polarguide.training.recipe import Priors
 from polarguide.vectors import dot, unit
 
-# Rendered normals shorter than this are too mixed to say anything.
+# Rendered normals shorter than this are too mixed to be trusted.
 MINIMUM_NORMAL = 0.3
 # Color differences that explain their polarization this much better than not count fully.
 FULL_CERTAINTY = 3.0
@@ -34,9 +34,9 @@ class ViewPriors:
         specular, diffuse: [H, W, 3] shown (sRGB) separated pictures, on the scale of S0/2.
         separated: [H, W] weight of both: 1 where the separation is well conditioned.
         normal: [H, W, 3] disambiguated polarization normal, world axes.
-        plane: [H, W, 3] world normal of the plane of incidence that the AoLP names.
+        plane: [H, W, 3] world normal of the plane of incidence that the AoLP gives.
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
-        chromatic: [H, W, 3] normal that the polarization of color differences tells, world axes.
+        chromatic: [H, W, 3] normal from the polarization of color differences, world axes.
         chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
         camera: of the view.
         stokes: [3, H, W, 3] as measured.
@@ -68,14 +68,14 @@ def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> ViewPriors:
+def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: float) -> ViewPriors:
     """Compute the priors of one view.
 
     Args:
         view: the capture.
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
-        index: refractive index.
+        refractive_index: of all surfaces.
     """
     view = view.to(normal.device)
     rays = view.camera.rays(device=normal.device)
@@ -94,26 +94,26 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
     nearest_to = guide
     if settings.chromatic:
         chromatic, chromatic_weight = facing_chromatic(
-            stokes, guide, rays, index, ~(view.invalid | view.saturated)
+            stokes, guide, rays, refractive_index, ~(view.invalid | view.saturated)
         )
         chromatic_weight = chromatic_weight * known
         nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
     make = optics.paper_candidates if settings.candidates == "paper" else optics.physical_candidates
     chosen = optics.disambiguate(
-        make(luminance, rays, index), nearest_to, rays, azimuth_weight=settings.azimuth_weight
+        make(luminance, rays, refractive_index), nearest_to, rays, azimuth_weight=settings.azimuth_weight
     ).normal
     if settings.separation == "paper":
-        zenith = optics.diffuse_zenith(optics.dolp(luminance), index)
-        layers = optics.paper_separation(stokes, zenith, index)
+        zenith = optics.diffuse_zenith(optics.dolp(luminance), refractive_index)
+        layers = optics.paper_separation(stokes, zenith, refractive_index)
         conditioned = ~view.saturated
     else:
-        layers = optics.exact_separation(stokes, guide, rays, index)
+        layers = optics.exact_separation(stokes, guide, rays, refractive_index)
         conditioned = layers.conditioned & known & ~view.saturated
     plane = unit(torch.linalg.cross(rays, chosen))
     degree = optics.dolp(luminance)
     weight = (degree / settings.full_dolp).clamp(max=1) * (usable & known)
     if settings.chromatic:
-        # Nearly unpolarized light has no AoLP to speak of; the slope among its colors may still have one.
+        # Nearly unpolarized light has no reliable AoLP; the slope among its colors may still have one.
         better = (chromatic_weight > 0) & (degree < CHROMATIC_PLANE_DOLP)
         plane = torch.where(better[..., None], unit(torch.linalg.cross(rays, chromatic)), plane)
         weight = torch.maximum(weight, chromatic_weight)
@@ -135,20 +135,20 @@ def view_priors(view: View, normal: Tensor, settings: Priors, index: float) -> V
 
 
 def facing_chromatic(
-    stokes: Tensor, guide: Tensor, rays: Tensor, index: float, good: Tensor
+    stokes: Tensor, guide: Tensor, rays: Tensor, refractive_index: float, good: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Normals of the color differences on the guide's side of each ray, and their weights.
 
     Args:
-        stokes: [3, H, W, 3]. guide: [H, W, 3] camera axes. rays: [H, W, 3]. index: refractive index.
+        stokes: [3, H, W, 3]. guide: [H, W, 3] camera axes. rays: [H, W, 3]. refractive_index: of all surfaces.
         good: [H, W] bool, pixels whose measurement counts.
 
     Returns:
         [H, W, 3] unit, camera axes; [H, W] in [0, 1], 0 where color decides nothing.
     """
-    told = optics.chromatic_normals(stokes, index)
-    normal = optics.normal_from_angles(told.zenith, told.azimuth, rays)
-    mirrored = optics.normal_from_angles(told.zenith, told.azimuth + torch.pi, rays)
+    found = optics.chromatic_normals(stokes, refractive_index)
+    normal = optics.normal_from_angles(found.zenith, found.azimuth, rays)
+    mirrored = optics.normal_from_angles(found.zenith, found.azimuth + torch.pi, rays)
     nearer = dot(normal, guide) >= dot(mirrored, guide)
-    weight = (told.certainty / FULL_CERTAINTY).clamp(max=1) * (told.decided & good)
+    weight = (found.certainty / FULL_CERTAINTY).clamp(max=1) * (found.decided & good)
     return torch.where(nearer[..., None], normal, mirrored), weight

@@ -5,15 +5,15 @@ Nothing in the loop compares a step with a constant: boundaries are fractions of
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
 
 from polarguide.gaussians.densify import Densification
+from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization
-from polarguide.shading.deferred import Blend, Shading
-from polarguide.shading.directional import DirectionalShading
-from polarguide.shading.model import ShadingModel
+from polarguide.shading.model import PLAIN, ShadingModel
 
 Action = Literal["reset_opacity", "propagate_normals", "refresh_priors", "orient_normals"]
 Candidates = Literal["paper", "physical"]
@@ -43,8 +43,8 @@ class Weights:
         photometric: final picture against S0/2.
         specular, diffuse: the two contributions against the separated pictures.
         normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
-        azimuth: distance of the normal from the plane of incidence that the AoLP names (azimuth alone).
-        chromatic: 1 - cosine with the normal that color differences tell, where they do.
+        azimuth: distance of the normal from the plane of incidence that the AoLP gives (azimuth alone).
+        chromatic: 1 - cosine with the normal from color differences, where these decide one.
         stokes: S1 and S2 that the layers and the normal predict against the measured ones.
         flatness: shortest scale of the Gaussians, in percent of the scene's extent.
         consistency: alpha - cosine of the blended normal with that of the rendered depth.
@@ -68,7 +68,7 @@ class Weights:
 
     @property
     def normals(self) -> bool:
-        """Whether a term looks at the rendered normals."""
+        """Whether a term reads the rendered normals."""
         return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.consistency))
 
 
@@ -108,7 +108,7 @@ class Priors:
         full_dolp: DoLP from which on a pixel's normal counts fully; below, in proportion.
         azimuth_weight: in [0, 1], how much the choice among candidates trusts azimuth over zenith.
         snr: ratio of the DoLP to its noise above which a pixel's normal is used; 0 switches the test off.
-        chromatic: whether the polarization of color differences names the plane where it is decided.
+        chromatic: whether the polarization of color differences gives the plane where it is decided.
     """
 
     candidates: Candidates = "physical"
@@ -140,22 +140,16 @@ class Propagation:
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that tells one method from another.
+    """All that distinguishes one method from another.
 
     Attributes:
         name: as given to ``--recipe``.
         about: one line.
         stages: in order; their fractions add up to 1.
-        rates: learning rates; that of the means is times the scene's extent.
+        rates: learning rates of what every recipe trains; that of the means is times the scene's extent.
+        shading: how Gaussians and learned light make the picture in stages with reflection.
         means_decay: factor on the means' rate at the last step (exponential in between).
-        blend: how base color and reflection make the picture (see ``Shading``).
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
-        local: whether Gaussians add reflected light of their own (see ``Shading``).
-        directional: the shading model in place of ``Shading``, if given; ``environment_*`` then tell its grid.
-        first_strength: reflection strength that Gaussians start with.
-        environment_spread: first raw texels are uniform in plus or minus this.
-        environment_rate: learning rate of the environment's texels.
-        environment_resolution: texels along a cube face's side.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
     """
@@ -163,16 +157,10 @@ class Recipe:
     name: str
     about: str
     stages: tuple[Stage, ...]
-    rates: dict[str, float]
+    rates: Mapping[str, float]
+    shading: ShadingModel = PLAIN
     means_decay: float = 0.01
-    blend: Blend = "lerp"
-    local: bool = False
     oriented: bool = False
-    directional: DirectionalShading | None = None
-    first_strength: float = 1e-3
-    environment_spread: float = 5.0
-    environment_rate: float = 0.05
-    environment_resolution: int = 128
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
     ssim_weight: float = 0.2
     densification: Densification = field(default_factory=Densification)
@@ -180,17 +168,23 @@ class Recipe:
     priors: Priors = field(default_factory=Priors)
     propagation: Propagation = field(default_factory=Propagation)
 
-    def shading(self, index: float) -> ShadingModel:
-        """The shading of this recipe for surfaces of a refractive index."""
-        return self.directional or Shading(self.blend, index, self.local)
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Every per-Gaussian tensor, with the shape of one Gaussian's values."""
+        own = {name: given.shape for name, given in self.shading.parameters.items()}
+        return {**CORE_SHAPES, **(ORIENTED_SHAPES if self.oriented else {}), **own}
 
     @property
-    def environment_rates(self) -> dict[str, float]:
-        """Learning rates of the environment's parameters by name."""
-        rate = self.environment_rate
-        return self.directional.rates(rate) if self.directional else {"texels": rate}
+    def learning_rates(self) -> dict[str, float]:
+        """Learning rates of the per-Gaussian tensors, the shading model's included."""
+        return {**self.rates, **{name: given.rate for name, given in self.shading.parameters.items()}}
 
     @property
-    def reflects(self) -> bool:
-        """Whether any stage has reflection (then Gaussians carry what its shading needs)."""
-        return any(stage.reflection for stage in self.stages)
+    def light_rates(self) -> dict[str, float]:
+        """Learning rates of the learned light's parameters."""
+        return {name: given.rate for name, given in self.shading.light_parameters.items()}
+
+    def data(self) -> dict[str, Any]:
+        """All values as plain JSON types, for a run's folder."""
+        plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "shading": self.shading.data()}))
+        return plain

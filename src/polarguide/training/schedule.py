@@ -57,6 +57,6 @@ class Schedule:
     def rates(self, step: int) -> dict[str, float]:
         """Learning rates at a step by name; that of the means is before the scene's extent."""
         factors = self.at(step).stage.rate_factors
-        rates = {name: rate * factors.get(name, 1.0) for name, rate in self.recipe.rates.items()}
+        rates = {name: rate * factors.get(name, 1.0) for name, rate in self.recipe.learning_rates.items()}
         rates["means"] *= self.recipe.means_decay ** (step / max(1, self.steps - 1))
         return rates

@@ -11,7 +11,7 @@ from torch import Tensor
 from polarguide.capture import Scene
 from polarguide.color import srgb_decode
 from polarguide.gaussians.densify import DensityStatistics
-from polarguide.gaussians.gaussians import Gaussians
+from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import initial_parameters
 from polarguide.training.recipe import Recipe
@@ -19,7 +19,7 @@ from polarguide.training.settings import TrainSettings
 
 
 class Environment:
-    """The learned surroundings: named parameters with their own Adam state.
+    """The learned light: named parameters with their own Adam state.
 
     Args:
         parameters: by name; a cubemap's raw texels are ``texels``.
@@ -79,9 +79,9 @@ class TrainingState:
     Attributes:
         step: the next step, 0-based.
         gaussians: the Gaussians.
-        environment: learned reflection, None for a recipe without.
+        environment: the learned light, None for a shading model without.
         statistics: of the density control.
-        frozen: copy of the rows from which the present priors were computed; None before the first refresh.
+        frozen: copy of the Gaussians from which the present priors were computed; None before the first refresh.
         opacity_frozen_until: first step at which opacities train again (after a normal propagation).
         opacity_was_reset: whether opacities have been reset yet (then huge Gaussians are pruned).
     """
@@ -93,6 +93,11 @@ class TrainingState:
     frozen: dict[str, Tensor] | None = None
     opacity_frozen_until: int = 0
     opacity_was_reset: bool = False
+
+    @property
+    def light(self) -> dict[str, Tensor]:
+        """The learned light's parameters by name; empty for a shading model without."""
+        return self.environment.parameters if self.environment else {}
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for a checkpoint."""
@@ -109,18 +114,37 @@ class TrainingState:
         return out
 
     @classmethod
-    def from_tensors(
-        cls, tensors: Mapping[str, Tensor], rates: Mapping[str, float], environment_rates: Mapping[str, float]
-    ) -> TrainingState:
-        """The inverse of ``tensors``."""
-        gaussians = Gaussians.from_state(tensors, rates)
-        environment = None
-        if "environment.texels" in tensors:
-            environment = Environment.from_state(tensors, environment_rates)
+    def from_tensors(cls, tensors: Mapping[str, Tensor], recipe: Recipe) -> TrainingState:
+        """The inverse of ``tensors``.
+
+        Raises:
+            KeyError, ValueError: tensors that no training of the recipe leaves.
+        """
+        refuse_foreign(tensors, recipe)
+        gaussians = Gaussians.from_state(tensors, recipe.learning_rates)
+        rates = recipe.light_rates
+        environment = Environment.from_state(tensors, rates) if rates else None
         statistics = DensityStatistics.of(tensors["statistics.gradient"], tensors["statistics.seen"])
         frozen = {key[7:]: value for key, value in tensors.items() if key.startswith("frozen.")}
         step, frozen_until, was_reset = (int(x) for x in tensors["scalars"])
         return cls(step, gaussians, environment, statistics, frozen or None, frozen_until, bool(was_reset))
+
+
+def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
+    """Raise ValueError unless a checkpoint's Gaussians and light are what the recipe trains, finite floats."""
+    count = tensors["gaussians.means"].shape[0]
+    shapes = {f"gaussians.{name}": (count, *shape) for name, shape in recipe.shapes.items()}
+    for name, given in recipe.shading.light_parameters.items():
+        shapes[f"environment.{name}"] = given.shape
+    for name, shape in shapes.items():
+        values = tensors.get(name)
+        if values is None:
+            raise ValueError(f"no {name}")
+        if values.dtype != torch.float32 or tuple(values.shape) != shape:
+            found = f"{list(values.shape)}, {values.dtype}"
+            raise ValueError(f"{name} of shape {found}, not {list(shape)}, torch.float32")
+        if not bool(torch.isfinite(values).all()):
+            raise ValueError(f"{name} with values that are not finite")
 
 
 def seeded(*numbers: int) -> torch.Generator:
@@ -139,27 +163,12 @@ def first_state(
     centers = torch.stack([view.camera.center for view in scene.train_views])
     tensors = initial_parameters(scene.points, colors, centers, recipe.initialization, seed=settings.seed)
     count = tensors["means"].shape[0]
-    environment = None
     if recipe.oriented:
-        tensors["outward"] = torch.zeros(count, 3)
-    if recipe.directional is not None:
-        generator = seeded(settings.seed, 5)
-        tensors.update(recipe.directional.first_parameters(tensors["sh_dc"] * SH_C0 + 0.5, generator))
-        light = recipe.directional.first_light_values(
-            recipe.environment_resolution, recipe.environment_spread, generator
-        )
-        light = {name: t.to(device) for name, t in light.items()}
-        environment = Environment(light, recipe.environment_rates)
-    elif recipe.reflects:
-        logit = torch.logit(torch.tensor(recipe.first_strength))
-        tensors["strength_logits"] = logit.expand(count).clone()
-        if recipe.local:
-            tensors["local_dc"] = torch.zeros(count, 3)
-            tensors["local_rest"] = torch.zeros(count, 15, 3)
-        size = (6, recipe.environment_resolution, recipe.environment_resolution, 3)
-        uniform = torch.rand(size, generator=seeded(settings.seed, 1)) * 2 - 1
-        texels = (uniform * recipe.environment_spread).to(device)
-        environment = Environment({"texels": texels}, recipe.environment_rates)
-    gaussians = Gaussians({name: t.to(device) for name, t in tensors.items()}, recipe.rates)
+        tensors |= {name: torch.zeros(count, *shape) for name, shape in ORIENTED_SHAPES.items()}
+    generator = seeded(settings.seed, recipe.shading.stream)
+    tensors |= recipe.shading.initial_parameters(tensors["sh_dc"] * SH_C0 + 0.5, generator)
+    light = {name: t.to(device) for name, t in recipe.shading.initial_light(generator).items()}
+    environment = Environment(light, recipe.light_rates) if light else None
+    gaussians = Gaussians({name: t.to(device) for name, t in tensors.items()}, recipe.learning_rates)
     statistics = DensityStatistics(count, settings.views_per_step, gaussians["means"].device)
     return TrainingState(0, gaussians, environment, statistics)

@@ -19,7 +19,8 @@ from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
 from polarguide.gaussians.initialize import scene_extent
 from polarguide.raster import Backend, ScreenStatistic
-from polarguide.shading.deferred import COLOR_CHANNELS, render
+from polarguide.shading.gbuffer import COLOR_CHANNELS, render
+from polarguide.shading.model import PLAIN
 from polarguide.shading.visibility import outward_directions
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
@@ -50,6 +51,10 @@ class Trainer:
         backend: device and rasterizer.
         state: where to go on from, on the backend's device; None: from the beginning.
         ranks: the processes that share the views of each step.
+
+    Attributes:
+        shading: the recipe's, for the run's refractive index.
+        whole: whether the state is one between two steps; an exception may leave it in the middle of a change.
     """
 
     def __init__(
@@ -63,7 +68,9 @@ class Trainer:
     ) -> None:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
         self.ranks, self._device = ranks, backend.device
+        self.whole = True
         self.schedule = Schedule(recipe, settings.steps)
+        self.shading = recipe.shading.bind(settings.refractive_index)
         self.state = state or first_state(scene, recipe, settings, backend.device)
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
@@ -86,15 +93,17 @@ class Trainer:
         """One optimizer step."""
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
+        self.whole = not position.actions
         for action in position.actions:
             self._act(action)
         mine = self.ranks.slots(views)
-        # A rank without a view looks at the first one, so that it knows what has gradients, and adds nothing.
-        measured = [self._look(slot, position.stage, bool(mine)) for slot in mine or range(1)]
+        # A rank without a view renders the first one, so that it knows what has gradients, and adds nothing.
+        measured = [self._backpropagate(slot, position.stage, bool(mine)) for slot in mine or range(1)]
+        self.whole = False
         self._join_gradients(idle=not mine)
         self._optimize()
-        told = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
-        report = StepReport(state.step, position.stage.name, len(state.gaussians), told)
+        mean = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
+        report = StepReport(state.step, position.stage.name, len(state.gaussians), mean)
         state.step += 1
         if position.stage.densify and state.step % recipe.densification.every == 0:
             self.exchange_statistics()
@@ -109,6 +118,7 @@ class Trainer:
                 limit=self._limit,
                 generator=seeded(self.settings.seed, 2, state.step),
             )
+        self.whole = True
         return report
 
     def exchange_statistics(self) -> None:
@@ -116,18 +126,19 @@ class Trainer:
         for sums in (self.state.statistics.gradient, self.state.statistics.seen):
             self.ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])
 
-    def _look(self, slot: int, stage: Stage, counts: bool) -> Tensor:
+    def _backpropagate(self, slot: int, stage: Stage, counts: bool) -> Tensor:
         """Render the view of a slot and add its gradients; [3] as of ``StepReport.measured``."""
         state, recipe = self.state, self.recipe
         view = self._view_of(state.step * self.settings.views_per_step + slot)
+        shading = self.shading if stage.reflection else PLAIN
         statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
         result = render(
             state.gaussians,
             view.camera,
             self.backend.rasterize,
             sh_degree=self.schedule.sh_degree(state.step),
-            environment=state.environment.parameters if state.environment and stage.reflection else None,
-            shading=recipe.shading(self.settings.refractive_index),
+            shading=shading,
+            light=state.light,
             normals=stage.weights.normals,
             depth=stage.weights.consistency > 0,
             statistic=statistic,
@@ -140,15 +151,16 @@ class Trainer:
             stage.weights,
             self._priors_of(view, stage),
             ssim_weight=recipe.ssim_weight,
-            index=self.settings.refractive_index,
+            shading=shading,
             log_scales=state.gaussians["log_scales"],
             extent=self._extent,
             camera=view.camera,
         )
         loss.backward()
-        if counts and statistic is not None and statistic.gradient is not None:
-            size = view.camera.width, view.camera.height
-            state.statistics.add(statistic.gradient, result.radii, *size, slot)
+        gradient = statistic.gradient if statistic else None
+        if counts and gradient is not None and result.radii is not None:
+            self.whole = False
+            state.statistics.add(gradient, result.radii, view.camera.width, view.camera.height, slot)
         return torch.stack((photometric.detach(), _psnr(result.final, shown.picture), loss.detach()))
 
     def _join_gradients(self, *, idle: bool) -> None:
@@ -156,8 +168,8 @@ class Trainer:
         views = self.settings.views_per_step
         if views == 1 and self.ranks.world == 1:
             return
-        light = self.state.environment.parameters.values() if self.state.environment else ()
-        gradients = [t.grad for t in (*self.state.gaussians.trained(), *light) if t.grad is not None]
+        trained = (*self.state.gaussians.trained(), *self.state.light.values())
+        gradients = [t.grad for t in trained if t.grad is not None]
         if idle:
             torch._foreach_zero_(gradients)
         self.ranks.all_reduce(gradients)
@@ -172,7 +184,7 @@ class Trainer:
         betas = (0.9**views, 0.999**views)
         self.state.gaussians.set_betas(betas)
         if self.state.environment is not None:
-            rates = {name: rate * self._rate for name, rate in self.recipe.environment_rates.items()}
+            rates = {name: rate * self._rate for name, rate in self.recipe.light_rates.items()}
             self.state.environment.retune(rates, betas)
 
     def _optimize(self) -> None:
@@ -189,11 +201,11 @@ class Trainer:
 
     def _act(self, action: Action) -> None:
         if action == "reset_opacity":
-            reset_opacity(self.state)
+            reset_opacity(self.state, self.shading)
         elif action == "propagate_normals":
             generator = seeded(self.settings.seed, 3, self.state.step)
             rest = min(OPACITY_REST, self.settings.steps // 50)
-            propagate_normals(self.state, self.recipe.propagation, generator, rest)
+            propagate_normals(self.state, self.shading, self.recipe.propagation, generator, rest)
         elif action == "orient_normals":
             gaussians, rasterize = self.state.gaussians, self.backend.rasterize
             outward = outward_directions(gaussians, self.scene.train_views, rasterize)
@@ -204,7 +216,7 @@ class Trainer:
             self._priors.clear()
 
     def _view_of(self, place: int) -> View:
-        """The view at a place in the sequence of all views ever looked at.
+        """The view at a place in the sequence of all views ever trained on.
 
         Every epoch visits every training view once, in an order of its own.
         """

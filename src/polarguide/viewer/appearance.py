@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,12 +9,9 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import View
-from polarguide.export.environment import RELIT_RESOLUTION, turned_cubemap
 from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
 from polarguide.optics import aolp, dolp, luminance, stokes
 from polarguide.scene_frame import SceneFrame
-from polarguide.shading.deferred import Shading
-from polarguide.shading.model import Parameters
 from polarguide.shading.result import RenderResult
 from polarguide.viewer.shown import Shown
 from polarguide.viewer.viewport import letterbox
@@ -120,23 +116,15 @@ class Painter:
         return self._layer(self._result(shown, camera, appearance), camera, appearance, settled=settled)
 
     def _result(self, shown: Shown, camera: Camera, appearance: Appearance) -> RenderResult:
-        gaussians: Parameters = shown.gaussians
-        if appearance.crop is not None:
-            kept = appearance.crop.inside(shown.gaussians["means"].detach(), self.around)
-            gaussians = {name: shown.gaussians[name].detach()[kept] for name in shown.gaussians.names}
-        light = self._light(shown, appearance.turn)
-        result = shown.render(camera, gaussians, light, depth=appearance.layer == "depth")
+        crop, turn = appearance.crop, None
+        kept = None if crop is None else lambda means: crop.inside(means, self.around)
+        if appearance.turn % 360:
+            turn = self.around.turn(appearance.turn)
+        result = shown.render(camera, depth=appearance.layer == "depth", kept=kept, turn=turn)
         if result.specular is None or result.diffuse is None or appearance.strength == 1.0:
             return result
         specular = appearance.strength * result.specular
         return replace(result, specular=specular, final=result.diffuse + specular)
-
-    def _light(self, shown: Shown, degrees: float) -> Mapping[str, Tensor] | None:
-        light = shown.environment
-        if light is None or degrees % 360 == 0 or not isinstance(shown.shading, Shading):
-            return light
-        turned = turned_cubemap(light["texels"].detach(), self.around.turn(degrees), RELIT_RESOLUTION)
-        return {**light, "texels": turned}
 
     def _layer(
         self, result: RenderResult, camera: Camera, appearance: Appearance, *, settled: bool

@@ -17,12 +17,12 @@ class PanelOptions:
     """The controls that a panel has.
 
     Attributes:
-        lit: whether the recipe learns an environment light. turns: whether the environment can be rotated.
+        layers: of the shading model. turns: whether the environment can be rotated.
         views: names of the photographs.
         trains: whether a training runs, which can be paused.
     """
 
-    lit: bool
+    layers: Sequence[str]
     turns: bool
     views: Sequence[str]
     trains: bool
@@ -44,12 +44,12 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._status = gui.add_markdown("")
         self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
-        layers = [n for n in LAYERS if options.lit or n in ("final", "normal", "depth", "alpha")]
+        layers = [name for name in LAYERS if name in options.layers]
         self.layer = gui.add_dropdown(
             "Layer", (*layers, *MEASURED), hint="The last four need a photograph's pose"
         )
         self.exposure = gui.add_slider("Exposure", -4.0, 4.0, 0.1, 0.0, hint="In stops")
-        self.strength = gui.add_slider("Reflection", 0.0, 2.0, 0.05, 1.0, visible=options.lit)
+        self.strength = gui.add_slider("Reflection", 0.0, 2.0, 0.05, 1.0, visible="specular" in layers)
         hint = "Rotates the environment light, in degrees; the scene stays"
         self.turn = gui.add_slider("Environment", -180, 180, 1, 0, hint=hint, visible=options.turns)
         with gui.add_folder("Photographs"):

@@ -12,14 +12,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
+from polarguide.options import LOOPBACK
 from polarguide.scene_frame import scene_frame
-from polarguide.shading.deferred import Shading
+from polarguide.shading.model import ShadingModel
 from polarguide.viewer.frusta import Photograph
 from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.session import Session
 from polarguide.viewer.shown import Shown
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 REFRESH = 1.0  # least seconds between two pictures of a training,
 SHARE = 10.0  # which are also at least this multiple of the time that the last one took
 TICK = 0.02
@@ -39,7 +39,7 @@ class Viewer:
     Args:
         current: returns the scene as it is now.
         photographs: of the scene by name, at least one; sessions start at the first one.
-        lit: whether the recipe learns an environment light. trains: whether the panel can pause a training.
+        shading: model of the recipe. trains: whether the panel can pause a training.
         host, port: address to listen at; another port is used if this one is taken.
         title: plain text.
 
@@ -52,7 +52,7 @@ class Viewer:
         current: Callable[[], Shown],
         photographs: Mapping[str, Photograph],
         *,
-        lit: bool,
+        shading: ShadingModel,
         trains: bool = False,
         host: str = LOOPBACK[0],
         port: int = 8080,
@@ -63,8 +63,8 @@ class Viewer:
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self._current, self._photographs = current, photographs
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
-        turns = lit and isinstance(current().shading, Shading)
-        self._options = PanelOptions(lit, turns, tuple(photographs), trains)
+        turns = shading.radiance_cubemap is not None
+        self._options = PanelOptions(shading.layers, turns, tuple(photographs), trains)
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._wake = threading.Event()

@@ -1,8 +1,8 @@
-"""What a viewer shows: Gaussians and their light as they are at one moment."""
+"""What a viewer shows: a scene as it is at one moment, of which it asks for layers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -11,9 +11,10 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.raster.interface import Rasterize
-from polarguide.runs.opened import TrainedRun
-from polarguide.shading.deferred import render
-from polarguide.shading.model import Parameters, ShadingModel
+from polarguide.rendering.relight import RELIT_RESOLUTION, turned_cubemap
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.gbuffer import render
+from polarguide.shading.model import PLAIN, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.trainer import Trainer
 
@@ -23,13 +24,13 @@ class Shown:
     """A scene to be rendered.
 
     Attributes:
-        gaussians: the Gaussians. environment: parameters of the learned light; None: no reflection (yet).
-        shading: of the recipe. rasterize: of the backend. sh_degree: of the base color.
+        gaussians: the Gaussians. light: learned, by name.
+        shading: as it is now. rasterize: of the backend. sh_degree: of the base color.
         status: a line about it.
     """
 
     gaussians: Gaussians
-    environment: Mapping[str, Tensor] | None
+    light: Mapping[str, Tensor]
     shading: ShadingModel
     rasterize: Rasterize
     sh_degree: int
@@ -37,38 +38,59 @@ class Shown:
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, gaussians: Parameters, environment: Mapping[str, Tensor] | None, *, depth: bool
+        self,
+        camera: Camera,
+        *,
+        depth: bool,
+        kept: Callable[[Tensor], Tensor] | None = None,
+        turn: Tensor | None = None,
     ) -> RenderResult:
-        """All layers, on the CPU, of some of its rows in some light."""
+        """All layers, on the CPU.
+
+        Args:
+            camera: with the size of the picture. depth: whether depth is one of them.
+            kept: which places [N, 3] of the scene are shown, [N] bool; None: all.
+            turn: rotation [3, 3] of the light from afar, where it is radiance; None: as learned.
+        """
+        gaussians: Parameters = self.gaussians
+        if kept is not None:
+            inside = kept(self.gaussians["means"].detach())
+            gaussians = {name: self.gaussians[name].detach()[inside] for name in self.gaussians.names}
         return render(
             gaussians,
             camera,
             self.rasterize,
             sh_degree=self.sh_degree,
-            environment=environment,
             shading=self.shading,
+            light=self.light if turn is None else self._turned(turn),
             depth=depth,
         ).to("cpu")
 
+    def _turned(self, turn: Tensor) -> Mapping[str, Tensor]:
+        cubemap = self.shading.radiance_cubemap
+        if cubemap is None:
+            return self.light
+        turned = turned_cubemap(self.light[cubemap.name].detach(), turn, RELIT_RESOLUTION)
+        return {**self.light, cubemap.name: turned}
 
-def shown_run(run: TrainedRun) -> Shown:
+
+def shown_run(run: OpenedRun) -> Shown:
     """A trained run."""
-    gaussians = run.state.gaussians
-    status = f"{run.recipe.name}, {run.state.step:,} steps; {len(gaussians):,} Gaussians"
-    return Shown(gaussians, run.environment, run.shading, run.backend.rasterize, 3, status)
+    model = run.model
+    status = f"{run.recipe.name}, {run.steps:,} steps; {len(model):,} Gaussians"
+    return Shown(model.state.gaussians, model.light, model.shading, model.backend.rasterize, 3, status)
 
 
 def shown_training(trainer: Trainer) -> Shown:
-    """A training as it is between two steps; in stages without reflection it has no light."""
+    """A training as it is between two steps, shaded as in its present stage."""
     state, steps = trainer.state, trainer.settings.steps
     stage = trainer.schedule.at(min(state.step, steps - 1)).stage
-    light = state.environment.parameters if state.environment and stage.reflection else None
     progress = f"step {state.step:,} of {steps:,} ({stage.name})"
     status = f"{trainer.recipe.name}, {progress}; {len(state.gaussians):,} Gaussians"
     return Shown(
         state.gaussians,
-        light,
-        trainer.recipe.shading(trainer.settings.refractive_index),
+        state.light,
+        trainer.shading if stage.reflection else PLAIN,
         trainer.backend.rasterize,
         trainer.schedule.sh_degree(min(state.step, steps - 1)),
         status,

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.camera import quaternion
+
 MODELS = {
     "SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4), "SIMPLE_RADIAL": (2, 4), "RADIAL": (3, 5), "OPENCV": (4, 8),
     "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12), "FOV": (7, 5), "SIMPLE_RADIAL_FISHEYE": (8, 4),
@@ -69,7 +71,7 @@ def write_cameras(
         if numbers is not None:
             number, of_camera = numbers[view]
         used[of_camera] = camera.intrinsics
-        pose = (*_quaternion(camera.rotation), *camera.translation)
+        pose = (*quaternion(camera.rotation), *camera.translation)
         name = f"{view}.png".encode() + b"\0"
         images.append(struct.pack("<I7dI", number, *pose, of_camera) + name + struct.pack("<Q", 0))
     intrinsics = []
@@ -79,21 +81,3 @@ def write_cameras(
     (folder / "cameras.bin").write_bytes(struct.pack("<Q", len(intrinsics)) + b"".join(intrinsics))
     (folder / "images.bin").write_bytes(struct.pack("<Q", len(images)) + b"".join(images))
     (folder / "points3D.bin").write_bytes(struct.pack("<Q", 0))
-
-
-def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """(w, x, y, z) of a rotation matrix, w not negative, by its largest component."""
-    m = rotation
-    trace = float(np.trace(m))
-    squares = 1.0 - trace + 2.0 * np.array([trace, m[0, 0], m[1, 1], m[2, 2]])
-    largest = int(squares.argmax())
-    sums = {
-        (0, 1): m[2, 1] - m[1, 2], (0, 2): m[0, 2] - m[2, 0], (0, 3): m[1, 0] - m[0, 1],
-        (1, 2): m[0, 1] + m[1, 0], (1, 3): m[0, 2] + m[2, 0], (2, 3): m[1, 2] + m[2, 1],
-    }  # fmt: skip
-    out = np.array([
-        squares[largest] if i == largest else sums[min(i, largest), max(i, largest)] for i in range(4)
-    ])  # fmt: skip
-    out = out / np.linalg.norm(out)
-    w, x, y, z = (out if out[0] >= 0 else -out).tolist()
-    return w, x, y, z

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.calibration import Sense
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.formats.pictures import decode_stored, read_file
 from polarguide.capture.view import listed
@@ -52,7 +53,7 @@ class Dataset:
     cameras: Mapping[str, PosedCamera]
     read_stokes: Callable[[str], StokesImage] | None
     mask: Callable[[str], NDArray[np.bool_] | None]
-    sense: str = "ccw"
+    sense: Sense = "ccw"
     mosaics: Path | None = None
     gamma: float = 1.0
     notes: tuple[str, ...] = field(default=())

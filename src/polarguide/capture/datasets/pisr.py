@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
 from polarguide.capture.layout import index_files
 from polarguide.errors import PolarguideError
 
-SENSOR = "IMX250MYR"
+SENSOR: Final = "IMX250MYR"
 SIZE = (1224, 1024)
 """Size that ``camera_matrix`` was made for."""
 _CAMERAS = ("cameras_sphere.npz", "cameras.npz")

@@ -1,0 +1,90 @@
+"""What bringing the four angles of a cell to one place is worth: half-size pictures against the truth.
+
+The pictures of a capture are taken for what a sensor of their size would have seen everywhere at every angle. They
+are mosaicked with shot noise, developed at half size, and compared with the means over the cells. Errors are means
+over views: of the DoLP where S0 exceeds 0.1, of the AoLP in degrees where the true DoLP exceeds 0.1, too.
+
+    python benchmarks/accuracy/half_size.py CAPTURE [--every 12]
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from simulated_mosaics import linear_intensities
+
+from polarguide.capture.layout import find_layout
+from polarguide.capture.sensor import Pattern, demosaic, sensor_pattern
+from polarguide.capture.view import ANGLES
+
+ELECTRONS = 10_000
+BORDER = 4
+
+
+def seen(intensities: NDArray[np.float64], pattern: Pattern, rng: np.random.Generator) -> NDArray[np.float32]:
+    """One sample a pixel of [4, H, W, 3], with shot noise."""
+    out = np.empty(intensities.shape[1:3])
+    period = pattern.period
+    for row, column in np.ndindex(period, period):
+        channel = 1 if pattern.colors is None else int(pattern.colors[row, column])
+        angle = ANGLES.index(int(pattern.angles[row, column]))
+        out[row::period, column::period] = intensities[angle, row::period, column::period, channel]
+    return (rng.poisson(out * ELECTRONS) / ELECTRONS).astype(np.float32)
+
+
+def errors(found: NDArray[np.floating], true: NDArray[np.floating]) -> tuple[float, float, float]:
+    """DoLP, AoLP in degrees, and PSNR of S0 in dB."""
+    inside = np.s_[:, BORDER:-BORDER, BORDER:-BORDER]
+    (i0, i45, i90, i135), (t0, t45, t90, t135) = (side[inside].mean(axis=3) for side in (found, true))
+    s0, ground_truth = (i0 + i45 + i90 + i135) / 2, (t0 + t45 + t90 + t135) / 2
+    lit = ground_truth > 0.1
+    dolp, true_dolp = (
+        np.hypot(a, b) / np.maximum(s, 1e-4)
+        for a, b, s in ((i0 - i90, i45 - i135, s0), (t0 - t90, t45 - t135, ground_truth))
+    )
+    turn = (np.arctan2(i45 - i135, i0 - i90) - np.arctan2(t45 - t135, t0 - t90)) / 2
+    off = np.degrees(np.arcsin(np.abs(np.sin(turn))))
+    return (
+        float(np.abs(dolp - true_dolp)[lit].mean()),
+        float(off[lit & (true_dolp > 0.1)].mean()),
+        float(-10 * np.log10(np.mean((s0 - ground_truth)[lit] ** 2))),
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--every", type=int, default=12, help="take every n-th view")
+    options = parser.parse_args()
+    layout = find_layout(options.capture)
+    rng = np.random.default_rng(0)
+    found: dict[tuple[str, str, bool], list[tuple[float, float, float]]] = {}
+    for view in layout.names[:: options.every]:
+        light = linear_intensities(layout, view, "linear")
+        _, height, width, _ = light.shape
+        true = light.reshape(4, height // 2, 2, width // 2, 2, 3).mean(axis=(2, 4))
+        for sensor in ("IMX250MYR", "IMX250MZR"):
+            pattern = sensor_pattern(sensor)
+            values = seen(light, pattern, rng)
+            target = true if pattern.colors is not None else np.repeat(true[..., 1:2], 3, axis=3)
+            for interpolation in ("bilinear", "guided"):
+                for registered in (False, True):
+                    picture = demosaic(
+                        values, np.zeros(values.shape, bool), pattern,
+                        mode="half", interpolation=interpolation, registered=registered,
+                    )  # fmt: skip
+                    key = (sensor, interpolation, registered)
+                    found.setdefault(key, []).append(errors(picture.intensities, target))
+    for (sensor, interpolation, registered), rows in found.items():
+        dolp, aolp, psnr = np.mean(rows, axis=0)
+        kind = "registered" if registered else "as they lie"
+        print(f"{sensor} {interpolation:8} {kind:11} DoLP {dolp:.3f}  AoLP {aolp:4.1f}  S0 {psnr:.1f} dB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""How far an exported mesh lies from the true surface: its depth on test views against the ground truth.
+
+    python benchmarks/accuracy/mesh_depth.py RUN MESH.ply
+
+Needs trimesh with a ray engine (``pip install embreex``). Errors are in percent of the scene's extent, 1.1 times the
+largest distance of a camera from the cameras' mean; "rendered" is the depth of the Gaussians themselves, alpha blended.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+
+from polarguide.api import open_run
+from polarguide.gaussians.initialize import scene_extent
+from polarguide.visualization import figures
+
+
+def mesh_depth(mesh: trimesh.Trimesh, camera, step: int) -> np.ndarray:
+    """Camera depth where the rays of every ``step``-th pixel first meet the mesh, NaN where they do not."""
+    rays = camera.rays(dtype=torch.float64)[::step, ::step]
+    ways = camera.to_world(rays).reshape(-1, 3).numpy()
+    start = np.broadcast_to(camera.center.numpy(), ways.shape)
+    found, which, _ = mesh.ray.intersects_location(start, ways, multiple_hits=False)
+    depth = np.full(len(ways), np.nan)
+    depth[which] = (found - start[which]) @ camera.rotation[2].numpy()
+    return depth.reshape(rays.shape[:2])
+
+
+def pictures(mesh: trimesh.Trimesh, camera) -> np.ndarray:
+    """The mesh from a camera, colors and normals side by side, uint8 RGB."""
+    ways = camera.to_world(camera.rays(dtype=torch.float64)).reshape(-1, 3).numpy()
+    start = np.broadcast_to(camera.center.numpy(), ways.shape)
+    places, which, faces = mesh.ray.intersects_location(start, ways, multiple_hits=False)
+    shares = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], places)[..., None]
+    colors, normals = np.zeros((len(ways), 3)), np.zeros((len(ways), 3))
+    colors[which] = (mesh.visual.vertex_colors[mesh.faces[faces], :3] * shares).sum(axis=1)
+    normals[which] = (mesh.vertex_normals[mesh.faces[faces]] * shares).sum(axis=1)
+    shape = (camera.height, camera.width, 3)
+    shown = figures.normal_to_rgb(torch.from_numpy(normals.reshape(shape)), camera)
+    return np.concatenate((colors.reshape(shape).round().astype(np.uint8), shown), axis=1)
+
+
+def main() -> None:
+    """Print the median errors of each test view and of all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("mesh", type=Path)
+    parser.add_argument("--step", type=int, default=2)
+    parser.add_argument("--picture", type=Path, help="JPEG or PNG to write of the first test view")
+    arguments = parser.parse_args()
+    opened = open_run(arguments.run)
+    extent = scene_extent(torch.stack([camera.center for camera in opened.cameras.values()]))
+    mesh = trimesh.load(arguments.mesh, process=False)
+    if arguments.picture:
+        shown = pictures(mesh, opened.scene.test_views[0].camera)
+        cv2.imwrite(str(arguments.picture), cv2.resize(shown, None, fx=2, fy=2)[..., ::-1])
+    errors: dict[str, list[np.ndarray]] = {"mesh": [], "rendered": []}
+    missing = []
+    for view in opened.scene.test_views:
+        assert view.ground_truth is not None
+        true = view.ground_truth.depth[:: arguments.step, :: arguments.step].numpy()
+        known = view.ground_truth.mask[:: arguments.step, :: arguments.step].numpy() & (true > 0)
+        rendered = opened.render(view.camera, layers=["depth"])["depth"].cpu()
+        rendered = rendered[:: arguments.step, :: arguments.step].numpy()
+        ours = mesh_depth(mesh, view.camera, arguments.step)
+        for name, depth in (("mesh", ours), ("rendered", rendered)):
+            hit = known & np.isfinite(depth)
+            errors[name].append(np.abs(depth - true)[hit] * 100 / extent)
+        missing.append(float((known & np.isnan(ours)).sum() / known.sum()))
+        medians = ", ".join(f"{name} {np.median(values[-1]):.3f} %" for name, values in errors.items())
+        print(f"{view.name}: median {medians}; no mesh in {100 * missing[-1]:.1f} % of the foreground")
+    for name, values in errors.items():
+        joined = np.concatenate(values)
+        print(
+            f"all, {name}: median {np.median(joined):.3f} %, 90th percentile {np.quantile(joined, 0.9):.3f} %"
+        )
+
+
+if __name__ == "__main__":
+    main()

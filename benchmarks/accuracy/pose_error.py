@@ -1,0 +1,65 @@
+"""How far the poses of one scene are from those of another that shows the same views.
+
+The two models are brought together by the similarity that fits the camera centers best in the least-squares sense
+(Umeyama 1991). Positions are relative to the diagonal of the reference's camera path, so that no unit is needed.
+
+    python benchmarks/accuracy/pose_error.py SCENE REFERENCE
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.colmap.model import read_model
+
+Array = NDArray[np.float64]
+
+
+def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
+    """Scale, rotation and translation that carry points [N, 3] to others best."""
+    a, b = source - source.mean(0), target - target.mean(0)
+    u, spread, vt = np.linalg.svd(b.T @ a / len(a))
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ mirror @ vt
+    scale = float((spread * np.diag(mirror)).sum() / a.var(0).sum())
+    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("reference", type=Path)
+    options = parser.parse_args()
+    found, true = read_model(options.scene), read_model(options.reference)
+    names = sorted(set(found.names) & set(true.names))
+    pairs = [(found.camera(name), true.camera(name)) for name in names]
+    ours, theirs = (np.stack([c.center.numpy() for c in side]) for side in zip(*pairs, strict=True))
+    scale, rotation, offset = similarity(ours, theirs)
+    distance = np.linalg.norm(ours @ (scale * rotation).T + offset - theirs, axis=1)
+    path = float(np.linalg.norm(theirs.max(0) - theirs.min(0)))
+    turns = []
+    for a, b in pairs:
+        between = a.rotation.numpy() @ rotation.T @ b.rotation.numpy().T
+        turns.append(np.degrees(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1))))
+    focal = np.array([a.fx / a.width / (b.fx / b.width) - 1 for a, b in pairs])
+    print(f"{len(names)} of {len(true.names)} views of the reference")
+    for label, values, unit in (
+        ("position / camera path", 100 * distance / path, "%"),
+        ("rotation", np.array(turns), "degrees"),
+        ("focal length", 100 * focal, "%"),
+    ):
+        worst = int(np.abs(values).argmax())
+        print(
+            f"{label}: median {np.median(values):+.3f}, mean {values.mean():+.3f}, "
+            f"worst {values[worst]:+.3f} {unit} ({names[worst]})"
+        )
+
+
+if __name__ == "__main__":
+    main()

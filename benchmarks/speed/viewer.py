@@ -1,0 +1,75 @@
+"""Pictures a second of the viewer while the camera moves: drawn, encoded, and sent to a browser that does nothing.
+
+``python benchmarks/speed/viewer.py RUN [--gaussians 50000] [--size 480x360]``; run it alone. The camera goes along an
+orbit, one pose a picture; the size is held. The Gaussians are a random choice of the run's (or all of them, some
+twice).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch is imported
+
+import cv2
+import torch
+
+from polarguide.api import open_run
+from polarguide.gaussians.gaussians import Gaussians
+from polarguide.scene_frame import scene_frame
+from polarguide.shading.result import LAYERS
+from polarguide.trajectory import orbit
+from polarguide.viewer import shown_run
+from polarguide.viewer.appearance import Appearance, Painter
+from polarguide.viewer.session import JPEG_QUALITY
+from polarguide.viewer.viewport import fit
+
+SKIPPED = 3
+
+
+def main() -> None:
+    """Measure and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--gaussians", type=int, default=50_000)
+    parser.add_argument("--size", default="480x360")
+    parser.add_argument("--pictures", type=int, default=40)
+    arguments = parser.parse_args()
+    width, height = (int(side) for side in arguments.size.split("x"))
+    opened = open_run(arguments.run)
+    shown = shown_run(opened)
+    generator = torch.Generator().manual_seed(0)
+    chosen = torch.randint(len(shown.gaussians), (arguments.gaussians,), generator=generator)
+    if arguments.gaussians <= len(shown.gaussians):
+        chosen = torch.randperm(len(shown.gaussians), generator=generator)[: arguments.gaussians]
+    rows = {name: shown.gaussians[name].detach()[chosen] for name in shown.gaussians.names}
+    shown = replace(shown, gaussians=Gaussians(rows, opened.recipe.rates))
+    cameras = list(opened.cameras.values())
+    path = [fit(c, (width, height)).camera(c) for c in orbit(cameras, arguments.pictures + SKIPPED)]
+    print(
+        f"{shown.status}; {len(shown.gaussians):,} of them, {width} x {height}, {torch.get_num_threads()} threads"
+    )
+    print("layer        ms (10 % to 90 %)   pictures a second")
+    for layer in LAYERS:
+        painter, seconds = Painter(scene_frame(cameras)), []
+        for camera in path:
+            began = time.perf_counter()
+            picture = painter.paint(shown, camera, Appearance(layer=layer), settled=False)
+            if picture is None:
+                break
+            cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            seconds.append(time.perf_counter() - began)
+        if seconds:
+            tenths = [1000 * t for t in statistics.quantiles(seconds[SKIPPED:], n=10)]
+            middle = statistics.median(seconds[SKIPPED:])
+            span = f"({tenths[0]:.0f} to {tenths[-1]:.0f})"
+            print(f"{layer:12s} {1000 * middle:4.0f} {span:14s} {1 / middle:8.1f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,229 @@
+"""Pages that are made from the program itself, so that they cannot go stale.
+
+reference/api/*.md           a page for each room of the package, with all its public modules
+generated/command-line.md    every verb and option, as the program's own help states them
+generated/rooms.md           the order of the rooms, as tests/test_imports.py enforces it
+generated/python.md          the names of ``import polarguide``
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import os
+import pkgutil
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+PACKAGE = "polarguide"
+# Rooms without an interface for Python: the command line has a page of its own.
+NOT_LIBRARY = ("_native", "api", "cli", "__main__")
+
+
+def rooms(docs: Path) -> tuple[str, ...]:
+    """The rooms of the package from the top down: the tuple ROOMS of tests/test_imports.py."""
+    tree = ast.parse((docs.parent / "tests" / "test_imports.py").read_text(encoding="utf-8"))
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "ROOMS":
+            return tuple(ast.literal_eval(node.value))
+    raise ValueError("tests/test_imports.py: expected the tuple ROOMS, found none")
+
+
+def source_of(name: str) -> Path:
+    """The file of a module of the package, found without importing it."""
+    package = find_spec(PACKAGE)
+    assert package is not None
+    assert package.submodule_search_locations
+    path = Path(package.submodule_search_locations[0]).joinpath(*name.split(".")[1:])
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def exists(name: str) -> bool:
+    """Whether there is such a module or package."""
+    path = source_of(name)
+    return path.exists() or path.name == "__init__.py"
+
+
+def summary(name: str) -> str:
+    """First sentence of a module's docstring, without a full stop; empty where it has none."""
+    path = source_of(name)
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) if path.exists() else None
+    return " ".join((text or "").split("\n\n")[0].split()).rstrip(".")
+
+
+def public_modules(name: str) -> Iterator[str]:
+    """A module and everything below it that is not private."""
+    yield name
+    path = source_of(name)
+    if path.name == "__init__.py":
+        for module in pkgutil.iter_modules([str(path.parent)]):
+            if not module.name.startswith("_"):
+                yield from public_modules(f"{name}.{module.name}")
+
+
+def module_section(name: str, level: int) -> str:
+    """A heading and everything public that a module defines itself."""
+    is_package = source_of(name).name == "__init__.py"
+    members = "" if is_package else "\n   :members:\n   :ignore-module-all:"
+    title = name if level == 1 else name.removeprefix(f"{PACKAGE}.")
+    return f"{'#' * level} `{title}`\n\n```{{eval-rst}}\n.. automodule:: {name}{members}\n```\n"
+
+
+def api_pages(docs: Path) -> dict[str, str]:
+    """Text of the pages below reference/api by name."""
+    pages, alone = {}, []
+    for room in rooms(docs):
+        name = f"{PACKAGE}.{room}"
+        if room in NOT_LIBRARY or not exists(name):
+            continue
+        if source_of(name).name != "__init__.py":
+            alone.append(name)
+            continue
+        first, *others = public_modules(name)
+        parts = [module_section(first, 1), *(module_section(other, 2) for other in others)]
+        pages[room] = "\n".join(parts)
+    ground = "\n".join(module_section(name, 2) for name in alone)
+    pages["ground-floor"] = f"# Ground floor\n\nModules that every room may use.\n\n{ground}"
+    order = ["ground-floor", *(room for room in rooms(docs) if room in pages)]
+    lines = [
+        f"| [`{PACKAGE}.{room}`]({room}.md) | {escaped(summary(f'{PACKAGE}.{room}'))} |" for room in order[1:]
+    ]
+    index = ["# The library, room by room", "", "| room | what is in it |", "|---|---|"]
+    index += [
+        "| [ground floor](ground-floor.md) | Errors, cameras, vectors and other things that every room may use |"
+    ]
+    contents = ["```{toctree}", ":hidden:", "", *order, "```"]
+    pages["index"] = "\n".join([*index, *lines, "", *contents]) + "\n"
+    return pages
+
+
+def escaped(text: str) -> str:
+    """Text with Markdown's own characters escaped; ``code`` becomes `code`."""
+    parts = re.split(r"(``.+?``)", text)
+    parts[::2] = [re.sub(r"([\\`*_{}\[\]<>|$#~])", r"\\\1", part) for part in parts[::2]]
+    parts[1::2] = [part[1:-1] for part in parts[1::2]]
+    return "".join(parts)
+
+
+def rooms_table(docs: Path) -> str:
+    """The rooms in order, with the first sentence of each."""
+    lines = ["| | room | what is in it |", "|---:|---|---|"]
+    for number, room in enumerate(rooms(docs), 1):
+        lines.append(f"| {number} | `{room}` | {escaped(summary(f'{PACKAGE}.{room}'))} |")
+    return "\n".join(lines) + "\n"
+
+
+def public_names() -> str:
+    """Every name of ``import polarguide``, described where it stands."""
+    package = importlib.import_module(PACKAGE)
+    directives = []
+    for name in package.__all__:
+        found = getattr(package, name)
+        if name.startswith("_") or inspect.ismodule(found):
+            continue
+        if inspect.isclass(found):
+            directives.append(f".. autoclass:: {PACKAGE}.{name}\n   :members:\n")
+        elif callable(found):
+            directives.append(f".. autofunction:: {PACKAGE}.{name}\n")
+        else:
+            directives.append(f".. autodata:: {PACKAGE}.{name}\n")
+    return "```{eval-rst}\n" + "\n".join(directives) + "```\n"
+
+
+def help_of(*verb: str) -> str:
+    """What ``polarguide VERB --help`` prints, without colors and so wide that nothing is broken over lines."""
+    command = [sys.executable, "-m", PACKAGE, *verb, "--help"]
+    environment = {**os.environ, "COLUMNS": "2000", "NO_COLOR": "1", "TERM": "dumb"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)} ended with status {done.returncode}:\n{done.stderr}")
+    return re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)
+
+
+def boxes(text: str) -> tuple[str, list[tuple[str, list[str]]]]:
+    """The text above the first box of a help text, and each box: its title and the lines in it."""
+    above: list[str] = []
+    found: list[tuple[str, list[str]]] = []
+    for line in text.splitlines():
+        if line.startswith("╭"):
+            found.append((line.strip("╭─╮ "), []))
+        elif line.startswith("│"):
+            found[-1][1].append(line[1:-1].rstrip()[1:])
+        elif not found:
+            above.append(line)
+    return "\n".join(above), found
+
+
+def entries(lines: list[str]) -> list[tuple[str, str]]:
+    """Options and what they do, from the lines of a box: names start at the left, what they do stands apart."""
+    found: list[tuple[str, str]] = []
+    for line in lines:
+        if line[:1].strip():
+            name, *text = re.split(r"\s{2,}", line.rstrip(), maxsplit=1)
+            found.append((name, "".join(text)))
+        elif found and line.strip():
+            name, text = found[-1]
+            found[-1] = name, f"{text} {line.strip()}".strip()
+    return found
+
+
+def verb_section(verb: str, text: str) -> str:
+    """One verb: usage, what it does, and its options as Sphinx' own ``option`` entries."""
+    above, found = boxes(text)
+    usage, _, about = above.strip().partition("\n\n")
+    usage = re.sub(r"^usage: ", "", usage)
+    lines = [f"## `{verb}`", "", "```text", usage, "```", "", escaped(about), "", "```{eval-rst}"]
+    lines += [f".. program:: {PACKAGE} {verb}", ""]
+    for _, box in found:
+        for name, what in entries(box):
+            if name != "-h, --help":
+                what = re.sub(r"([\\*|`_])", r"\\\1", what)
+                lines += [f".. option:: {name}", "", f"   {what}", ""]
+    return "\n".join([*lines, "```", ""])
+
+
+def command_line() -> str:
+    """All verbs, in the order of ``polarguide --help``."""
+    top = help_of()
+    braces = re.search(r"\{([a-z,\-]+)\}", top)
+    if braces is None:
+        raise ValueError(f"polarguide --help: expected the verbs in braces, found\n{top}")
+    verbs = braces.group(1).split(",")
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        texts = list(pool.map(help_of, verbs))
+    return "\n".join(verb_section(verb, text) for verb, text in zip(verbs, texts, strict=True))
+
+
+def write(path: Path, text: str) -> None:
+    """Write a page if it has changed: a page that stays need not be built again."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+def generate(app: Sphinx) -> None:
+    """Write all pages, and remove those of rooms that are no more."""
+    docs = Path(app.srcdir)
+    pages = api_pages(docs)
+    api = docs / "reference" / "api"
+    for stale in api.glob("*.md"):
+        if stale.stem not in pages:
+            stale.unlink()
+    for name, text in pages.items():
+        write(api / f"{name}.md", text)
+    write(docs / "generated" / "rooms.md", rooms_table(docs))
+    write(docs / "generated" / "python.md", public_names())
+    write(docs / "generated" / "command-line.md", command_line())
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.connect("builder-inited", generate)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,71 @@
+"""Compare a recipe with its ablations: the same with one thing changed, each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from polarguide.errors import PolarguideError
+from polarguide.experiments.compare import compare
+from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.results import Results
+from polarguide.progress import SILENT, Reporter
+from polarguide.recipes import ABLATIONS
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
+
+
+def ablate(
+    scenes: Sequence[str | os.PathLike[str]],
+    base: str,
+    out: str | os.PathLike[str],
+    *,
+    only: Sequence[str] = (),
+    reference: Sequence[str | Recipe] = (),
+    settings: TrainSettings = TrainSettings(5000, 0),
+    options: CompareOptions = CompareOptions(),
+    reporter: Reporter = SILENT,
+) -> Results:
+    """``compare`` with a recipe and its ablations; it shares runs with a comparison in the same folder.
+
+    Args:
+        scenes, out, settings, options, reporter: as for ``compare``.
+        base: name of the recipe whose ablations to train.
+        only: names of the ablations to take, such as without-normals; all if empty.
+        reference: recipes to add as first rows.
+
+    Raises:
+        PolarguideError: as ``compare``; or a recipe without ablations, or an ablation that it does not have.
+    """
+    recipes = [*reference, *ablated(base, only)]
+    return compare(scenes, recipes, out, settings=settings, options=options, reporter=reporter)
+
+
+def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
+    """The names of a recipe and of its ablations, or of those of them that are in ``only``.
+
+    Args:
+        base: a recipe.
+        only: ablations with or without ``base:`` before the name; all if empty.
+
+    Raises:
+        PolarguideError: a recipe without ablations, or an ablation that it does not have.
+    """
+    if base not in ABLATIONS:
+        raise PolarguideError(
+            "base",
+            expected="a recipe with ablations: " + ", ".join(ABLATIONS),
+            found=base,
+            remedy="Take one of these, or use compare.",
+        )
+    names = [recipe.name for recipe in ABLATIONS[base]]
+    wanted = [name if name.startswith(f"{base}:") else f"{base}:{name}" for name in only]
+    for name, full in zip(only, wanted, strict=True):
+        if full not in names:
+            raise PolarguideError(
+                "only",
+                expected="one of " + ", ".join(n.partition(":")[2] for n in names),
+                found=name,
+                remedy="Correct the name.",
+            )
+    return (base, *(name for name in names if not only or name in wanted))

@@ -1,0 +1,192 @@
+"""Train and score several recipes on several scenes, and set tables and a report of them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from polarguide.errors import PolarguideError
+from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
+from polarguide.experiments.jobs import STDERR, Job, run_jobs
+from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
+from polarguide.experiments.report import write_report
+from polarguide.experiments.results import Results
+from polarguide.experiments.study import write_study
+from polarguide.experiments.worker import Scoring, Task, Training
+from polarguide.files import make_folder
+from polarguide.progress import SILENT, Reporter
+from polarguide.raster import choose_backend
+from polarguide.recipes import recipe_named
+from polarguide.system import exclusive_lock
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
+
+LOCK = ".lock"
+
+
+def compare(
+    scenes: Sequence[str | os.PathLike[str]],
+    recipes: Sequence[str | Recipe],
+    out: str | os.PathLike[str],
+    *,
+    settings: TrainSettings = TrainSettings(5000, 0),
+    options: CompareOptions = CompareOptions(),
+    reporter: Reporter = SILENT,
+) -> Results:
+    """Train and score every recipe on every scene with every seed, each run in processes of its own.
+
+    Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``.
+    Finished runs are found again and not repeated. KeyboardInterrupt is passed on after the runs at work have saved
+    their state; the same call goes on with them.
+
+    Args:
+        scenes: scene folders with names of their own.
+        recipes: the methods in the order of the tables, by name, or as they are registered.
+        out: folder to write.
+        settings: of each training; ``seed`` is the first of ``options.seeds``.
+        options: how runs are trained, timed and shown.
+        reporter: receives messages and progress.
+
+    Returns:
+        The record as written. A run that failed is in it, with its error; the others are not affected.
+
+    Raises:
+        PolarguideError: wrong input, or another comparison at work in ``out``.
+    """
+    comparison = Comparison(
+        scenes=tuple(Path(scene) for scene in scenes),
+        recipes=_checked_recipes(recipes),
+        settings=settings,
+        options=options,
+        out=Path(out),
+    )
+    if not scenes:
+        raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
+    choose_backend(options.device)
+    entries = scene_entries(comparison, reporter)
+    plan = plan_runs(comparison, entries)
+    make_folder(comparison.out)
+    with _locked(comparison.out):
+        failures = _train(comparison, entries, plan, reporter)
+        if options.speed:
+            _time(comparison, plan, reporter)
+        results = collect(comparison, entries, plan, failures)
+        write_tables(comparison.out, results)
+        write_report(comparison, entries, plan, results, reporter)
+        write_study(comparison.out, results, {entry.name: entry.path for entry in entries})
+    return results
+
+
+def _checked_recipes(recipes: Sequence[str | Recipe]) -> tuple[Recipe, ...]:
+    """The recipes as they are registered: runs are trained in other processes, which know recipes by name."""
+    found = tuple(recipe_named(recipe if isinstance(recipe, str) else recipe.name) for recipe in recipes)
+    for asked, known in zip(recipes, found, strict=True):
+        if isinstance(asked, Recipe) and asked != known:
+            raise PolarguideError(
+                "recipes",
+                expected=f"the registered recipe {known.name}",
+                found="one of this name with other values",
+                remedy="Give it a name of its own, and register it under the entry points polarguide.recipes.",
+            )
+    if not found:
+        raise PolarguideError(
+            "compare", expected="a recipe", found="none", remedy="Name at least one recipe."
+        )
+    names = [recipe.name for recipe in found]
+    if len(set(names)) < len(names):
+        raise PolarguideError(
+            "recipes", expected="every name once", found=" ".join(names), remedy="Name each once."
+        )
+    return found
+
+
+def _train(
+    comparison: Comparison, scenes: Sequence[SceneEntry], plan: Sequence[PlannedRun], reporter: Reporter
+) -> dict[Path, str]:
+    """Train and score what is missing; the last words of what failed, by run folder."""
+    wanted = [run for run in plan if run.state() != "done"]
+    parallel = min(comparison.options.parallel, len(wanted))
+    reporter.say(f"runs: {len(plan)}, of them finished before: {len(plan) - len(wanted)}")
+    jobs = [_job(comparison, run, alone=parallel == 1) for run in wanted]
+    failures: dict[Path, str] = {}
+    if not jobs:
+        return failures
+
+    def end(job: Job, error: str | None) -> None:
+        if error is None:
+            (job.folder / STDERR).unlink(missing_ok=True)
+        else:
+            failures[job.folder] = error
+        write_tables(comparison.out, collect(comparison, scenes, plan, failures))
+
+    try:
+        run_jobs(jobs, parallel=parallel, reporter=reporter, on_end=end)
+    except KeyboardInterrupt:
+        reporter.say("The runs at work have saved their state: the same comparison goes on with them.")
+        raise
+    return failures
+
+
+def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
+    """The tasks that finish a run."""
+    state, options = run.state(), comparison.options
+    tasks: list[Task] = []
+    if state in ("new", "begun"):
+        if not alone:
+            make_folder(run.folder)
+            (run.folder / BESIDE_OTHERS).write_text("Trained beside other runs: its seconds do not count.\n")
+        tasks.append(
+            Training(
+                scene=str(run.scene.path),
+                folder=str(run.folder),
+                recipe=run.recipe.name,
+                settings=run.settings,
+                downscale=run.reading.downscale,
+                transfer=run.reading.transfer,
+                device=options.device,
+                threads=options.threads,
+                resume=state == "begun",
+            )
+        )
+    tasks.append(_scoring(comparison, run, speed=alone))
+    return Job(run.label, run.folder, tuple(tasks), run.settings.steps)
+
+
+def _scoring(comparison: Comparison, run: PlannedRun, *, speed: bool) -> Scoring:
+    options = comparison.options
+    return Scoring(folder=str(run.folder), speed=speed, device=options.device, threads=options.threads)
+
+
+def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter) -> None:
+    """Time the pictures of finished runs that have not been timed alone, one after the other."""
+    untimed = [run for run in plan if (record := run.metrics()) is not None and record["fps"] is None]
+    if not untimed:
+        return
+    reporter.say(f"timing the pictures of {len(untimed)} runs, one after the other")
+    jobs = [
+        Job(run.label, run.folder, (_scoring(comparison, run, speed=True),), run.settings.steps)
+        for run in untimed
+    ]
+    run_jobs(jobs, parallel=1, reporter=reporter)
+    missed = [run for run in untimed if (record := run.metrics()) is None or record["fps"] is None]
+    if missed:
+        reporter.warn(f"no speed for {len(missed)} runs: they failed, or were not alone on the machine.")
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep two comparisons out of one folder. Children inherit the lock and hold it if the parent is killed."""
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(exclusive_lock(folder / LOCK))
+        except BlockingIOError:
+            raise PolarguideError(
+                folder,
+                expected="a folder that nobody is writing to",
+                found="another comparison at work in it",
+                remedy="Wait for it, or give another --out.",
+            ) from None
+        yield

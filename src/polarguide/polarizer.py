@@ -1,0 +1,60 @@
+"""The polarizer before the camera: its four angles, and Malus's law. For NumPy arrays and torch tensors alike.
+
+Angles count counter-clockwise as displayed, from the image's horizontal.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+ANGLES = (0, 45, 90, 135)
+"""Polarizer angles in degrees, in the order of every stack of four intensities."""
+
+
+def malus(stokes: Any, angle: Any) -> Any:
+    """Intensity behind an ideal polarizer: Malus's law, ``(S0 + S1 cos 2a + S2 sin 2a) / 2``.
+
+    Args:
+        stokes: S0, S1 and S2, each [...]: an array or tensor [3, ...], or three.
+        angle: of the polarizer, radians: a number, or an array or tensor that broadcasts against [...].
+
+    Returns:
+        [...], of the type of ``stokes``.
+    """
+    s0, s1, s2 = stokes
+    twice = 2 * angle
+    if isinstance(twice, (int, float, np.ndarray, np.generic)):
+        cosine, sine = np.cos(twice), np.sin(twice)
+    else:
+        cosine, sine = twice.cos(), twice.sin()
+    return (s0 + s1 * cosine + s2 * sine) / 2
+
+
+def stokes_of_four(intensities: Any) -> tuple[Any, Any, Any]:
+    """S0, S1 and S2 of the intensities at ``ANGLES``, the least-squares solution of Malus's law.
+
+    ``S0 = (I0 + I45 + I90 + I135) / 2``, ``S1 = I0 - I90``, ``S2 = I45 - I135``.
+
+    Args:
+        intensities: four, each [...]: an array or tensor [4, ...], or four.
+
+    Returns:
+        Three of [...].
+    """
+    i0, i45, i90, i135 = intensities
+    return (i0 + i45 + i90 + i135) / 2, i0 - i90, i45 - i135
+
+
+def four_intensities(stokes: Any) -> tuple[Any, Any, Any, Any]:
+    """Malus's law at ``ANGLES``, where sine and cosine are 0 and 1: the inverse of ``stokes_of_four``.
+
+    Args:
+        stokes: S0, S1 and S2, each [...].
+
+    Returns:
+        Four of [...].
+    """
+    s0, s1, s2 = stokes
+    return (s0 + s1) / 2, (s0 + s2) / 2, (s0 - s1) / 2, (s0 - s2) / 2

@@ -1,0 +1,76 @@
+"""From Gaussians to a picture: one splat of the G-buffer, then the shading model per pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import torch
+from torch import Tensor
+
+from polarguide.camera import Camera
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
+from polarguide.shading.model import PLAIN, GBuffer, Parameters, ShadingModel
+from polarguide.shading.result import RenderResult
+
+COLOR_CHANNELS = (0, 1, 2)
+NO_LIGHT: Mapping[str, Tensor] = MappingProxyType({})
+
+
+def render(
+    gaussians: Parameters,
+    camera: Camera,
+    rasterize: Rasterize,
+    *,
+    sh_degree: int = 3,
+    shading: ShadingModel = PLAIN,
+    light: Mapping[str, Tensor] = NO_LIGHT,
+    normals: bool = True,
+    depth: bool = False,
+    statistic: ScreenStatistic | None = None,
+) -> RenderResult:
+    """Render one view.
+
+    Args:
+        gaussians: the Gaussians, with the parameters of the shading model; with ``outward`` where normals are turned
+            to the side from which they are seen, not to the camera.
+        sh_degree: SH degree of the base color, 0 to 3.
+        shading: what is splatted, and how it makes the picture. light: its learned light, by name.
+        normals: also splat normals where the shading model does not need them.
+        depth: also splat camera depth.
+        statistic: see ``ScreenStatistic``; the color channels come first.
+    """
+    pose = camera.pose(gaussians["means"].dtype, gaussians["means"].device)
+    center, means = pose.center, gaussians["means"]
+    if normals := normals or shading.needs_normals:
+        axes = shortest_axis_normals(
+            means, gaussians["quaternions"], gaussians["log_scales"], center, gaussians.get("outward")
+        )
+    else:
+        axes = means.new_empty(len(means), 0)
+    channels = shading.channels(gaussians, axes, center, sh_degree)
+    channels.insert(1, axes)
+    if depth:
+        channels.append(((means - center) @ pose.rotation[2])[:, None])
+    splats = Splats(
+        means,
+        gaussians["quaternions"],
+        gaussians["log_scales"].exp(),
+        torch.sigmoid(gaussians["opacity_logits"]),
+        torch.cat(channels, dim=1),
+    )
+    picture = rasterize(splats, camera, statistic=statistic)
+    layers = shading.shade(GBuffer(picture.features, picture.alpha), light, camera)
+    return RenderResult(
+        final=layers["final"],
+        specular=layers.get("specular"),
+        diffuse=layers.get("diffuse"),
+        base=picture.features[..., :3],
+        reflection=layers.get("reflection"),
+        strength=layers.get("strength"),
+        normal=picture.features[..., 3:6] if normals else None,
+        depth=picture.features[..., -1] / picture.alpha.clamp(min=1e-6) if depth else None,
+        alpha=picture.alpha,
+        radii=picture.radii,
+    )

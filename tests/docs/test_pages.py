@@ -1,0 +1,140 @@
+"""What the documentation says about the program is so: names, files, options, citations, spelling."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from polarguide.evaluation.table import METRICS
+from polarguide.recipes import ABLATIONS, RECIPES
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "polarguide"
+GENERATED = (DOCS / "generated", DOCS / "reference" / "api")
+PAGES = sorted(p for p in DOCS.rglob("*.md") if not any(made in p.parents for made in GENERATED))
+TEXTS = [*PAGES, *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+# Folders of the repository whose files the pages name.
+NAMED_FILE = re.compile(r"\b(?:benchmarks|examples|native|src|tests)/[\w./-]+\.(?:py|json|cpp|h)\b")
+MODULE_FILE = re.compile(r"`([a-z_]+(?:/[a-z_]+)+\.py)`")
+# Options of other programs that pages show, too.
+FOREIGN_OPTIONS = {
+    *(
+        "nproc-per-node",
+        "no-register",
+        "no-align",
+        "help",
+        "version",
+        "python",
+        "large",
+        "tiny",
+        "picture",
+        "gaussians",
+    ),
+}
+BRITISH = re.compile(
+    r"\b\w*(?:colour|grey\b|centre|neighbour|behaviour|licence|analyse|catalogue|metre\b|harbour|"
+    r"(?:rasteri|normali|initiali|optimi|organi|recogni|quanti|minimi|maximi|synchroni|digiti|summari)s(?:e|ing|ation))\w*",
+    re.IGNORECASE,
+)
+
+
+def text_of(path):
+    return path.read_text(encoding="utf-8")
+
+
+def python_blocks():
+    for path in TEXTS:
+        for number, (language, code) in enumerate(FENCE.findall(text_of(path))):
+            if language == "python":
+                yield pytest.param(code, id=f"{path.relative_to(ROOT)}-{number}")
+
+
+def test_there_are_pages():
+    assert len(PAGES) > 30
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_files_and_links_exist(path):
+    text = text_of(path)
+    missing = [name for name in NAMED_FILE.findall(text) if "<" not in name and not (ROOT / name).exists()]
+    missing += [
+        name for name in MODULE_FILE.findall(text) if not any((at / name).exists() for at in (PACKAGE, ROOT))
+    ]
+    for target in re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", text)):
+        file, _, anchor = target.partition("#")
+        if "://" in target:
+            continue
+        found = path.parent / file if file else path
+        if any(made in found.resolve().parents for made in GENERATED):
+            continue
+        if not found.exists() or (anchor and anchor not in anchors(text_of(found))):
+            missing.append(target)
+    assert missing == []
+
+
+def anchors(text):
+    """The anchors of a page's headings, as GitHub and MyST make them."""
+    headings = re.findall(r"^#+ (.+)$", FENCE.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower().replace("`", "")).replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("code", list(python_blocks()))
+def test_python_compiles(code):
+    ast.parse(code)
+
+
+def test_every_metric_is_defined():
+    page = text_of(DOCS / "reference" / "metrics.md")
+    assert [metric.key for metric in METRICS if f"`{metric.key}`" not in page] == []
+
+
+def test_every_recipe_is_described_and_every_named_one_exists():
+    page = text_of(DOCS / "explanation" / "recipes.md")
+    assert [name for name in RECIPES if f"## `{name}`" not in page] == []
+    known = {*RECIPES, *(recipe.name for recipes in ABLATIONS.values() for recipe in recipes)}
+    bases = "|".join(map(re.escape, RECIPES))
+    named = {n for path in TEXTS for n in re.findall(rf"`((?:{bases}):[a-z-]+)`", text_of(path))}
+    assert named
+    assert named - known == set()
+
+
+def parameters():
+    """Names of parameters and fields that an option can stand for: of verbs, and of the dataclasses that they read."""
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(text_of(path))):
+            if isinstance(node, ast.arg):
+                yield node.arg
+            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                yield node.target.id
+
+
+def test_options_exist():
+    words = set(parameters())
+    unknown = {}
+    for path in TEXTS:
+        for option in re.findall(r"(?<![\w-])--([a-z][a-z-]+)", text_of(path)):
+            if option not in FOREIGN_OPTIONS and option.replace("-", "_") not in words:
+                unknown.setdefault(option, path.name)
+    assert unknown == {}
+
+
+def test_the_bibliography_holds_what_is_cited():
+    bibliography = text_of(DOCS / "reference" / "bibliography.bib")
+    authors = {name.lower() for name in re.findall(r"author = \{([^,{]+)", bibliography)}
+    folders = (PACKAGE, ROOT / "benchmarks")
+    sources = "\n".join(text_of(p) for folder in folders for p in folder.rglob("*.py"))
+    name = "[A-Z][a-z]+"
+    cited = set(re.findall(rf"\b({name})(?:, {name})*(?: et al\.|,? and {name})? (?:19|20)\d\d\b", sources))
+    assert cited
+    assert {name for name in cited if name.lower() not in authors} == set()
+    keys = re.findall(r"^@\w+\{(\w+),", bibliography, re.MULTILINE)
+    assert len(set(keys)) == len(keys) > 20
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_american_spelling(path):
+    # Names that stay (an ablation's) and old names (in the changelog) are code.
+    assert BRITISH.findall(re.sub(r"`[^`\n]*`", "", text_of(path))) == []

@@ -1,0 +1,182 @@
+"""Which runs a comparison has and when one is found again; what it refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polarguide.cli.app import run
+from polarguide.errors import PolarguideError
+from polarguide.evaluation.sources import scoring_digest
+from polarguide.experiments import plan as plans
+from polarguide.experiments.ablate import ablated
+from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
+from polarguide.options import SceneOptions
+from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
+from polarguide.runs.folder import recipe_data
+from polarguide.training.settings import TrainSettings
+
+SETTINGS = TrainSettings(40, 0)
+ENTRY = SceneEntry(Path("cup"), "cup", "digest", 9, ("v0",))
+
+
+def asked(**changes: Any) -> Comparison:
+    """A comparison of two recipes."""
+    names = [field.name for field in dataclasses.fields(CompareOptions)]
+    options = {name: changes.pop(name) for name in names if name in changes}
+    values: dict[str, Any] = {
+        "scenes": (Path("cup"),),
+        "recipes": (recipe_named("3dgs"), recipe_named("polarguide:without-normals")),
+        "settings": SETTINGS,
+        "options": CompareOptions(**{"seeds": 2, "device": "cpu", "jobs": 1, **options}),
+        "out": Path("out"),
+    }
+    return Comparison(**{**values, **changes})
+
+
+def folders(**changes: Any) -> list[Path]:
+    return [planned.folder for planned in plan_runs(asked(**changes), [ENTRY])]
+
+
+def test_every_scene_recipe_and_seed_has_a_folder_of_its_own() -> None:
+    found = folders()
+    assert len(set(found)) == 4
+    assert found[1].parts[:4] == ("out", "runs", "cup", "polarguide__without-normals")
+    assert [folder.name[:2] for folder in found] == ["0-", "0-", "1-", "1-"]
+
+
+def test_the_same_question_has_the_same_folders() -> None:
+    assert folders() == folders()
+    # What decides nothing about the result does not either.
+    assert folders(jobs=4, threads=2, speed=True, report_views=0, scenes=(Path("moved/cup"),)) == folders()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"settings": TrainSettings(41, 0)},
+        {"settings": TrainSettings(40, 0, 1.33)},
+        {"settings": TrainSettings(40, 0, views_per_step=2)},
+        {"downscale": 2},
+        {"transfer": "srgb"},
+    ],
+)
+def test_another_question_has_other_folders(changes: dict[str, Any]) -> None:
+    assert not set(folders(**changes)) & set(folders())
+
+
+def test_seeds_count_up_from_that_of_the_settings() -> None:
+    runs = plan_runs(asked(settings=TrainSettings(40, 3)), [ENTRY])
+    assert [run.settings.seed for run in runs] == [3, 3, 4, 4]
+
+
+def test_another_scene_recipe_value_or_program_has_another_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    def key(scene: str = "s", recipe: dict[str, Any] | None = None, code: str = "c", seed: int = 0) -> str:
+        data = recipe_data(RECIPES["3dgs"]) if recipe is None else recipe
+        return run_key(scene, data, TrainSettings(40, seed), SceneOptions(), code=code)
+
+    changed = recipe_data(dataclasses.replace(RECIPES["3dgs"], ssim_weight=0.3))
+    keys = [key(), key(scene="t"), key(recipe=changed), key(code="d"), key(seed=1)]
+    assert len(set(keys)) == len(keys)
+    assert key() == key()
+    before = folders()
+    monkeypatch.setattr(plans, "training_digest", lambda: "other")
+    assert not set(before) & set(folders())
+
+
+def test_the_command_in_the_record_asks_for_the_same() -> None:
+    command = asked(scenes=(Path("my cup"),)).command
+    assert command.startswith(
+        "polarguide compare 'my cup' --recipes 3dgs polarguide:without-normals --steps 40"
+    )
+
+
+@pytest.fixture
+def planned(trained: Path, demo_scene: Path, tmp_path: Path) -> PlannedRun:
+    """The short training of the demo scene as a run of a comparison, scored."""
+    question = asked(
+        scenes=(demo_scene,), recipes=(recipe_named("polarguide-stokes"),), seeds=1, downscale=4, out=tmp_path
+    )
+    (only,) = plan_runs(question, scene_entries(question))
+    shutil.copytree(trained, only.folder)
+    return only
+
+
+def test_how_far_a_run_is(planned: PlannedRun, tmp_path: Path) -> None:
+    metrics, other = planned.folder / "metrics.json", dataclasses.replace(planned, folder=Path("none"))
+    assert (planned.state(), other.state()) == ("trained", "new")
+    assert run(["eval", str(planned.folder), "--no-speed", "--threads", "1"]) == 0
+    assert planned.state() == "done"
+    record = json.loads(metrics.read_text())
+    assert (record["fps"], record["fps_layers"]) == (None, None)
+    assert record["provenance"]["sources"] == scoring_digest()
+    for change in (
+        {"steps": 39},
+        {"psnr": "high"},
+        {"provenance": record["provenance"] | {"sources": "old"}},
+    ):
+        metrics.write_text(json.dumps(record | change))
+        assert planned.state() == "trained", change
+    metrics.write_text('{"psnr": 3')
+    assert planned.state() == "trained"
+    shutil.copytree(planned.scene.path, tmp_path / "demo")
+    moved = dataclasses.replace(planned, scene=dataclasses.replace(planned.scene, path=tmp_path / "demo"))
+    assert moved.state() == "begun"
+    (planned.folder / "point_cloud.ply").unlink()
+    assert planned.state() == "begun"
+    metrics.write_text(json.dumps(record))
+    configuration = planned.folder / "run.json"
+    configuration.write_text(configuration.read_text().replace('"downscale": 4', '"downscale": 2'))
+    assert planned.state() == "begun", "a run of something else is not taken for this one"
+
+
+def test_ablations_by_name() -> None:
+    every = ablated("polarguide")
+    assert every == ("polarguide", *(recipe.name for recipe in ABLATIONS["polarguide"]))
+    some = ablated("polarguide", ("without-mask", "polarguide:only-normals"))
+    assert some == ("polarguide", "polarguide:only-normals", "polarguide:without-mask")
+    with pytest.raises(PolarguideError, match="only: expected one of only-normals"):
+        ablated("polarguide", ("without-luck",))
+    with pytest.raises(
+        PolarguideError, match=r"base: expected a recipe with ablations: .*polarguide.*, found 3dgs"
+    ):
+        ablated("3dgs")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--recipes", "magic"], "recipe: expected one of"),
+        (["--recipes", "3dgs", "3dgs"], "recipes: expected every name once"),
+        (["--recipes", "3dgs", "--steps", "0"], "--steps: expected 1 or more"),
+        (["--recipes", "3dgs", "--seeds", "0"], "seeds: expected 1 or more"),
+        (["--recipes", "3dgs", "--threads", "0"], "threads: expected 1 or more"),
+        (["--recipes", "3dgs", "--jobs", "-1"], "jobs: expected"),
+        (["--recipes", "3dgs", "--report-views", "-1"], "report_views: expected"),
+        (["--recipes", "3dgs", "--refractive-index", "5"], "--refractive-index"),
+        (["--recipes", "3dgs", "--device", "cuda"], "--device cuda"),
+        (["--recipes", "3dgs", "--downscale", "0"], "downscale: expected"),
+    ],
+)
+def test_refusals(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+) -> None:
+    assert run(["compare", str(demo_scene), *arguments, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_scenes_of_one_name_are_refused(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["compare", str(demo_scene), str(demo_scene), "--recipes", "3dgs", "--downscale", "8"]
+    assert run([*command, "--out", str(tmp_path / "out")]) == 2
+    assert "expected scenes with names of their own, found demo twice" in capsys.readouterr().err

@@ -1,0 +1,124 @@
+"""What is done for a run by how far it is, and which of its speeds count."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polarguide.cli.app import run
+from polarguide.experiments import compare as comparing
+from polarguide.experiments.collect import BESIDE_OTHERS, collect
+from polarguide.experiments.jobs import Job
+from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
+from polarguide.experiments.worker import Scoring, Training
+from polarguide.progress import Reporter
+from polarguide.recipes import recipe_named
+from polarguide.training.settings import TrainSettings
+
+Planned = tuple[Comparison, list[SceneEntry], PlannedRun]
+
+
+@pytest.fixture
+def planned(demo_scene: Path, tmp_path: Path) -> Planned:
+    """A comparison with one run, of which nothing is there yet."""
+    question = Comparison(
+        scenes=(demo_scene,),
+        recipes=(recipe_named("polarguide-stokes"),),
+        settings=TrainSettings(40, 0),
+        options=CompareOptions(downscale=4, device="cpu", jobs=1, speed=True, report_views=0),
+        out=tmp_path,
+    )
+    scenes = scene_entries(question)
+    (only,) = plan_runs(question, scenes)
+    return question, scenes, only
+
+
+def score(folder: Path, **changes: Any) -> None:
+    """Score a run and change its record."""
+    assert run(["eval", str(folder), "--no-speed", "--threads", "1"]) == 0
+    path = folder / "metrics.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def test_a_new_run_is_trained_and_scored(planned: Planned) -> None:
+    question, _, only = planned
+    train, scoring = comparing._job(question, only, alone=True).tasks
+    assert isinstance(train, Training)
+    assert (train.scene, train.folder) == (str(question.scenes[0]), str(only.folder))
+    assert (train.settings, train.downscale, train.transfer) == (question.settings, 4, "linear")
+    assert not train.resume
+    assert scoring == Scoring(folder=str(only.folder), speed=True, device="cpu", threads=1)
+    assert not only.folder.exists()
+
+
+def test_beside_others_no_speed_is_measured_and_that_is_remembered(planned: Planned) -> None:
+    question, _, only = planned
+    _, scoring = comparing._job(question, only, alone=False).tasks
+    assert isinstance(scoring, Scoring)
+    assert not scoring.speed
+    assert (only.folder / BESIDE_OTHERS).exists()
+
+
+def test_a_run_is_gone_on_with_where_it_stopped(planned: Planned, trained: Path) -> None:
+    question, _, only = planned
+    shutil.copytree(trained, only.folder)
+    assert [type(task) for task in comparing._job(question, only, alone=True).tasks] == [Scoring]
+    (only.folder / "point_cloud.ply").unlink()
+    train, _ = comparing._job(question, only, alone=True).tasks
+    assert isinstance(train, Training)
+    assert train.resume
+
+
+def test_seconds_count_only_alone(planned: Planned, trained: Path) -> None:
+    question, scenes, only = planned
+    shutil.copytree(trained, only.folder)
+    score(only.folder, train_seconds=12.5, fps=60.0)
+    (record,) = collect(question, scenes, [only], {})["runs"]
+    assert (record["state"], record["metrics"]["train_seconds"], record["metrics"]["fps"]) == (
+        "done",
+        12.5,
+        60.0,
+    )
+    (only.folder / BESIDE_OTHERS).touch()
+    (record,) = collect(question, scenes, [only], {only.folder: "an old error"})["runs"]
+    assert (record["metrics"]["train_seconds"], record["metrics"]["fps"]) == (None, 60.0)
+    assert record["error"] is None
+
+
+class Warnings(Reporter):
+    """Collects warnings."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def warn(self, text: str) -> None:
+        self.said.append(text)
+
+
+def test_speed_times_what_was_not_timed(
+    planned: Planned, trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    question, _, only = planned
+    shutil.copytree(trained, only.folder)
+    asked: list[Job] = []
+
+    def instead(jobs: Sequence[Job], *, parallel: int, **_: Any) -> None:
+        assert parallel == 1
+        asked.extend(jobs)
+
+    monkeypatch.setattr(comparing, "run_jobs", instead)
+    score(only.folder, fps=60.0)
+    reporter = Warnings()
+    comparing._time(question, [only], reporter)
+    assert asked == []
+    score(only.folder)
+    comparing._time(question, [only], reporter)
+    scoring = Scoring(folder=str(only.folder), speed=True, device="cpu", threads=1)
+    assert [job.tasks for job in asked] == [(scoring,)]
+    assert [text[:19] for text in reporter.said] == ["no speed for 1 runs"]
