@@ -7,20 +7,20 @@ import sys
 
 import polarguide
 
-model = polarguide.load(sys.argv[1])
-print(model)
+run = polarguide.open_run(sys.argv[1])
+print(run)
 
-# Rows of the Gaussians, by name; one row a Gaussian.
-for name, rows in model.gaussians.items():
-    print(f"  {name:16} {list(rows.shape)}")
+# Parameters of the Gaussians, by name; one row a Gaussian.
+for name, parameters in run.gaussians.items():
+    print(f"  {name:16} {list(parameters.shape)}")
 
 # Linear radiance and world normals of a view, by its name.
-view = model.scene.test_names[0]
-layers = model.render(view, layers=["final", "normal", "depth"])
+view = run.scene.test_names[0]
+layers = run.render(view, layers=["final", "normal", "depth"])
 print(f"view {view}: mean radiance {layers['final'].mean():.4f}, median depth {layers['depth'].median():.3f}")
 
-# What polarguide eval has measured, if it has.
+# What polarguide eval, or run.evaluate(), has measured, if it has.
 try:
-    print(f"PSNR of the test views: {model.metrics()['psnr']:.2f} dB")
+    print(f"PSNR of the test views: {run.metrics()['psnr']:.2f} dB")
 except polarguide.PolarguideError as error:
     print(error)

@@ -10,10 +10,10 @@ import polarguide
 from polarguide.trajectory import orbit
 from polarguide.visualization.figures import normal_to_rgb, radiance_to_rgb, write_png
 
-model, out = polarguide.load(sys.argv[1]), Path(sys.argv[2])
+run, out = polarguide.open_run(sys.argv[1]), Path(sys.argv[2])
 out.mkdir(parents=True, exist_ok=True)
-for number, camera in enumerate(orbit(list(model.cameras.values()), frames=8)):
-    layers = model.render(camera, layers=["final", "normal"])
+for number, camera in enumerate(orbit(list(run.cameras.values()), frames=8)):
+    layers = run.render(camera, layers=["final", "normal"])
     write_png(out / f"final_{number}.png", radiance_to_rgb(layers["final"]))
     write_png(out / f"normal_{number}.png", normal_to_rgb(layers["normal"], camera))
 print(f"8 pictures of each layer in {out}")

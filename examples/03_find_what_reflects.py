@@ -9,15 +9,15 @@ import torch
 
 import polarguide
 
-model = polarguide.load(sys.argv[1])
-for name, camera in list(model.cameras.items())[:5]:
-    layers = model.render(camera, layers=["specular", "final"])
+run = polarguide.open_run(sys.argv[1])
+for name, camera in list(run.cameras.items())[:5]:
+    layers = run.render(camera, layers=["specular", "final"])
     share = layers["specular"].sum() / layers["final"].sum()
     print(f"{name}: {100 * share:.1f} % of the light is specular")
 
-strength = torch.sigmoid(model.gaussians["strength_logits"])
+strength = torch.sigmoid(run.gaussians["strength_logits"])
 strongest = strength.topk(3).indices
 print(
     "strongest Gaussians at",
-    [[round(x, 3) for x in place] for place in model.gaussians["means"][strongest].tolist()],
+    [[round(x, 3) for x in place] for place in run.gaussians["means"][strongest].tolist()],
 )

@@ -19,8 +19,9 @@ from tiny import make_busy_recipe, make_scene
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.cli.app import run
+from polarguide.options import SceneOptions, SessionOptions
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 
 torch.set_num_threads(1)
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as a shell starts what runs in its background
@@ -40,7 +41,13 @@ def demo_scene() -> Path:
 def trained(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder. Tests read it and leave it as it is."""
     out = tmp_path_factory.mktemp("trained") / "run"
-    assert run(["train", str(demo_scene), "--out", str(out), *SHORT]) == 0
+    polarguide.train(
+        demo_scene,
+        out,
+        settings=TrainSettings(STEPS),
+        reading=SceneOptions(downscale=4),
+        session=SessionOptions(threads=1),
+    )
     return out
 
 

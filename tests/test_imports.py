@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 
 PACKAGE = "polarguide"
+FOLDERS = ("src", "benchmarks", "examples", "tests")
 SOURCE = Path(__file__).resolve().parents[1] / "src" / PACKAGE
 
 # From the top down. A room may import from itself and from every room before it.
 ROOMS = (
     "errors",
+    "options",
     "files",
     "records",
     "system",
@@ -45,9 +47,9 @@ ROOMS = (
     "cli",
     "__main__",
 )
-# What ``polarguide/__init__.py`` defines itself (its version) is for everyone. It opens the door to the interface, but
-# imports nothing by itself.
-ROOT, DOOR = "", "api"
+# What ``polarguide/__init__.py`` defines itself (its version) is for everyone. It names what others define for type
+# checkers, and loads it by name when it is asked for.
+ROOT = ""
 
 
 def room_of(parts):
@@ -102,7 +104,7 @@ def faults(source, rooms=ROOMS):
             if any(alias.name == "*" for alias in node.names):
                 found.append(f"{line}: star import")
             targets = imported_rooms(node, parts, rooms)
-            if room == ROOT and targets == [DOOR] and id(node) in deferred | typing:
+            if room == ROOT and id(node) in typing:
                 continue
             if targets and id(node) in deferred:
                 found.append(f"{line}: project import inside a function")
@@ -122,9 +124,51 @@ def test_the_package_keeps_its_order():
 
 
 def test_the_package_itself_imports_nothing_heavy():
-    code = "import sys, polarguide; print('torch' in sys.modules, callable(polarguide.load), 'torch' in sys.modules)"
+    code = (
+        "import sys, polarguide; dir(polarguide); polarguide.TrainSettings; "
+        "print('torch' in sys.modules, callable(polarguide.train), 'torch' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "True", "True"]
+
+
+def clients_of_the_command_line(root):
+    """Files that import ``polarguide.cli`` and are no part of it, below the folders of a checkout."""
+    allowed = ("src/polarguide/cli/", "src/polarguide/__main__.py", "tests/cli/")
+    found = []
+    for path in sorted(p for folder in FOLDERS for p in (root / folder).rglob("*.py")):
+        name = path.relative_to(root).as_posix()
+        tree = ast.parse(path.read_text(encoding="utf-8"), name)
+        modules = {alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}
+        for node in (n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)):
+            module = ("polarguide." if node.level else "") + (node.module or "")
+            modules |= {f"{module}.{alias.name}" for alias in node.names}
+        # A module may also be loaded by its name.
+        modules |= {
+            n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)
+        }
+        if not name.startswith(allowed) and any(f"{m}.".startswith(f"{PACKAGE}.cli.") for m in modules):
+            found.append(name)
+    return sorted(found)
+
+
+def test_nothing_but_itself_imports_the_command_line():
+    assert clients_of_the_command_line(SOURCE.parents[1]) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from polarguide.cli.app import run",
+        "from polarguide import cli",
+        "import polarguide.cli.app as app",
+        "import importlib\nimportlib.import_module('polarguide.cli.app')",
+    ],
+)
+def test_a_client_of_the_command_line_is_found(package, text):
+    files = {"src/polarguide/runs/a.py": text, "benchmarks/b.py": text, "tests/cli/c.py": text}
+    root = package({**files, "examples/d.py": "import polarguide"})
+    assert clients_of_the_command_line(root) == ["benchmarks/b.py", "src/polarguide/runs/a.py"]
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from polarguide.cli.common import open_run
+from polarguide.api import open_run
 from polarguide.color import srgb_encode
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.gaussians.ply import read_ply
@@ -32,7 +32,7 @@ def main() -> None:
     opened, file = open_run(run), read_ply(sys.argv[2] if len(sys.argv) > 2 else run / PLY)
     scores = []
     for view in opened.scene.test_views:
-        result = opened.render(view)
+        result = opened.result(view.camera).to("cpu")
         colors = evaluate_sh(
             file["means"], view.camera.center, file["sh_dc"][:, 0].contiguous(), file["sh_rest"], 3
         )
@@ -43,7 +43,7 @@ def main() -> None:
             torch.sigmoid(file["opacity_logits"]),
             (colors + 0.5).clamp(min=0),
         )
-        baked = opened.backend.rasterize(splats, view.camera).features.clamp(0, 1)
+        baked = opened.model.backend.rasterize(splats, view.camera).features.clamp(0, 1)
         diffuse = result.base if result.diffuse is None else result.diffuse
         final = srgb_encode(result.final.clamp(0, 1))
         scores.append((psnr(baked, final), psnr(srgb_encode(diffuse.clamp(0, 1)), final)))

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import trimesh
 
-from polarguide.cli.common import open_run
+from polarguide.api import open_run
 from polarguide.gaussians.initialize import scene_extent
 from polarguide.visualization import figures
 
@@ -66,7 +66,8 @@ def main() -> None:
         assert view.ground_truth is not None
         true = view.ground_truth.depth[:: arguments.step, :: arguments.step].numpy()
         known = view.ground_truth.mask[:: arguments.step, :: arguments.step].numpy() & (true > 0)
-        rendered = opened.render(view, depth=True).depth[:: arguments.step, :: arguments.step].numpy()
+        rendered = opened.render(view.camera, layers=["depth"])["depth"].cpu()
+        rendered = rendered[:: arguments.step, :: arguments.step].numpy()
         ours = mesh_depth(mesh, view.camera, arguments.step)
         for name, depth in (("mesh", ours), ("rendered", rendered)):
             hit = known & np.isfinite(depth)

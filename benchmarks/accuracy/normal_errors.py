@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.cli.common import open_run
+from polarguide.api import open_run
 from polarguide.evaluation.metrics import normal_angles_deg
 
 NEAR = np.ones((5, 5), dtype=np.uint8)
@@ -46,7 +46,7 @@ def main() -> None:
             assert ground_truth is not None
             assert ground_truth.normal is not None
             assert ground_truth.mask is not None
-            rendered = opened.render(view).normal
+            rendered = opened.result(view.camera).to("cpu").normal
             assert rendered is not None
             angles = normal_angles_deg(rendered, ground_truth.normal)
             dolp = optics.dolp(optics.luminance(optics.stokes(view.intensities())))

@@ -22,8 +22,7 @@ import cv2
 import numpy as np
 import torch
 
-from polarguide.cli.common import open_run
-from polarguide.cli.export import export
+from polarguide.api import open_run
 from polarguide.export.cameras import transforms
 from polarguide.visualization import figures
 
@@ -94,7 +93,7 @@ def main() -> None:
     views = opened.scene.test_views[: arguments.views]
     frames = transforms({view.name: view.camera for view in views})["frames"]
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        export(arguments.run, format=arguments.format, out=Path(folder))
+        opened.export(arguments.format, folder)
         file = f"splats.{arguments.format}"
 
         def answer(route) -> None:
@@ -123,7 +122,7 @@ def main() -> None:
             address = page.evaluate("(text) => show(JSON.parse(text))", json.dumps(frame))
             data = np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8)
             found = np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
-            result = opened.render(view)
+            result = opened.result(view.camera).to("cpu")
             ours = figures.radiance_to_rgb(result.final)
             diffuse = figures.radiance_to_rgb(result.base if result.diffuse is None else result.diffuse)
             scores.append((psnr(found, ours), psnr(diffuse, ours)))

@@ -19,8 +19,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 import torch
 
 from polarguide import _native
+from polarguide.api import Run, open_run
 from polarguide.capture import View
-from polarguide.cli.common import OpenRun, open_run
 from polarguide.shading.gbuffer import render
 
 ROUNDS = 7
@@ -32,17 +32,17 @@ def milliseconds(draw: Callable[[], object]) -> float:
     return 1e3 * (time.perf_counter() - begin)
 
 
-def measure(opened: OpenRun, rounds: int) -> None:
-    rows, rasterize = opened.state.gaussians, opened.backend.rasterize
+def measure(opened: Run, rounds: int) -> None:
+    rows, rasterize = opened.model.state.gaussians, opened.model.backend.rasterize
 
     def plain(view: View) -> object:
         return render(rows, view.camera, rasterize, normals=False)
 
     def layers(view: View) -> object:
-        return opened.render(view)
+        return opened.result(view.camera, depth=False).to("cpu")
 
     def layers_and_depth(view: View) -> object:
-        return opened.render(view, depth=True)
+        return opened.result(view.camera).to("cpu")
 
     ways = (plain, layers, layers_and_depth)
     views = opened.scene.test_views

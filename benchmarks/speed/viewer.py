@@ -19,7 +19,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 import cv2
 import torch
 
-from polarguide.cli.common import open_run
+from polarguide.api import open_run
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import LAYERS

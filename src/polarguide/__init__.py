@@ -1,6 +1,7 @@
 """polarguide: polarization photographs to a Gaussian splatting scene with its reflections separated.
 
-``polarguide.load(RUN)`` opens a trained run; see ``polarguide.api``.
+``train`` trains on a scene folder and gives a ``Run``; ``open_run`` opens one that was trained before. Names are loaded
+when they are first asked for, so that ``import polarguide`` costs nothing.
 """
 
 from __future__ import annotations
@@ -9,20 +10,103 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from polarguide.api import Model, PolarguideError, load
+    from polarguide import optics
+    from polarguide.api import (
+        Run,
+        demo_scene,
+        inspect,
+        open_run,
+        prepare,
+        priors,
+        train,
+    )
+    from polarguide.capture import Scene, load_scene
+    from polarguide.errors import PolarguideError, PolarguideWarning
     from polarguide.experiments.ablate import ablate
     from polarguide.experiments.compare import compare
+    from polarguide.experiments.options import CompareOptions
+    from polarguide.inspection.settings import InspectSettings
+    from polarguide.options import SceneOptions, SessionOptions
+    from polarguide.preparation.settings import PrepareSettings
+    from polarguide.progress import Reporter
+    from polarguide.training.recipe import Recipe
+    from polarguide.training.settings import TrainSettings
 
-__version__ = "0.1.0"
-__all__ = ["Model", "PolarguideError", "__version__", "ablate", "compare", "load"]
+    __version__: str
+
+_MODULES = {
+    "CompareOptions": "experiments.options",
+    "InspectSettings": "inspection.settings",
+    "PolarguideError": "errors",
+    "PolarguideWarning": "errors",
+    "PrepareSettings": "preparation.settings",
+    "Recipe": "training.recipe",
+    "Reporter": "progress",
+    "Run": "api",
+    "Scene": "capture",
+    "SceneOptions": "options",
+    "SessionOptions": "options",
+    "TrainSettings": "training.settings",
+    "ablate": "experiments.ablate",
+    "compare": "experiments.compare",
+    "demo_scene": "api",
+    "inspect": "api",
+    "load_scene": "capture",
+    "open_run": "api",
+    "prepare": "api",
+    "priors": "api",
+    "train": "api",
+}
+"""Where each public name is defined, below the package."""
+
+__all__ = [
+    "CompareOptions",
+    "InspectSettings",
+    "PolarguideError",
+    "PolarguideWarning",
+    "PrepareSettings",
+    "Recipe",
+    "Reporter",
+    "Run",
+    "Scene",
+    "SceneOptions",
+    "SessionOptions",
+    "TrainSettings",
+    "__version__",
+    "ablate",
+    "compare",
+    "demo_scene",
+    "inspect",
+    "load_scene",
+    "open_run",
+    "optics",
+    "prepare",
+    "priors",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:
-    # Only when it is asked for: the command line has to say how threads wait before torch is imported.
-    if name in ("Model", "PolarguideError", "load"):
-        from polarguide import api
+    if name == "__version__":
+        value: Any = _version()
+    elif name == "optics":
+        return importlib.import_module("polarguide.optics")
+    elif name in _MODULES:
+        value = getattr(importlib.import_module(f"polarguide.{_MODULES[name]}"), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
 
-        return getattr(api, name)
-    if name in ("ablate", "compare"):
-        return getattr(importlib.import_module(f"polarguide.experiments.{name}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _version() -> str:
+    """The installed version; pyproject.toml states it."""
+    metadata = importlib.import_module("importlib.metadata")
+    try:
+        return str(metadata.version("polarguide"))
+    except metadata.PackageNotFoundError:  # run from a checkout that is not installed
+        return "0+unknown"

@@ -15,7 +15,7 @@ from polarguide.cli.app import run
 
 def main() -> None:
     """Entry point of the command line."""
-    # pycolmap prints a stack trace at this signal; a process that is asked to end should just end.
+    # As Ctrl-C does, so that whatever is open is closed.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(run(sys.argv[1:]))
 

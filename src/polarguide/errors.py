@@ -27,6 +27,10 @@ class PolarguideError(Exception):
         self.remedy = remedy
 
 
+class PolarguideWarning(UserWarning):
+    """Something that the user should know before relying on a result."""
+
+
 def optional_import(module: str, what: str, *, install: str = "'polarguide[export]'") -> Any:
     """Import a library that most verbs do without.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import subprocess
 import sys
@@ -9,7 +10,9 @@ import sys
 import pytest
 
 from polarguide import __version__
-from polarguide.cli.app import VERBS, run
+from polarguide.cli.app import VERBS, function_of, options_of, run
+
+HEAVY = ("torch", "scipy", "pycolmap", "cv2", "viser")
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -21,13 +24,35 @@ def test_help_of_every_verb_names_and_explains_every_flag(
         run([verb, "--help"])
     assert not stop.value.code
     text = capsys.readouterr().out
-    about = inspect.getdoc(VERBS[verb]) or ""
+    function = function_of(verb)
+    about = inspect.getdoc(function) or ""
     assert about.splitlines()[0] in text
-    for parameter in inspect.signature(VERBS[verb]).parameters.values():
-        if parameter.kind is parameter.KEYWORD_ONLY:
-            flag = f"--{parameter.name.replace('_', '-')}"
-            assert f"{flag} " in text or f"{flag}, --no-" in text, parameter.name
-        assert f"{parameter.name}:" in about, f"{parameter.name} is not explained"
+    for parameter in inspect.signature(function).parameters.values():
+        fields, explained = [parameter.name], about
+        if dataclasses.is_dataclass(parameter.default):
+            fields = [field.name for field in dataclasses.fields(parameter.default)]
+            explained = "\n".join(kind.__doc__ or "" for kind in type(parameter.default).__mro__)
+        for name in fields:
+            if parameter.kind is parameter.KEYWORD_ONLY:
+                flag = f"--{name.replace('_', '-')}"
+                assert f"{flag} " in text or f"{flag}, --no-" in text, name
+            assert f"{name}:" in explained, f"{name} is not explained"
+        assert set(fields) <= set(options_of(function))
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["--version"], ["trian"], [], *([verb, "--help"] for verb in VERBS)]
+)
+def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
+    code = (
+        "import sys\nfrom polarguide.__main__ import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        f"print('loaded:', *[name for name in {HEAVY} if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "loaded:"
 
 
 def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,10 +52,10 @@ def test_a_training_leaves_a_whole_run(trained: Path) -> None:
 def test_the_ply_opens_in_an_independent_reader(trained: Path) -> None:
     vertex = PlyData.read(str(trained / PLY))["vertex"]
     tensors = load_file(trained / CHECKPOINT)
-    assert vertex.count == len(tensors["rows.means"])
+    assert vertex.count == len(tensors["gaussians.means"])
     for column, name in enumerate("xyz"):
-        np.testing.assert_array_equal(vertex[name], tensors["rows.means"][:, column].numpy())
-    np.testing.assert_array_equal(vertex["opacity"], tensors["rows.opacity_logits"].numpy())
+        np.testing.assert_array_equal(vertex[name], tensors["gaussians.means"][:, column].numpy())
+    np.testing.assert_array_equal(vertex["opacity"], tensors["gaussians.opacity_logits"].numpy())
     rotation = np.stack([vertex[f"rot_{i}"] for i in range(4)], axis=1)
     np.testing.assert_allclose(np.linalg.norm(rotation, axis=1), 1, rtol=1e-5)
     names = {p.name for p in vertex.properties}
@@ -72,7 +72,7 @@ def test_eval_writes_a_valid_record(
     validate_metrics(record)
     assert tuple(sorted(record["views"])) == TEST_VIEWS
     assert record["steps"] == 40
-    assert record["gaussians"] == len(load_file(trained / CHECKPOINT)["rows.means"])
+    assert record["gaussians"] == len(load_file(trained / CHECKPOINT)["gaussians.means"])
     assert record["provenance"]["recipe"] == "polarguide-stokes"
     assert record["provenance"]["downscale"] == 4
     assert 5 < record["psnr"] < 60

@@ -12,12 +12,12 @@ import pytest
 import torch
 from other_device import BACKEND, OtherDevice
 
+from polarguide.api import Run, open_run
 from polarguide.capture import load_scene
-from polarguide.cli.common import OpenRun, open_run
-from polarguide.cli.evaluate import evaluate_run
-from polarguide.cli.render import render_views
+from polarguide.cli.render import render
 from polarguide.evaluation import ViewTarget, score_view
 from polarguide.inspection.short_run import short_run, surface_of
+from polarguide.options import ComputeOptions
 from polarguide.scene_frame import scene_frame
 from polarguide.viewer import shown_run
 from polarguide.viewer.appearance import Appearance, Crop, Painter
@@ -39,17 +39,17 @@ def test_scores_are_made_there_and_read_once_a_view(run: Path) -> None:
     with OtherDevice() as device:
         opened = open_run(run)
         before = device.waits
-        record = evaluate_run(opened, speed=False)
+        record = opened.evaluate()
         assert device.waits - before == len(record["views"]) > 1
         view = opened.scene.test_views[0]
         given = view.photograph(), view.invalid, view.ground_truth
-        result = opened.draw(view)
+        result = opened.model.render(view.camera)
         there = score_view(ViewTarget.of(*given, BACKEND.device), result)
         here = score_view(ViewTarget.of(*given, torch.device("cpu")), result.to("cpu"))
         with pytest.raises(RuntimeError, match="mixes devices"):
             score_view(ViewTarget.of(*given, torch.device("cpu")), result)
     assert there == here == record["views"][view.name]
-    by_cpu = evaluate_run(open_run(run, device="cpu"), speed=False)
+    by_cpu = open_run(run, device="cpu").evaluate()
     assert record["psnr"] == pytest.approx(by_cpu["psnr"], abs=0.01)
     assert record["specular_psnr"] == pytest.approx(by_cpu["specular_psnr"], abs=0.01)
 
@@ -60,12 +60,19 @@ def test_pictures_by_other_light_and_along_a_path(run: Path, tmp_path: Path) -> 
     layers = "final,reflection,specular,normal,depth,strength"
 
     def shown(device: str, out: Path) -> np.ndarray:
-        render_views(run, layers=layers, environment=light, rotate_environment=30, out=out, device=device)
+        render(
+            run,
+            layers=layers,
+            environment=light,
+            rotate_environment=30,
+            out=out,
+            compute=ComputeOptions(device=device),
+        )
         return cv2.imread(str(out / "contact_sheet.png")).astype(int)
 
     with OtherDevice():
         there = shown("auto", tmp_path / "there")
-        render_views(run, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path)
+        render(run, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path)
     assert len(list(tmp_path.glob("path_*.png"))) == 2
     # Depth's colors jump where nothing is seen, so a few pixels may differ by much.
     assert float((np.abs(there - shown("cpu", tmp_path / "here")) > 2).mean()) < 0.01
@@ -98,7 +105,7 @@ def test_the_viewer_draws_what_lies_there(run: Path) -> None:
         for layer in ("final", "specular", "normal", "depth", "error")
     ]
 
-    def drawn(opened: OpenRun) -> list[np.ndarray]:
+    def drawn(opened: Run) -> list[np.ndarray]:
         view = opened.scene.test_views[0]
         painter = Painter(scene_frame(list(opened.cameras.values())))
         pictures = [painter.paint(shown_run(opened), view.camera, look, view) for look in chosen]

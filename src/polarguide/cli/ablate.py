@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import polarguide
-from polarguide.cli.compare import Options, Scenes, Settings, print_results, signals_as_interrupts
+from polarguide.cli.compare import Options, Scenes, Settings, print_results
 from polarguide.cli.job_progress import JobReporter
+from polarguide.system import signals_as_interrupts
 
 
 def ablate(

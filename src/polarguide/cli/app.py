@@ -1,7 +1,10 @@
-"""The command line: one verb a file, and the one place where errors are printed."""
+"""The command line: verbs by name, loaded when they are called, and the one place where errors are printed."""
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,40 +13,47 @@ import tyro
 from rich.console import Console
 
 from polarguide import __version__
-from polarguide.cli.ablate import ablate
-from polarguide.cli.compare import compare
-from polarguide.cli.demo import demo
-from polarguide.cli.evaluate import evaluate
-from polarguide.cli.export import export
-from polarguide.cli.inspect import inspect
-from polarguide.cli.prepare import prepare
-from polarguide.cli.priors import priors
-from polarguide.cli.render import render_views
-from polarguide.cli.share import share
-from polarguide.cli.synth import synth
-from polarguide.cli.train import train
-from polarguide.cli.view import view
+from polarguide.cli.console import warnings_printed
 from polarguide.errors import PolarguideError
 
-VERBS: dict[str, Callable[..., Any]] = {
-    "demo": demo,
-    "prepare": prepare,
-    "inspect": inspect,
-    "train": train,
-    "eval": evaluate,
-    "render": render_views,
-    "view": view,
-    "share": share,
-    "export": export,
-    "priors": priors,
-    "compare": compare,
-    "ablate": ablate,
-    "synth": synth,
+VERBS = {
+    "demo": "demo",
+    "prepare": "prepare",
+    "inspect": "inspect",
+    "train": "train",
+    "eval": "evaluate",
+    "render": "render",
+    "view": "view",
+    "share": "share",
+    "export": "export",
+    "priors": "priors",
+    "compare": "compare",
+    "ablate": "ablate",
+    "synth": "synth",
 }
+"""The module of each verb, whose function has the module's name. None of them imports torch before it is called."""
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "
     "normals and diffuse color."
 )
+
+
+def function_of(verb: str) -> Callable[..., Any]:
+    """What a verb calls; its signature and docstring are the verb's options and help."""
+    module = importlib.import_module(f"polarguide.cli.{VERBS[verb]}")
+    function: Callable[..., Any] = getattr(module, VERBS[verb])
+    # Options that several verbs share are the fields of dataclasses, and are called as these are.
+    return tyro.conf.configure(tyro.conf.OmitArgPrefixes)(function)
+
+
+def options_of(function: Callable[..., Any]) -> list[str]:
+    """Names of all parameters, those in dataclasses included."""
+    names = []
+    for parameter in inspect.signature(function).parameters.values():
+        shared = parameter.default
+        known = dataclasses.is_dataclass(shared)
+        names += [field.name for field in dataclasses.fields(shared)] if known else [parameter.name]
+    return names
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -52,13 +62,13 @@ def run(arguments: Sequence[str]) -> int:
     if list(arguments) == ["--version"]:
         print(f"polarguide {__version__}")
         return 0
+    verb = arguments[0] if arguments and arguments[0] in VERBS else None
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            VERBS, prog="polarguide", description=DESCRIPTION, args=arguments, sort_subcommands=False
-        )
+        with warnings_printed():
+            _call(verb, arguments)
     except PolarguideError as error:
         errors.print("[bold red]error:[/] ", end="")
-        errors.print(str(error), markup=False)
+        errors.print(_as_flag(error, verb), markup=False)
         return 2
     except KeyboardInterrupt:
         errors.print("stopped.")
@@ -71,3 +81,21 @@ def run(arguments: Sequence[str]) -> int:
         errors.print(f"{error.filename or 'files'}: {error.strerror or error}.", markup=False)
         return 2
     return 0
+
+
+def _call(verb: str | None, arguments: Sequence[str]) -> None:
+    if verb is not None:
+        tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=arguments[1:])
+        return
+    verbs = {name: function_of(name) for name in VERBS}
+    tyro.extras.subcommand_cli_from_dict(
+        verbs, prog="polarguide", description=DESCRIPTION, args=arguments, sort_subcommands=False
+    )
+
+
+def _as_flag(error: PolarguideError, verb: str | None) -> str:
+    """The message; a parameter that is at fault is called as on the command line."""
+    text = str(error)
+    if verb is not None and error.where in options_of(function_of(verb)):
+        return f"--{error.where.replace('_', '-')}{text.removeprefix(error.where)}"
+    return text

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
-from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -16,18 +12,22 @@ from polarguide.cli.console import console
 from polarguide.cli.job_progress import JobReporter
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
+from polarguide.system import signals_as_interrupts
 from polarguide.training.settings import TrainSettings
 
 if TYPE_CHECKING:
     from polarguide.experiments.results import Results
 
 
-def compared_settings(steps: int = 5000, refractive_index: float = 1.5) -> TrainSettings:
-    """Those settings of a training that a comparison has one value of; their texts are those of ``train``."""
-    return TrainSettings(steps=steps, seed=0, refractive_index=refractive_index)
+def compared_settings(
+    steps: int = TrainSettings.steps, refractive_index: float = TrainSettings.refractive_index
+) -> TrainSettings:
+    return TrainSettings(steps=steps, refractive_index=refractive_index)
 
 
-compared_settings.__doc__ = TrainSettings.__doc__
+compared_settings.__doc__ = (
+    TrainSettings.__doc__
+)  # of these options; the seeds are counted, the others are fixed
 Scenes = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE ...")]
 Settings = Annotated[TrainSettings, tyro.conf.arg(name="", constructor=compared_settings)]
 Options = Annotated[CompareOptions, tyro.conf.arg(name="")]
@@ -75,18 +75,3 @@ def print_results(results: Results, out: Path) -> None:
             found=f"that {len(failed)} failed ({errors})",
             remedy="What there is has been written. Remove the cause and give the same command again.",
         )
-
-
-@contextlib.contextmanager
-def signals_as_interrupts() -> Iterator[None]:
-    """SIGTERM and SIGHUP act like Ctrl-C."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    old = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)

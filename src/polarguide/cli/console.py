@@ -1,7 +1,39 @@
-"""The console that all verbs print to."""
+"""The console: what is printed where, and warnings as lines of it."""
 
 from __future__ import annotations
 
+import contextlib
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
 from rich.console import Console
 
-console = Console(highlight=False, soft_wrap=True)
+from polarguide.errors import PolarguideWarning
+from polarguide.system import process_rank
+
+# Of several processes of one training, the first alone talks.
+console = Console(highlight=False, soft_wrap=True, quiet=process_rank() > 0)
+
+
+def warn(text: object) -> None:
+    """Print a warning; names in it are shown as they are."""
+    console.print("[yellow]warning:[/] ", end="")
+    console.print(str(text), markup=False)
+
+
+@contextlib.contextmanager
+def warnings_printed() -> Iterator[None]:
+    """Inside, the library's warnings are lines on the console."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", PolarguideWarning)
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, PolarguideWarning):
+                warn(message)
+            else:
+                others(message, category, *where, **more)
+
+        warnings.showwarning = show
+        yield

@@ -2,41 +2,41 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
-from polarguide.cli.common import console, open_run, use_threads
-from polarguide.cli.evaluate import evaluate_run
-from polarguide.cli.render import render_run
+import polarguide
+from polarguide.cli.console import console
+from polarguide.cli.evaluate import evaluate
+from polarguide.cli.render import render
 from polarguide.cli.train import train
-from polarguide.errors import PolarguideError
-from polarguide.runs.folder import CONFIGURATION
-from polarguide.shading.result import LAYERS
+from polarguide.options import ComputeOptions, SessionOptions, ThreadOptions
+from polarguide.training.settings import TrainSettings
 
 STEPS = 2000
 
 
-def demo(*, out: Path = Path("runs/demo"), steps: int = STEPS, seed: int = 0, threads: int = 0) -> None:
+def demo(
+    *,
+    out: Path = Path("runs/demo"),
+    steps: int = STEPS,
+    seed: int = 0,
+    machine: ThreadOptions = ThreadOptions(),
+) -> None:
     """Train, evaluate and render the small scene that ships with the program.
 
     Args:
         out: Run folder to write; a finished or interrupted demo there is gone on with.
         steps: Optimizer steps.
         seed: Seed of every random draw.
-        threads: Threads to use; 0 takes all cores.
     """
-    use_threads(threads)
-    with resources.as_file(resources.files("polarguide") / "data" / "demo") as scene:
-        if not scene.is_dir():
-            raise PolarguideError(
-                scene, expected="the demo scene", found="nothing", remedy="Install the package again."
-            )
+    with polarguide.demo_scene() as scene:
         console.print(f"scene: {scene} (27 views of glossy objects, four polarizer angles each)")
-        train(scene, out=out, steps=steps, seed=seed, threads=threads, resume=(out / CONFIGURATION).exists())
-        opened = open_run(out)
-        evaluate_run(opened)
-        sheet = render_run(
-            opened, opened.scene.test_views, [n for n in LAYERS if n != "alpha"], out / "render"
-        )
-    console.print(f"look at {sheet}: rows are rendered and true pictures, columns are layers")
+        settings = TrainSettings(steps, seed, views_per_step=0)
+        session = SessionOptions(threads=machine.threads)
+        train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
+        evaluate(out, compute=ComputeOptions(machine.threads))
+        render(out)
+    console.print(
+        f"look at {out / 'render' / 'contact_sheet.png'}: rows are rendered and true pictures, columns are layers"
+    )
     console.print(f"look around: polarguide view {out}")

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from polarguide.cli.console import console
+from polarguide.cli.console import console, warn
 from polarguide.progress import Advance, Reporter
 
 
 class ConsoleReporter(Reporter):
-    """What work reports, printed; bars disappear when they are full."""
+    """What work reports, printed. Bars disappear at the end, but for those with a note."""
 
     def say(self, text: str) -> None:
         """Print a finding; brackets in it are shown as they are."""
@@ -20,8 +20,7 @@ class ConsoleReporter(Reporter):
 
     def warn(self, text: str) -> None:
         """Print a warning."""
-        console.print("[yellow]warning:[/] ", end="")
-        console.print(text, markup=False)
+        warn(text)
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
@@ -37,6 +36,7 @@ class ConsoleReporter(Reporter):
             task = progress.add_task(label, total=total, note="")
 
             def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+                progress.live.transient = not note
                 progress.update(task, completed=done, total=total, note=note)
 
             yield advance

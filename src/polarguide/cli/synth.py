@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from polarguide.cli.common import console, use_threads
+from polarguide.cli.console import console
 from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.threads import use_threads
 from polarguide.errors import PolarguideError
-from polarguide.synth.manifest import MANIFEST, scene_digest
-from polarguide.synth.render import synthesize
-from polarguide.synth.settings import Overrides, SynthSettings, find_scene
-from polarguide.synth.sweep import parse_sweep, sweep_scenes
+from polarguide.options import ThreadOptions
 
 
 def synth(
@@ -33,7 +32,7 @@ def synth(
     sweep: str | None = None,
     color: Literal["rgb", "spectral"] = "rgb",
     ground_truth: Literal["test", "all"] = "test",
-    threads: int = 0,
+    machine: ThreadOptions = ThreadOptions(),
 ) -> None:
     """Render a polarized scene with ground truth: figure, kit, car, cup, water, proof, or a scene file.
 
@@ -55,12 +54,14 @@ def synth(
         sweep: A family of scenes, such as views=9,18,36,63 or noise=0,1,2,4; also roughness, index and spacing.
         color: Three channels with exact values, or a sampled spectrum.
         ground_truth: Views that get ground truth.
-        threads: Threads to use; 0 takes all cores.
     """
+    threads = machine.threads
     use_threads(threads)
+    reporter = ConsoleReporter()
+    asked = import_module("polarguide.synth.settings")
     width, height = _size(size)
-    overrides = Overrides(views=views, spacing=spacing, roughness=roughness, index=index)
-    settings = SynthSettings(
+    overrides = asked.Overrides(views=views, spacing=spacing, roughness=roughness, index=index)
+    settings = asked.SynthSettings(
         width=width,
         height=height,
         samples=samples,
@@ -70,14 +71,19 @@ def synth(
         color=color,
         ground_truth=ground_truth,
     )
-    spec = find_scene(scene)
+    spec = asked.find_scene(scene)
     if sweep is not None:
-        family = parse_sweep(sweep)
-        folders = sweep_scenes(spec, out, settings, overrides, family, ConsoleReporter(), threads=threads)
+        sweeps = import_module("polarguide.synth.sweep")
+        family = sweeps.parse_sweep(sweep)
+        folders = sweeps.sweep_scenes(spec, out, settings, overrides, family, reporter, threads=threads)
         console.print(f"scenes: {' '.join(str(folder) for folder in folders)}", markup=False)
         return
-    done = synthesize(overrides.apply(spec), out, settings, ConsoleReporter(), threads=threads)
-    console.print(f"scene: {done}   SHA-256 of its {MANIFEST}: {scene_digest(done)}", markup=False)
+    render = import_module("polarguide.synth.render")
+    done = render.synthesize(overrides.apply(spec), out, settings, reporter, threads=threads)
+    manifest = import_module("polarguide.synth.manifest")
+    console.print(
+        f"scene: {done}   SHA-256 of its {manifest.MANIFEST}: {manifest.scene_digest(done)}", markup=False
+    )
     if sensor == "ideal":
         console.print(f"next: polarguide train {done} --out runs/{done.name}", markup=False)
     else:

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.common import console, open_run, use_threads
-from polarguide.raster import DeviceName
-from polarguide.viewer import LOOPBACK, Viewer, photographs, shown_run
+import polarguide
+from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.threads import use_threads
+from polarguide.options import LOOPBACK, ComputeOptions
 
 
 def view(
@@ -18,8 +19,7 @@ def view(
     *,
     host: str = LOOPBACK[0],
     port: int = 8080,
-    device: DeviceName = "auto",
-    threads: int = 0,
+    compute: ComputeOptions = ComputeOptions(),
 ) -> None:
     """Look at a run in a browser: its layers from any side, beside the photographs. Ctrl-C ends it.
 
@@ -27,32 +27,8 @@ def view(
         run: Run folder.
         host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
         port: To listen at; the next free one is taken if it is in use.
-        device: What to compute on.
-        threads: Threads to use; 0 takes all cores.
     """
-    use_threads(threads)
-    opened = open_run(run, device=device)
-    shown = shown_run(opened)
-    viewer = Viewer(
-        lambda: shown,
-        photographs(opened.scene),
-        shading=opened.shading,
-        host=host,
-        port=port,
-        title=f"polarguide {run.resolve().name}",
-    )
-    announce(viewer, host)
-    try:
-        while True:
-            viewer.serve(1.0)
-    finally:
-        viewer.close()
-
-
-def announce(viewer: Viewer, host: str) -> None:
-    """Say where to look, and warn of strangers."""
-    if host not in LOOPBACK:
-        console.print(
-            f"[yellow]warning:[/] whoever reaches {host} over the network can look: there is no password"
-        )
-    console.print(f"viewer: {viewer.address}")
+    use_threads(compute.threads)
+    reporter = ConsoleReporter()
+    opened = polarguide.open_run(run, device=compute.device, reporter=reporter)
+    opened.view(host=host, port=port, reporter=reporter)

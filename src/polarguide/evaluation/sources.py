@@ -16,7 +16,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 TRAINED_BY = ("training/trainer.py", "capture/reader.py", "raster/backends.py", "recipes/__init__.py")
 """What trains, and what makes its scene, backend and shading: with all that they import, they decide the result."""
-SCORED_BY = ("cli/evaluate.py",)
+SCORED_BY = ("evaluation/evaluate.py",)
 """What decides, beside that, the numbers of a finished training."""
 DATA = "recipes"
 """What is followed but does not count."""

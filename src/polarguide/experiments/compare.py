@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from polarguide.errors import PolarguideError
@@ -21,6 +21,7 @@ from polarguide.files import make_folder
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
+from polarguide.system import exclusive_lock
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
@@ -32,7 +33,7 @@ def compare(
     recipes: Sequence[str | Recipe],
     out: str | os.PathLike[str],
     *,
-    settings: TrainSettings = TrainSettings(5000, 0),
+    settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,
 ) -> Results:
@@ -59,7 +60,7 @@ def compare(
     comparison = Comparison(
         scenes=tuple(Path(scene) for scene in scenes),
         recipes=_checked_recipes(recipes),
-        settings=settings,
+        settings=replace(settings, views_per_step=settings.views_per_step or 1),  # a run is one process
         options=options,
         out=Path(out),
     )
@@ -179,9 +180,9 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Keep two comparisons out of one folder. Children inherit the lock and hold it if the parent is killed."""
-    with open(folder / LOCK, "w") as file:
+    with contextlib.ExitStack() as stack:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            stack.enter_context(exclusive_lock(folder / LOCK))
         except BlockingIOError:
             raise PolarguideError(
                 folder,
@@ -189,5 +190,4 @@ def _locked(folder: Path) -> Iterator[None]:
                 found="another comparison at work in it",
                 remedy="Wait for it, or give another --out.",
             ) from None
-        os.set_inheritable(file.fileno(), True)
         yield

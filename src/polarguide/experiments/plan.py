@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from polarguide import __version__
-from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import read_metrics
 from polarguide.evaluation.sources import scoring_digest, training_digest
@@ -23,6 +22,7 @@ from polarguide.experiments.options import CompareOptions
 from polarguide.options import SceneOptions
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration, recipe_data
+from polarguide.runs.opened import read_scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
@@ -190,11 +190,3 @@ def run_key(
     parts = [scene_digest, recipe, asdict(settings), asdict(reading), code]
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
-
-
-def read_scene(path: Path, options: SceneOptions, reporter: Reporter) -> Scene:
-    """Load a scene, with progress, and pass on its warnings."""
-    scene = load_scene(path, downscale=options.downscale, transfer=options.transfer, reporter=reporter)
-    for warning in scene.warnings:
-        reporter.warn(warning)
-    return scene

@@ -16,12 +16,12 @@ from polarguide.capture import View
 from polarguide.evaluation.metrics import normal_angles_deg
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash, read_curve
-from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, read_scene
+from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import Block, ShownCell, blocks, formatted, notes, shown_columns
 from polarguide.files import write_text
-from polarguide.progress import SILENT, Reporter
-from polarguide.runs.opened import TrainedRun, open_trained
+from polarguide.progress import Reporter
+from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import LAYERS, EmbeddedView, Tile, chosen_views, embed
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
@@ -96,8 +96,8 @@ def _scene_views(
     comparison: Comparison, entry: SceneEntry, runs: Sequence[PlannedRun], names: Sequence[str], limit: int
 ) -> Iterator[tuple[EmbeddedView | None, str | None]]:
     """The named views of one scene, as ``embed`` gives them; ``limit`` in bytes for each."""
-    scene = read_scene(entry.path, comparison.options, SILENT)
-    opened = [open_trained(run.folder, device=comparison.options.device) for run in runs]
+    scene = read_scene(entry.path, comparison.options)
+    opened = [OpenedRun.open(run.folder, device=comparison.options.device) for run in runs]
     scores = [(run.metrics() or {})["views"] for run in runs]
     for name in names:
         view = scene.view(name)
@@ -111,9 +111,9 @@ def _ground_truth_tile(view: View) -> Tile:
     return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
 
 
-def _tile(run: TrainedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
+def _tile(run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
     """What one run shows of one view."""
-    result = run.render_camera(view.camera).to("cpu")
+    result = run.model.render(view.camera).to("cpu")
     pictures: dict[str, Picture] = {}
     for layer in ("final", "diffuse", "specular", "normal"):
         picture = layer_picture(result, layer, view.camera)

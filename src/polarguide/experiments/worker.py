@@ -9,11 +9,14 @@ from typing import Any
 
 import msgspec
 
-from polarguide.cli.evaluate import evaluate
-from polarguide.cli.train import train
 from polarguide.errors import PolarguideError
-from polarguide.options import DeviceName, Transfer
+from polarguide.evaluation.evaluate import evaluate
+from polarguide.options import DeviceName, SceneOptions, SessionOptions, Transfer
+from polarguide.raster import use_threads
 from polarguide.records import decode, to_json
+from polarguide.runs.opened import OpenedRun
+from polarguide.runs.train import train
+from polarguide.system import StopSignals
 from polarguide.training.settings import TrainSettings
 
 PACKAGE = Path(__file__).parents[1]
@@ -55,7 +58,7 @@ Task = Training | Scoring
 
 def main() -> int:
     """Do the task on standard input; returns the exit status (0 done, 130 stopped, 2 wrong input, with one line)."""
-    # pycolmap prints a stack trace at this signal; a process that is asked to end should just end.
+    # As Ctrl-C does, so that whatever is open is closed.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         kind: Any = Task
@@ -83,20 +86,18 @@ def do(task: Task) -> None:
         PolarguideError: the input is wrong, or the training has diverged.
         KeyboardInterrupt: stopped by SIGINT; a training has saved its state.
     """
+    use_threads(task.threads)
     if isinstance(task, Scoring):
-        evaluate(Path(task.folder), speed=task.speed, device=task.device, threads=task.threads)
+        evaluate(OpenedRun.open(task.folder, device=task.device), speed=task.speed)
         return
-    train(
-        Path(task.scene),
-        out=Path(task.folder),
-        recipe=task.recipe,
-        steps=task.settings.steps,
-        seed=task.settings.seed,
-        refractive_index=task.settings.refractive_index,
-        views_per_step=task.settings.views_per_step,
-        downscale=task.downscale,
-        transfer=task.transfer,
-        device=task.device,
-        threads=task.threads,
-        resume=task.resume,
-    )
+    with StopSignals() as should_stop:
+        train(
+            task.scene,
+            task.folder,
+            recipe=task.recipe,
+            settings=task.settings,
+            session=SessionOptions(task.threads, task.device),
+            reading=SceneOptions(task.downscale, task.transfer),
+            resume=task.resume,
+            should_stop=should_stop,
+        )

@@ -1,6 +1,7 @@
 """Splatting of Gaussians with any channels: one interface, a reference implementation, and fast backends."""
 
-from polarguide.raster.backends import Backend, DeviceName, choose_backend, use_threads
+from polarguide.options import DeviceName
+from polarguide.raster.backends import Backend, choose_backend, use_threads
 from polarguide.raster.interface import Rasterize, Rasterized, ScreenStatistic, Splats
 from polarguide.raster.reference import rasterize_reference
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from polarguide import _native
 from polarguide.errors import PolarguideError
+from polarguide.options import DeviceName
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
 from polarguide.raster.interface import Rasterize
-
-DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 class Backend(NamedTuple):

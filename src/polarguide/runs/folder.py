@@ -8,11 +8,8 @@ RUN/point_cloud.ply     for other viewers, at the end
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +19,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from polarguide.files import atomic
 from polarguide import __version__
 from polarguide.errors import PolarguideError
+from polarguide.files import atomic, write_text
+from polarguide.options import Transfer
+from polarguide.records import decode
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import TrainSettings
 
 CONFIGURATION = "run.json"
 CHECKPOINT = "checkpoint.safetensors"
@@ -54,60 +53,58 @@ class RunConfiguration:
     recipe_data: dict[str, Any]
     settings: TrainSettings
     downscale: int
-    transfer: str
+    transfer: Transfer
     device: str
     version: str = __version__
 
     def save(self, run: Path) -> None:
         """Write ``run.json``."""
-        with atomic(run / CONFIGURATION) as path:
-            path.write_text(json.dumps(dataclasses.asdict(self), indent=1) + "\n")
+        write_text(run / CONFIGURATION, json.dumps(dataclasses.asdict(self), indent=1) + "\n")
 
     @classmethod
     def load(cls, run: Path) -> RunConfiguration:
         """Read ``run.json``.
 
         Raises:
-            PolarguideError: not a run folder, or a file that is not what this version writes.
+            PolarguideError: not a run folder, a run of another version, or a file that is no configuration.
         """
         path = run / CONFIGURATION
         try:
-            data = json.loads(path.read_text())
-            data["settings"] = TrainSettings(**data["settings"])
-            configuration = cls(**data)
-            _check_types(configuration)
-            _check_types(configuration.settings)
-            return configuration
-        except FileNotFoundError:
+            data = path.read_bytes()
+        except (FileNotFoundError, NotADirectoryError):
             raise PolarguideError(
                 run,
                 expected=f"a run folder with {CONFIGURATION}",
                 found="none",
-                remedy="Give the --out of a training.",
+                remedy="Give the folder that a training wrote.",
             ) from None
-        except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError) as error:
+        remedy = "Restore the file, or train again into a new folder."
+        written = decode(data, _Written, path, remedy=remedy).version
+        if _series(written) != _series(__version__):
             raise PolarguideError(
-                path,
-                expected="the configuration of a run",
-                found=f"something else ({error})",
-                remedy="Restore the file, or train again into a new folder.",
-            ) from None
+                run,
+                expected=f"a run of polarguide {_series(__version__)}",
+                found=f"one of version {written}",
+                remedy=f"Train again into a new folder, or open it with polarguide {_series(written)}.",
+            )
+        return decode(data, cls, path, remedy=remedy)
 
 
-def _check_types(record: Any) -> None:
-    """TypeError where a field of a dataclass with plain types holds another type."""
-    plain: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
-    for field in dataclasses.fields(record):
-        expected, value = plain.get(str(field.type)), getattr(record, field.name)
-        if expected is not None and (not isinstance(value, expected) or isinstance(value, bool)):
-            raise TypeError(f"{field.name} is {value!r}, not {field.type}")
+@dataclass(frozen=True)
+class _Written:
+    """What is read of a run of any version."""
+
+    version: str
+
+
+def _series(version: str) -> str:
+    """The versions that read each other's runs: 0.2 of 0.2.1."""
+    return ".".join(version.split(".")[:2])
 
 
 def recipe_data(recipe: Recipe) -> dict[str, Any]:
     """All values of a recipe as plain JSON types."""
     return recipe.data()
-
-
 
 
 def save_checkpoint(run: Path, state: TrainingState) -> None:
@@ -167,8 +164,7 @@ class RunLog:
                     kept.append(line)
             except (json.JSONDecodeError, KeyError):
                 continue  # a line cut short by a kill
-        with atomic(self._path) as path:
-            path.write_text("".join(line + "\n" for line in kept))
+        write_text(self._path, "".join(line + "\n" for line in kept))
 
     def elapsed(self) -> tuple[float, bool]:
         """Training seconds that the log accounts for, and whether the machine worked for nobody else."""

@@ -1,47 +1,74 @@
-"""A run folder opened for looking at: its Gaussians, its light, and how they make pictures."""
+"""A run folder opened: its configuration, what it learned, its scene when that is asked for, and its layers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.raster import Backend, DeviceName, choose_backend
+from polarguide.capture import Scene, load_scene
+from polarguide.errors import PolarguideError, PolarguideWarning
+from polarguide.options import DeviceName, SceneOptions
+from polarguide.progress import SILENT, Reporter
+from polarguide.raster import Backend, choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.shading.model import ShadingModel
+from polarguide.runs.folder import RunConfiguration, load_checkpoint, recipe_data
 from polarguide.shading.gbuffer import render
-from polarguide.shading.result import RenderResult
-from polarguide.runs.folder import RunConfiguration, load_checkpoint
+from polarguide.shading.model import ShadingModel
+from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
 
-@dataclass(frozen=True, eq=False)
-class TrainedRun:
-    """A trained run, without the scene it was trained on."""
 
-    folder: Path
-    configuration: RunConfiguration
-    recipe: Recipe
+class Model(Protocol):
+    """What was learned, for whoever scores or shows it: layers, however they are made.
+
+    Attributes:
+        device: where layers are rendered.
+    """
+
+    @property
+    def device(self) -> torch.device: ...
+
+    def __len__(self) -> int:
+        """How many primitives (Gaussians) it has."""
+
+    def render(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
+        """All layers; ``normals`` where the model can do without them, and ``depth``, only if asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianModel:
+    """Gaussians, their learned light, and how they are shaded."""
+
     state: TrainingState
+    shading: ShadingModel
     backend: Backend
 
     @property
-    def shading(self) -> ShadingModel:
-        """How its layers combine."""
-        return self.recipe.shading.bind(self.configuration.settings.refractive_index)
+    def device(self) -> torch.device:
+        """Where layers are rendered."""
+        return self.backend.device
 
     @property
     def light(self) -> dict[str, Tensor]:
         """Parameters of the learned light by name; empty for a recipe without."""
         return self.state.light
 
+    def __len__(self) -> int:
+        return len(self.state.gaussians)
+
     @torch.no_grad()
-    def render_camera(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
-        """All layers from a camera; ``normals`` where the recipe can do without them, and ``depth``, on request."""
+    def render(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
+        """All layers; see ``Model``."""
         return render(
             self.state.gaussians,
             camera,
@@ -53,19 +80,184 @@ class TrainedRun:
         )
 
 
-def open_trained(
-    folder: Path, *, device: DeviceName = "auto", say: Callable[[str], None] = lambda _: None
-) -> TrainedRun:
-    """Open a run folder.
+Opened = TypeVar("Opened", bound="OpenedRun")
+
+
+class OpenedRun:
+    """A trained run: what it was trained as, what it learned, and the layers that it renders.
 
     Args:
-        folder: of the run. device: what to compute on. say: told what takes long.
+        folder: of the run.
+        configuration: what it was trained as. recipe: the method.
+        model: what it learned.
+        scene: the scene or its folder, where that is not the folder that the configuration names.
+        reporter: told how far the reading of the scene is.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        configuration: RunConfiguration,
+        recipe: Recipe,
+        model: GaussianModel,
+        *,
+        scene: Scene | str | os.PathLike[str] | None = None,
+        reporter: Reporter = SILENT,
+    ) -> None:
+        self.folder, self.configuration, self.recipe, self.model = folder, configuration, recipe, model
+        self._scene_source, self._reporter = scene, reporter
+
+    def __repr__(self) -> str:
+        gaussians = f"{len(self.model)} Gaussians"
+        return f"<{type(self).__name__} {self.folder}: {self.recipe.name}, {self.steps} steps, {gaussians}>"
+
+    @classmethod
+    def open(
+        cls: type[Opened],
+        folder: str | os.PathLike[str],
+        *,
+        recipe: Recipe | None = None,
+        scene: Scene | str | os.PathLike[str] | None = None,
+        device: DeviceName = "auto",
+        reporter: Reporter = SILENT,
+    ) -> Opened:
+        """Open a run folder. Warns if the recipe has other values now than it was trained with.
+
+        Args:
+            folder: what a training wrote.
+            recipe: the recipe it was trained with, where that is not one of ours.
+            scene: the scene or its folder, where that has moved since; read when it is first asked for.
+            device: what to compute on.
+            reporter: told what takes long.
+
+        Raises:
+            PolarguideError: it is no run folder, is damaged, or belongs to another version.
+        """
+        folder = Path(folder)
+        configuration = RunConfiguration.load(folder)
+        recipe = recipe or recipe_named(configuration.recipe)
+        backend = choose_backend(device, say=reporter.say)
+        state = load_checkpoint(folder, recipe, backend.device)
+        if recipe_data(recipe) != configuration.recipe_data:
+            _warn(
+                f"{folder} was trained with other values of the recipe {recipe.name} than this version has; its "
+                "pictures are shaded with this version's."
+            )
+        model = GaussianModel(state, recipe.shading.bind(configuration.settings.refractive_index), backend)
+        return cls(folder, configuration, recipe, model, scene=scene, reporter=reporter)
+
+    @property
+    def steps(self) -> int:
+        """How many steps it has been trained for."""
+        return self.model.state.step
+
+    @property
+    def gaussians(self) -> dict[str, Tensor]:
+        """Parameters by name, one row a Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Not to be written to."""
+        found = self.model.state.gaussians
+        return {name: found[name].detach() for name in found.names}
+
+    @property
+    def light(self) -> dict[str, Tensor]:
+        """The learned light's parameters, such as ``texels`` [6, R, R, C] raw; empty for a recipe without."""
+        return {name: values.detach() for name, values in self.model.light.items()}
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene it was trained on, read when it is first asked for. Warns if it has changed since.
+
+        Raises:
+            PolarguideError: it is not there any more, or cannot be read.
+        """
+        configuration = self.configuration
+        found = self._scene_source
+        if not isinstance(found, Scene):
+            options = SceneOptions(configuration.downscale, configuration.transfer)
+            found = read_scene(configuration.scene if found is None else found, options, self._reporter)
+        if found.digest != configuration.scene_digest:
+            _warn(f"{found.root} has changed since {self.folder} was trained on it.")
+        return found
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras of the scene's views by name; reads the scene."""
+        return {view.name: view.camera for view in self.scene.views}
+
+    @cached_property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers that this run renders, in the order of ``LAYERS``."""
+        small = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(3).double(), torch.zeros(3).double())
+        found = self.model.render(small, depth=True)
+        return tuple(name for name in LAYERS if getattr(found, name) is not None)
+
+    def result(self, camera: Camera | str, *, normals: bool = True, depth: bool = True) -> RenderResult:
+        """Everything that can be rendered, as one typed record on the run's device.
+
+        Args:
+            camera: any camera, or the name of a view (then the scene is read).
+            normals, depth: whether to render these layers where the recipe can do without them.
+        """
+        chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
+        return self.model.render(chosen, normals=normals, depth=depth)
+
+    def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:
+        """Layers of a picture.
+
+        Args:
+            camera: any camera, or the name of a view (then the scene is read).
+            layers: names in ``layers``.
+
+        Returns:
+            By name: linear radiance [H, W, 3] on the scale of S0/2, world normals [H, W, 3] of any length, or [H, W]
+            for strength, depth and alpha.
+
+        Raises:
+            PolarguideError: there is no such layer, or this recipe has not got it.
+        """
+        names = checked_layers([layers] if isinstance(layers, str) else list(layers))
+        result = self.result(camera)
+        found: dict[str, Tensor] = {}
+        for name in names:
+            values = getattr(result, name)
+            if values is None:
+                raise PolarguideError(
+                    "layers",
+                    expected=f"layers of the recipe {self.recipe.name}",
+                    found=f"{name}, which it has not",
+                    remedy="Leave it out.",
+                )
+            found[name] = values
+        return found
+
+
+def checked_layers(names: list[str]) -> list[str]:
+    """The names, if there is at least one and each is a layer's.
 
     Raises:
-        PolarguideError: it is none, is damaged, or belongs to another version.
+        PolarguideError: otherwise.
     """
-    configuration = RunConfiguration.load(folder)
-    recipe = recipe_named(configuration.recipe)
-    backend = choose_backend(device, say=say)
-    state = load_checkpoint(folder, recipe, backend.device)
-    return TrainedRun(folder, configuration, recipe, state, backend)
+    for name in names or ["none"]:
+        if name not in LAYERS:
+            raise PolarguideError(
+                "layers", expected="any of " + ", ".join(LAYERS), found=name, remedy="Correct the name."
+            )
+    return names
+
+
+def read_scene(
+    folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(), reporter: Reporter = SILENT
+) -> Scene:
+    """Load a scene, with progress, and hand on its warnings.
+
+    Raises:
+        PolarguideError: it cannot be read.
+    """
+    scene = load_scene(folder, downscale=options.downscale, transfer=options.transfer, reporter=reporter)
+    for warning in scene.warnings:
+        reporter.warn(warning)
+    return scene
+
+
+def _warn(text: str) -> None:
+    """Warn the caller of this package."""
+    warnings.warn(text, PolarguideWarning, stacklevel=4)

@@ -53,7 +53,8 @@ def write_run_ply(path: Path, state: TrainingState, shading: ShadingModel) -> No
         lambda directions: shown_colors(state, shading, directions).cpu(), len(gaussians)
     )
     plain = {
-        name: gaussians[name].detach().cpu() for name in ("means", "log_scales", "quaternions", "opacity_logits")
+        name: gaussians[name].detach().cpu()
+        for name in ("means", "log_scales", "quaternions", "opacity_logits")
     }
     with atomic(path) as temporary:
         write_ply(

@@ -1,128 +1,297 @@
-"""The loop of ``polarguide train``: progress, checkpoints, a clean stop, and whoever looks on."""
+"""Training a run: the loop with its log, its checkpoints and a clean stop, and going on with a run."""
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import json
+import math
+import os
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 
-from polarguide.cli.common import console
-from polarguide.cli.meter import LOG_EVERY, Meter, progress_bar
-from polarguide.cli.view import announce
+import torch
+
+from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
+from polarguide.files import make_folder
+from polarguide.options import SceneOptions, SessionOptions
+from polarguide.progress import SILENT, Advance, Reporter
+from polarguide.raster import use_threads
+from polarguide.recipes import recipe_named
+from polarguide.runs.folder import (
+    CHECKPOINT,
+    CONFIGURATION,
+    PLY,
+    RunConfiguration,
+    RunLog,
+    load_checkpoint,
+    recipe_data,
+    save_checkpoint,
+)
+from polarguide.runs.opened import GaussianModel, OpenedRun, read_scene
 from polarguide.runs.point_cloud import write_run_ply
-from polarguide.runs.folder import PLY, RunLog, save_checkpoint
+from polarguide.training.distributed import Ranks, backend_of, process_group
+from polarguide.training.losses import refuse_diverged
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.stopwatch import Stopwatch
 from polarguide.training.trainer import Trainer
-from polarguide.viewer import Viewer, photographs, shown_training
 
-Look = Callable[[Callable[[], bool]], None]
-"""Lets visitors look between two steps; asks what it is given whether training should end."""
-
-PATIENCE = 0.2  # seconds between two looks at whether a waiting training should end
-
-
-class _Interrupt:
-    """Turns the first Ctrl-C (or SIGTERM) into a flag that the loop looks at between two steps."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._old = {s: signal.signal(s, self._ask) for s in (signal.SIGINT, signal.SIGTERM)}
-
-    def _ask(self, number: int, _: FrameType | None) -> None:
-        if self.asked and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.asked = True
-
-    def restore(self) -> None:
-        """Put the previous handlers back."""
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
+LOG_EVERY = 10
+Ends = Callable[[], bool]
+"""Whether training should end."""
+Look = Callable[[Ends], None]
+"""Lets others look between two steps; asks what it is given whether training should end."""
 
 
-def train_run(trainer: Trainer, out: Path, *, checkpoint_every: int, look: Look | None = None) -> None:
-    """Train to the end with progress, checkpoints and a log; then write the PLY. Rank 0 alone writes.
+class TrainingStopped(KeyboardInterrupt):
+    """Training was asked to stop; its state is saved.
 
-    ``look`` is called between steps; its time does not count.
+    Attributes:
+        step: how many steps were done.
     """
-    ranks, leads = trainer.ranks, trainer.ranks.rank == 0
-    log = RunLog(out) if leads else None
-    if log is not None:
-        log.cut(trainer.state.step)
-    stopwatch = Stopwatch(*log.elapsed()) if log else Stopwatch()
-    interrupt = _Interrupt()
-    try:
-        with progress_bar() as progress:
-            task = progress.add_task("", total=trainer.settings.steps, completed=trainer.state.step, note="")
-            meter = Meter(progress, task, log, stopwatch)
-            stopped = False
-            while trainer.state.step < trainer.settings.steps and not stopped:
-                meter.show(trainer.step())
-                if trainer.state.step % checkpoint_every == 0:
-                    with stopwatch.paused():
-                        meter.read()
-                        _save(trainer, out)
-                if look is not None:
-                    with stopwatch.paused():
-                        look(lambda: interrupt.asked)
-                # Several ranks stop after the same step, so they have to ask each other, which takes time.
-                if ranks.world == 1 or trainer.state.step % LOG_EVERY == 0:
-                    stopped = ranks.any(interrupt.asked)
-            meter.read()
-        _save(trainer, out)
-        if stopped:
-            console.print(
-                f"stopped after step {trainer.state.step}; go on with the same command and --resume"
-            )
-            raise KeyboardInterrupt
-    finally:
-        interrupt.restore()
-    if leads:
-        write_run_ply(out / PLY, trainer.state, trainer.shading)
+
+    def __init__(self, step: int) -> None:
+        super().__init__(f"stopped after step {step}")
+        self.step = step
 
 
-def _save(trainer: Trainer, out: Path) -> None:
-    """A checkpoint of what all ranks have seen, by rank 0."""
-    trainer.exchange_statistics()
-    if trainer.ranks.rank == 0:
-        save_checkpoint(out, trainer.state)
+def train(
+    scene: Scene | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    recipe: Recipe | str = "polarguide-stokes",
+    settings: TrainSettings = TrainSettings(),
+    session: SessionOptions = SessionOptions(),
+    reading: SceneOptions = SceneOptions(),
+    resume: bool = False,
+    reporter: Reporter = SILENT,
+    should_stop: Ends = lambda: False,
+    watch: Callable[[Trainer], AbstractContextManager[Look]] | None = None,
+) -> OpenedRun:
+    """Train a recipe on a scene, into a run folder.
 
+    KeyboardInterrupt (Ctrl-C, or a notebook's stop button) is passed on after the state has been saved; where it comes
+    in the middle of a change of the state, the last checkpoint stays.
 
-@contextmanager
-def watched(trainer: Trainer, host: str, port: int) -> Iterator[Look]:
-    """A viewer over a training, for ``train_run``.
+    Args:
+        scene: a scene, or the folder of one, which is read as ``reading`` says.
+        out: folder to write: configuration, checkpoints, log, and a PLY at the end.
+        recipe: the method, or the name of one.
+        settings: steps, seed and what else decides the result.
+        session: device, threads, and how often the state is saved.
+        resume: go on with the run in ``out``, to the same result.
+        reporter: told how far it is.
+        should_stop: asked between steps.
+        watch: gives, for the trainer, a context with what is to be called between steps.
 
     Raises:
-        PolarguideError: several processes train, or the address cannot be listened at.
+        PolarguideError: wrong input, a folder that does not suit, or a loss that is not finite.
+        TrainingStopped: ``should_stop`` said so; the state is saved.
     """
-    if trainer.ranks.world > 1:
-        raise PolarguideError(
-            "--viewer",
-            expected="one process",
-            found=f"{trainer.ranks.world}",
-            remedy="Leave it out, and look at the checkpoints: polarguide view RUN.",
+    out = Path(out)
+    use_threads(session.threads)
+    chosen = recipe_named(recipe) if isinstance(recipe, str) else recipe
+    with process_group(session.device, out) as ranks:
+        leads = ranks.rank == 0
+        reporter = reporter if leads else SILENT
+        _check_out(out, resume, ranks)
+        settings = replace(
+            settings, views_per_step=_views(settings.views_per_step, ranks, out if resume else None, reporter)
         )
-    scene = trainer.scene
-    viewer = Viewer(
-        lambda: shown_training(trainer),
-        photographs(scene),
-        shading=trainer.shading,
-        trains=True,
-        host=host,
-        port=port,
-        title=f"polarguide {scene.name}",
-    )
-    announce(viewer, host)
+        backend = backend_of(ranks, session.device, reporter)
+        loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
+        configuration = RunConfiguration(
+            scene=str(loaded.root.resolve()),
+            scene_digest=loaded.digest,
+            recipe=chosen.name,
+            recipe_data=recipe_data(chosen),
+            settings=settings,
+            downscale=loaded.downscale,
+            transfer="srgb" if loaded.transfer == "srgb" else "linear",
+            device=str(backend.device),
+        )
+        state = None
+        if resume:
+            _check_same(RunConfiguration.load(out), configuration, out)
+            state = load_checkpoint(out, chosen, backend.device) if (out / CHECKPOINT).exists() else None
+        trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
+        with watch(trainer) if watch is not None else nullcontext() as look:
+            ranks.barrier()
+            if leads:
+                make_folder(out)
+                configuration.save(out)
+            _Loop(trainer, out, session.checkpoint_every, reporter, should_stop, look).run()
+        model = GaussianModel(trainer.state, trainer.shading, backend)
+        if leads:
+            write_run_ply(out / PLY, model.state, model.shading)
+    return OpenedRun(out, configuration, chosen, model, scene=loaded, reporter=reporter)
 
-    def look(ends: Callable[[], bool]) -> None:
-        viewer.refresh()
-        viewer.serve()
-        while viewer.paused and not ends():
-            viewer.serve(PATIENCE)
 
-    try:
-        yield look
-    finally:
-        viewer.close()
+class _Loop:
+    """Trains to the end with progress, checkpoints and a log. Rank 0 alone writes."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        out: Path,
+        checkpoint_every: int,
+        reporter: Reporter,
+        should_stop: Ends,
+        look: Look | None,
+    ) -> None:
+        self._trainer, self._out, self._every = trainer, out, checkpoint_every
+        self._reporter, self._should_stop, self._look = reporter, should_stop, look
+        self._log = RunLog(out) if trainer.ranks.rank == 0 else None
+        if self._log is not None:
+            self._log.cut(trainer.state.step)
+        self._stopwatch = Stopwatch(*self._log.elapsed()) if self._log else Stopwatch()
+
+    def run(self) -> None:
+        """Train; see ``train``."""
+        trainer = self._trainer
+        with self._reporter.track("training", trainer.settings.steps) as advance:
+            meter = _Meter(advance, self._log, self._stopwatch)
+            advance(trainer.state.step)
+            try:
+                stopped = self._steps(meter)
+            except KeyboardInterrupt:
+                if trainer.ranks.world == 1 and trainer.whole:
+                    self._save()
+                raise
+            meter.read()
+        self._save()
+        if stopped:
+            raise TrainingStopped(trainer.state.step)
+
+    def _steps(self, meter: _Meter) -> bool:
+        """Steps up to the last one; True where training is to stop before."""
+        trainer, ranks = self._trainer, self._trainer.ranks
+        while trainer.state.step < trainer.settings.steps:
+            # Several ranks stop after the same step, so they have to ask each other, which takes time.
+            if (ranks.world == 1 or trainer.state.step % LOG_EVERY == 0) and ranks.any(self._should_stop()):
+                return True
+            meter.take(trainer.step())
+            if trainer.state.step % self._every == 0:
+                with self._stopwatch.paused():
+                    meter.read()
+                    self._save()
+            if self._look is not None:
+                with self._stopwatch.paused():
+                    self._look(self._should_stop)
+        return False
+
+    def _save(self) -> None:
+        """A checkpoint of what all ranks have seen, by rank 0."""
+        self._trainer.exchange_statistics()
+        if self._trainer.ranks.rank == 0:
+            save_checkpoint(self._out, self._trainer.state)
+
+
+class _Meter:
+    """Smooths what the steps report, hands it on, and writes every tenth into the log.
+
+    Reports are looked at ten at a time: on a GPU, looking waits for it.
+    """
+
+    def __init__(self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch) -> None:
+        self._advance, self._log, self._stopwatch = advance, log, stopwatch
+        self._loss = self._psnr = math.nan
+        self._began, self._first = time.perf_counter(), -1
+        self._waiting: list[StepReport] = []
+
+    def take(self, report: StepReport) -> None:
+        """Take one step's report."""
+        if self._first < 0:
+            self._first = report.step
+        self._waiting.append(report)
+        if (report.step + 1) % LOG_EVERY == 0:
+            loss, psnr = self.read()
+            if self._log is None:
+                return
+            seconds, alone = self._stopwatch.read()
+            self._log.append(
+                step=report.step,
+                stage=report.stage,
+                loss=round(loss, 6),
+                psnr=round(psnr, 3),
+                gaussians=report.gaussians,
+                seconds=round(seconds, 3),
+                alone=alone,
+            )
+
+    def read(self) -> tuple[float, float]:
+        """Look at the reports that wait; loss and PSNR of the last.
+
+        Raises:
+            PolarguideError: a loss that is not finite.
+        """
+        if not self._waiting:
+            return math.nan, math.nan
+        last = self._waiting[-1]
+        measured = torch.stack([report.measured for report in self._waiting]).cpu()
+        self._waiting.clear()
+        refuse_diverged(measured[:, 2])
+        for loss, psnr, _ in measured.tolist():
+            keep = 0.0 if math.isnan(self._loss) else 0.98
+            self._loss = loss if keep == 0 else keep * self._loss + (1 - keep) * loss
+            self._psnr = psnr if keep == 0 else keep * self._psnr + (1 - keep) * psnr
+        rate = (last.step + 1 - self._first) / max(1e-9, time.perf_counter() - self._began)
+        note = (
+            f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  "
+            f"{last.gaussians:,} Gaussians  {rate:.1f} it/s"
+        )
+        self._advance(last.step + 1, note=note)
+        return loss, psnr
+
+
+def _views(asked: int, ranks: Ranks, resumed: Path | None, reporter: Reporter) -> int:
+    """Views a step: as asked, or of the run to resume, or one for each process."""
+    old = RunConfiguration.load(resumed).settings.views_per_step if resumed else 0
+    views = asked or old or ranks.world
+    if views < ranks.world:
+        reporter.warn(f"{ranks.world - views} of {ranks.world} processes have no view to look at")
+    return views
+
+
+def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
+    """Refuse a folder that does not suit, once for all ranks: rank 0 looks, before it writes there itself."""
+    problem = _unsuitable(out, resume) if ranks.rank == 0 else None
+    if ranks.any(problem is not None):
+        raise problem or SystemExit(2)
+
+
+def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
+    has_run = (out / CONFIGURATION).exists()
+    if resume and not has_run:
+        return PolarguideError(
+            out,
+            expected="a run to resume",
+            found="no run.json",
+            remedy="Train without --resume, or name the folder of a run.",
+        )
+    if not resume and has_run:
+        return PolarguideError(
+            out,
+            expected="a new folder",
+            found="a run",
+            remedy="Add --resume (resume=True) to go on with it, or name another folder.",
+        )
+    return None
+
+
+def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
+    for field in ("scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer"):
+        a, b = getattr(old, field), getattr(new, field)
+        if a != b:
+            if isinstance(a, dict):  # a recipe: show what differs
+                keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
+                a, b = ({key: values.get(key) for key in keys} for values in (a, b))
+            raise PolarguideError(
+                f"{out}/{CONFIGURATION} ({field})",
+                expected=json.dumps(a, default=str)[:120],
+                found=json.dumps(b, default=str)[:120],
+                remedy="Resume with the same scene, options and program version, or train into a new folder.",
+            )

@@ -1,4 +1,5 @@
-"""The processes that share one training: who takes which views, and how their results become one.
+"""The processes that torchrun started for one training: who takes which views, how their results become one, and how
+all end when one is lost.
 
 A step looks at B views, its slots 0 to B - 1. Each rank takes a run of them. Sums over slots are made in the order of
 the ranks, whatever the backend of the communication does, so two processes of one view each give the bits of one
@@ -8,11 +9,24 @@ process of two.
 from __future__ import annotations
 
 import contextlib
+import os
+import socket
+import sys
+import threading
+import time
 from collections.abc import Iterator, Sequence
+from datetime import timedelta
+from pathlib import Path
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
+
+from polarguide.errors import PolarguideError
+from polarguide.options import DeviceName
+from polarguide.progress import SILENT, Reporter
+from polarguide.raster import Backend, choose_backend
+from polarguide.system import process_count, process_is_alive
 
 if dist.is_available():
     # Its functions have the default group for a default value. Imported once there is a group, as torch's optimizers
@@ -20,12 +34,18 @@ if dist.is_available():
     import torch.distributed.nn
 
 
+POLL_SECONDS = 1.0
+# A rank whose collective has failed waits this long for the monitor to find out which process was lost.
+PATIENCE_SECONDS = 15.0
+TIMEOUT = timedelta(minutes=30)
+
+
 class LostRank(Exception):
     """Another rank does not take part any more."""
 
 
 @contextlib.contextmanager
-def _together() -> Iterator[None]:
+def _collective() -> Iterator[None]:
     """Inside, a failed collective raises LostRank; every backend has an exception of its own kind."""
     try:
         yield
@@ -40,7 +60,7 @@ def _gather(into: Tensor, own: Tensor) -> None:
 
 
 class Ranks:
-    """One process alone; ``SeveralRanks`` overrides what needs company.
+    """One process alone; ``SeveralRanks`` overrides what needs the others.
 
     Attributes:
         rank: number of this process. world: how many there are.
@@ -87,12 +107,12 @@ class SeveralRanks(Ranks):
         part = -(-flat.numel() // self.world)
         padded = torch.cat((flat, flat.new_zeros(part * self.world - flat.numel())))
         received = torch.empty_like(padded)
-        with _together():
+        with _collective():
             dist.all_to_all_single(received, padded)
         total, *others = received.view(self.world, part)
         for other in others:
             total = total + other
-        with _together():
+        with _collective():
             _gather(padded, total.contiguous())
         for t, values in zip(
             tensors, padded[: flat.numel()].split([t.numel() for t in tensors]), strict=True
@@ -105,19 +125,19 @@ class SeveralRanks(Ranks):
         mine = self.slots(len(sums))
         own[: len(mine)] = sums[mine.start : mine.stop]
         gathered = sums.new_empty(self.world * most, *sums.shape[1:])
-        with _together():
+        with _collective():
             _gather(gathered, own)
         for rank in range(self.world):
             theirs = self.slots(len(sums), rank)
             sums[theirs.start : theirs.stop] = gathered[rank * most : rank * most + len(theirs)]
 
     def broadcast(self, tensor: Tensor) -> None:
-        with _together():
+        with _collective():
             dist.broadcast(tensor, 0)
 
     def any(self, flag: bool) -> bool:
         raised = torch.tensor([int(flag)])
-        with _together():
+        with _collective():
             dist.all_reduce(raised, dist.ReduceOp.MAX)
         return bool(raised.item())
 
@@ -126,3 +146,84 @@ class SeveralRanks(Ranks):
 
 
 ALONE = Ranks()
+
+
+@contextlib.contextmanager
+def process_group(device: DeviceName, out: Path) -> Iterator[Ranks]:
+    """Join the process group that torchrun started, if it did, and leave it together.
+
+    When a process is lost, whatever the others do, each of this machine ends within seconds with status 1, and the
+    first of them says so on stderr.
+
+    Args:
+        device: what to compute on. out: the run's folder, named in that line.
+
+    Raises:
+        PolarguideError: a process is lost on another machine.
+    """
+    if process_count() == 1:
+        yield ALONE
+        return
+    backend = "cpu:gloo,cuda:nccl" if device != "cpu" and torch.cuda.is_available() else "gloo"
+    dist.init_process_group(backend, timeout=TIMEOUT)
+    ranks = SeveralRanks()
+    monitor = _Monitor(ranks, out)
+    try:
+        yield ranks
+        ranks.barrier()
+    except LostRank as error:
+        # The monitor ends this process before that, if the lost one was of this machine.
+        time.sleep(PATIENCE_SECONDS)
+        raise _loss("one of them does not answer", ranks.world, out) from error
+    finally:
+        monitor.stop()
+    dist.destroy_process_group()
+
+
+def backend_of(ranks: Ranks, device: DeviceName, reporter: Reporter = SILENT) -> Backend:
+    """The backend of this rank; the first rank of a machine compiles kernels while the others wait."""
+    local = int(os.environ.get("LOCAL_RANK", "0")) if ranks.world > 1 else 0
+    chosen = choose_backend(device, say=reporter.say) if local == 0 else None
+    ranks.barrier()
+    return chosen or choose_backend(device, local_rank=local, say=reporter.say)
+
+
+def _loss(found: str, world: int, out: Path) -> PolarguideError:
+    return PolarguideError(
+        "training",
+        expected=f"{world} processes",
+        found=found,
+        remedy=f"The last checkpoint in {out} is whole; go on with --resume, on any number of processes.",
+    )
+
+
+class _Monitor:
+    """A thread that checks whether this machine's ranks are alive, and ends this process when one is not.
+
+    A rank that waits for a lost one inside a collective cannot be reached by a signal handler, so a thread does it.
+    """
+
+    def __init__(self, ranks: SeveralRanks, out: Path) -> None:
+        self._ranks, self._out = ranks, out
+        everyone: list[tuple[str, int]] = [("", 0)] * ranks.world
+        here = socket.gethostname()
+        dist.all_gather_object(everyone, (here, os.getpid()))
+        self._pids = {rank: pid for rank, (host, pid) in enumerate(everyone) if host == here}
+        self._stop = threading.Event()
+        threading.Thread(target=self._poll, daemon=True).start()
+
+    def _poll(self) -> None:
+        while not self._stop.wait(POLL_SECONDS):
+            lost = {rank: pid for rank, pid in self._pids.items() if not process_is_alive(pid)}
+            if lost and not self._stop.is_set():
+                if self._ranks.rank == min(set(self._pids) - set(lost)):
+                    who = " and ".join(f"rank {rank} (process {pid})" for rank, pid in lost.items())
+                    loss = _loss(f"that {who} was lost", self._ranks.world, self._out)
+                    sys.stderr.write(f"error: {loss}\n")
+                    sys.stderr.flush()
+                time.sleep(0.5)  # so that the others find the same loss, and not this process's end
+                os._exit(1)
+
+    def stop(self) -> None:
+        """From now on others may end."""
+        self._stop.set()

@@ -3,24 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Iterator
 
+from polarguide.system import machine_busy_seconds
+
 # Share of one core that others may use before a time is no longer worth quoting.
 FOREIGN_SHARE = 0.10
-
-
-def machine_busy_seconds() -> float | None:
-    """Processor seconds that the whole machine has been busy, or None where the system does not tell."""
-    try:
-        with open("/proc/stat") as file:
-            fields = [int(x) for x in file.readline().split()[1:]]
-    except (OSError, ValueError):
-        return None
-    user, nice, system, _, _, irq, softirq, *rest = fields
-    steal = rest[0] if rest else 0
-    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
 
 
 class Stopwatch:

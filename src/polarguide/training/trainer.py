@@ -51,6 +51,10 @@ class Trainer:
         backend: device and rasterizer.
         state: where to go on from, on the backend's device; None: from the beginning.
         ranks: the processes that share the views of each step.
+
+    Attributes:
+        shading: the recipe's, for the run's refractive index.
+        whole: whether the state is one between two steps; an exception may leave it in the middle of a change.
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class Trainer:
     ) -> None:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
         self.ranks, self._device = ranks, backend.device
+        self.whole = True
         self.schedule = Schedule(recipe, settings.steps)
         self.shading = recipe.shading.bind(settings.refractive_index)
         self.state = state or first_state(scene, recipe, settings, backend.device)
@@ -88,11 +93,13 @@ class Trainer:
         """One optimizer step."""
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
+        self.whole = not position.actions
         for action in position.actions:
             self._act(action)
         mine = self.ranks.slots(views)
         # A rank without a view renders the first one, so that it knows what has gradients, and adds nothing.
         measured = [self._backpropagate(slot, position.stage, bool(mine)) for slot in mine or range(1)]
+        self.whole = False
         self._join_gradients(idle=not mine)
         self._optimize()
         mean = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
@@ -111,6 +118,7 @@ class Trainer:
                 limit=self._limit,
                 generator=seeded(self.settings.seed, 2, state.step),
             )
+        self.whole = True
         return report
 
     def exchange_statistics(self) -> None:
@@ -151,6 +159,7 @@ class Trainer:
         loss.backward()
         gradient = statistic.gradient if statistic else None
         if counts and gradient is not None and result.radii is not None:
+            self.whole = False
             state.statistics.add(gradient, result.radii, view.camera.width, view.camera.height, slot)
         return torch.stack((photometric.detach(), _psnr(result.final, shown.picture), loss.detach()))
 

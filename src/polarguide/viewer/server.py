@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
+from polarguide.options import LOOPBACK
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.model import ShadingModel
 from polarguide.viewer.frusta import Photograph
@@ -19,7 +20,6 @@ from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.session import Session
 from polarguide.viewer.shown import Shown
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 REFRESH = 1.0  # least seconds between two pictures of a training,
 SHARE = 10.0  # which are also at least this multiple of the time that the last one took
 TICK = 0.02

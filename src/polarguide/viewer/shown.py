@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.export.environment import RELIT_RESOLUTION, turned_cubemap
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.raster.interface import Rasterize
-from polarguide.runs.opened import TrainedRun
+from polarguide.rendering.relight import RELIT_RESOLUTION, turned_cubemap
+from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import PLAIN, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
@@ -74,11 +74,11 @@ class Shown:
         return {**self.light, cubemap.name: turned}
 
 
-def shown_run(run: TrainedRun) -> Shown:
+def shown_run(run: OpenedRun) -> Shown:
     """A trained run."""
-    gaussians = run.state.gaussians
-    status = f"{run.recipe.name}, {run.state.step:,} steps; {len(gaussians):,} Gaussians"
-    return Shown(gaussians, run.light, run.shading, run.backend.rasterize, 3, status)
+    model = run.model
+    status = f"{run.recipe.name}, {run.steps:,} steps; {len(model):,} Gaussians"
+    return Shown(model.state.gaussians, model.light, model.shading, model.backend.rasterize, 3, status)
 
 
 def shown_training(trainer: Trainer) -> Shown:

@@ -1,4 +1,4 @@
-"""The learned environment as a panorama, and panoramas as environments.
+"""Other light for a run; the learned environment as a panorama, and panoramas as environments.
 
 A panorama [H, 2 H, 3] is upright in the scene: row i, column j is at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
 cameras' common level and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle, to the right. Files hold linear
@@ -17,13 +17,45 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from polarguide.errors import PolarguideError, optional_import
-from polarguide.scene_frame import SceneFrame
+from polarguide.progress import SILENT, Reporter
+from polarguide.runs.opened import OpenedRun
+from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
 from polarguide.shading.model import RadianceCubemap, ShadingModel
 
 LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
 """Texels along the sides of a cubemap that is made of another light, or of the learned one turned."""
+
+
+def relight(
+    run: OpenedRun, panorama: Path | None = None, degrees: float = 0.0, *, reporter: Reporter = SILENT
+) -> None:
+    """Put a panorama in the learned environment's place, or turn it, in the run as it is in memory.
+
+    Args:
+        run: the run; its scene is read.
+        panorama: file of linear radiance (.hdr, .exr), to be reflected in place of the learned environment.
+        degrees: by which to turn the environment, counter-clockwise seen from above.
+        reporter: told what stays as it was learned.
+
+    Raises:
+        PolarguideError: the recipe learns no radiance, or the file cannot be read.
+    """
+    if panorama is None and degrees % 360 == 0:
+        return
+    what = "rotate_environment" if panorama is None else "environment"
+    if not math.isfinite(degrees):
+        raise PolarguideError(what, expected="degrees", found=str(degrees), remedy="Give a number.")
+    cubemap = needs_radiance(run.model.shading, what=what)
+    light = run.model.light
+    around = scene_frame(list(run.cameras.values()))
+    if panorama is not None:
+        texels = texels_of(read_panorama(panorama), cubemap, around, RELIT_RESOLUTION)
+        light[cubemap.name] = texels.to(light[cubemap.name].device)
+    light[cubemap.name] = turned_cubemap(light[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION)
+    if run.model.shading.local_note:
+        reporter.say(f"note: {run.model.shading.local_note}")
 
 
 def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from polarguide.cli.app import run
+import polarguide
+from polarguide.options import SceneOptions, SessionOptions
 from polarguide.runs.folder import CHECKPOINT
-from polarguide.training.company import alive
+from polarguide.system import process_is_alive
 
 pytestmark = [
     pytest.mark.slow,
@@ -64,7 +65,7 @@ def test_a_killed_rank_ends_all_and_the_run_goes_on_alone(
     _, errors = process.communicate(timeout=60)
     assert time.monotonic() - begin < 60
     assert process.returncode != 0
-    assert not any(alive(pid) for pid in ranks.values())
+    assert not any(process_is_alive(pid) for pid in ranks.values())
     told = [line for line in errors.splitlines() if line.startswith("error: training: expected 2 processes")]
     assert len(told) == 1, errors
     assert f"rank {victim} (process {ranks[victim]}) was lost" in told[0]
@@ -72,5 +73,13 @@ def test_a_killed_rank_ends_all_and_the_run_goes_on_alone(
     step = int(load_file(out / CHECKPOINT)["scalars"][0])
     assert 0 < step < STEPS
     if victim == 0:
-        assert run([*flags(demo_scene, out), "--resume"]) == 0
+        polarguide.train(
+            demo_scene,
+            out,
+            recipe="3dgs",
+            settings=polarguide.TrainSettings(STEPS, views_per_step=0),
+            session=SessionOptions(threads=1),
+            reading=SceneOptions(downscale=4),
+            resume=True,
+        )
         assert int(load_file(out / CHECKPOINT)["scalars"][0]) == STEPS

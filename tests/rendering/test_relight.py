@@ -13,7 +13,7 @@ import torch
 from random_runs import ring
 
 from polarguide.errors import PolarguideError
-from polarguide.export.environment import (
+from polarguide.rendering.relight import (
     needs_radiance,
     panorama,
     read_panorama,

@@ -1,0 +1,92 @@
+"""Scoring a run on its test views, with its speed and where its numbers come from."""
+
+from __future__ import annotations
+
+import platform
+from typing import Any
+
+import torch
+
+import polarguide
+from polarguide import _native
+from polarguide.capture import View
+from polarguide.evaluation import ViewTarget, score_view, write_metrics
+from polarguide.evaluation.record import METRICS_FILE
+from polarguide.evaluation.sources import commit, scoring_digest
+from polarguide.evaluation.speed import frames_per_second
+from polarguide.progress import SILENT, Reporter
+from polarguide.runs.folder import RunLog
+from polarguide.runs.opened import OpenedRun
+from polarguide.system import peak_memory_mib
+
+
+def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT) -> dict[str, Any]:
+    """Score a run's test views and write ``metrics.json`` into its folder.
+
+    Args:
+        run: the run; it is asked for layers only.
+        speed: whether to measure frames a second, which makes sense only while nothing else runs.
+        reporter: told how far it is.
+
+    Returns:
+        The record as written: means over the views, ``views`` by name, and ``provenance``.
+
+    Raises:
+        PolarguideError: the scene cannot be read, or has no test views.
+    """
+    tests = run.scene.test_views
+    views = {}
+    with reporter.track("scoring", len(tests)) as advance:
+        for view in tests:
+            # First what is known of it: copied later, it would have to wait until the rendering is done.
+            target = ViewTarget.of(view.photograph(), view.invalid, view.ground_truth, run.model.device)
+            views[view.name] = score_view(target, run.model.render(view.camera))
+            advance(len(views))
+    seconds, alone = RunLog(run.folder).elapsed()
+    return write_metrics(
+        run.folder / METRICS_FILE,
+        views=views,
+        run={
+            "fps": _speed(run, normals=False) if speed else None,
+            "fps_layers": _speed(run, depth=True) if speed else None,
+            "train_seconds": seconds if alone and seconds > 0 else None,
+            "gaussians": len(run.model),
+            "steps": run.steps,
+            "peak_memory_mib": peak_memory_mib(),
+        },
+        provenance=_provenance(run),
+    )
+
+
+def _speed(run: OpenedRun, **layers: bool) -> float | None:
+    def draw(view: View) -> None:
+        run.model.render(view.camera, **layers)
+        if run.model.device.type == "cuda":
+            torch.cuda.synchronize(run.model.device)
+
+    return frames_per_second(draw, run.scene.test_views)
+
+
+def _device(device: torch.device) -> str:
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else _native.simd()
+    return f"{device} ({name}, {_native.thread_count()} threads)"
+
+
+def _provenance(run: OpenedRun) -> dict[str, Any]:
+    configuration = run.configuration
+    return {
+        "recipe": configuration.recipe,
+        "seed": configuration.settings.seed,
+        "commit": commit(),
+        "sources": scoring_digest(),
+        "versions": {
+            "polarguide": polarguide.__version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        },
+        "device": _device(run.model.device),
+        "downscale": configuration.downscale,
+        "scene_hash": run.scene.digest,
+        "scene": run.scene.name,
+        "refractive_index": configuration.settings.refractive_index,
+    }

@@ -1,0 +1,133 @@
+"""Pictures of what polarization says about a scene, before or after training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.capture import Scene, View
+from polarguide.errors import PolarguideError
+from polarguide.files import make_folder
+from polarguide.progress import SILENT, Reporter
+from polarguide.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
+from polarguide.runs.opened import OpenedRun
+from polarguide.training.priors import facing_chromatic, guide_normals
+from polarguide.visualization import figures
+
+Picture = NDArray[np.uint8]
+
+
+def write_priors(
+    scene: Scene,
+    out: Path,
+    *,
+    run: OpenedRun | None = None,
+    views: str = "test",
+    refractive_index: float = 1.5,
+    threshold: float = 0.05,
+    reporter: Reporter = SILENT,
+) -> Path:
+    """Pictures of what polarization says about a scene, one PNG each, and a contact sheet of them.
+
+    S0, DoLP, AoLP, zenith, both separations, polarization normals, those that color differences tell, and the mask of
+    usable pixels. The exact separation needs normals: those of a trained run, else the polarization normals themselves,
+    with their ambiguity resolved only by the surface facing the camera.
+
+    Args:
+        scene: the scene.
+        out: folder to write.
+        run: a run trained on this scene at this size, whose normals resolve the ambiguity.
+        views: ``test``, ``train``, ``all``, or names separated by commas.
+        refractive_index: of the surfaces.
+        threshold: DoLP above which a pixel's normal is used.
+
+    Returns:
+        The path of the contact sheet.
+
+    Raises:
+        PolarguideError: there is no such view, or the run was trained at another size.
+    """
+    if run is not None and run.configuration.downscale != scene.downscale:
+        raise PolarguideError(
+            "downscale",
+            expected=f"{run.configuration.downscale}, as {run.folder} was trained",
+            found=str(scene.downscale),
+            remedy="Give the same factor.",
+        )
+    chosen = select_views(scene, views)
+    make_folder(out)
+    rows: list[list[Picture]] = []
+    labels: list[str] = []
+    names: list[str] = []
+    with reporter.track("drawing", len(chosen)) as advance:
+        for number, view in enumerate(chosen):
+            pictures = prior_pictures(view, run, refractive_index, threshold)
+            names = list(pictures)
+            for name, picture in pictures.items():
+                figures.write_png(out / f"{view.name}_{name}.png", picture)
+            if len(rows) < SHEET_VIEWS:
+                rows.append(list(pictures.values()))
+                labels.append(view.name)
+            advance(number + 1)
+    sheet = out / CONTACT_SHEET
+    figures.write_png(sheet, figures.contact_sheet(rows, labels, names))
+    return sheet
+
+
+@torch.no_grad()
+def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: float) -> dict[str, Picture]:
+    """All prior pictures of one view, by the name their file gets."""
+    rays = view.camera.rays()
+    stokes = optics.stokes(view.intensities())
+    luminance = optics.luminance(stokes)
+    dolp, aolp = optics.dolp(luminance), optics.aolp(luminance)
+    zenith = optics.diffuse_zenith(dolp, index)
+    guide, source = _guide(view, run, rays, luminance, index)
+    mask = optics.polarization_mask(
+        luminance, threshold=threshold, invalid=view.invalid, saturated=view.saturated
+    )
+    candidates = optics.physical_candidates(luminance, rays, index)
+    normal = optics.disambiguate(candidates, guide, rays, azimuth_weight=0.5).normal
+    good = ~(view.invalid | view.saturated)
+    chromatic, certain = facing_chromatic(stokes, guide, rays, index, good)
+    paper = optics.paper_separation(stokes, zenith, index)
+    exact = optics.exact_separation(stokes, guide, rays, index)
+    degrees = torch.rad2deg(zenith)
+    return {
+        "S0": figures.radiance_to_rgb(view.photograph()),
+        "DoLP": figures.dolp_to_rgb(dolp),
+        "AoLP": figures.aolp_to_rgb(aolp, dolp),
+        "zenith_diffuse": figures.scalar_to_rgb(degrees, 0.0, 90.0),
+        "specular_paper": figures.radiance_to_rgb(paper.specular / 2),
+        "diffuse_paper": figures.radiance_to_rgb(paper.diffuse / 2),
+        f"specular_exact_{source}": figures.radiance_to_rgb(exact.specular / 2),
+        f"diffuse_exact_{source}": figures.radiance_to_rgb(exact.diffuse / 2),
+        f"normal_{source}": figures.normal_to_rgb(
+            view.camera.to_world(normal * mask[..., None]), view.camera
+        ),
+        "normal_by_color": figures.normal_to_rgb(
+            view.camera.to_world(chromatic * (certain[..., None] > 0)), view.camera
+        ),
+        "mask": figures.scalar_to_rgb(mask.float(), 0.0, 1.0),
+    }
+
+
+def _guide(
+    view: View, run: OpenedRun | None, rays: Tensor, luminance: Tensor, index: float
+) -> tuple[Tensor, str]:
+    """Normals in camera axes that resolve the ambiguity, and where they come from."""
+    if run is not None:
+        normal = run.result(view.name, depth=False).to("cpu").normal
+        assert normal is not None
+        return guide_normals(view.camera.to_camera(normal), rays)[0], "by_run"
+    upward = torch.tensor([0.0, -0.5, -1.0]).expand_as(rays)
+    guess = torch.nn.functional.normalize(upward, dim=-1)
+    chosen = optics.disambiguate(
+        optics.physical_candidates(luminance, rays, index), guess, rays, azimuth_weight=0.0
+    ).normal
+    return chosen, "by_polarization"

@@ -1,0 +1,143 @@
+"""Signals, and what only some operating systems offer: elsewhere a function returns None, or does nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+MEBIBYTE = 1 << 20
+LAST_WORDS_SECONDS = 5.0
+
+
+def _posix(module: str) -> Any | None:
+    """A module of the standard library that POSIX systems alone have."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        return None
+
+
+class StopSignals:
+    """A context in which Ctrl-C and SIGTERM ask work to stop; the object is what ``should_stop`` of a training is.
+
+    Before it is called for the first time, and at a second Ctrl-C, they interrupt at once.
+    """
+
+    def __init__(self) -> None:
+        self._asked = self._works = False
+
+    def __enter__(self) -> StopSignals:
+        self._old = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        self._works = True
+        return self._asked
+
+    def _stop(self, number: int, _: FrameType | None) -> None:
+        if self._works:
+            if self._asked and number == signal.SIGINT:
+                raise KeyboardInterrupt
+            self._asked = True
+        elif number == signal.SIGTERM and process_count() > 1:
+            # torchrun ends the others when one process is lost: first one of them has to say what happened.
+            timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
+            timer.daemon = True
+            timer.start()
+        else:
+            raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def signals_as_interrupts() -> Iterator[None]:
+    """SIGTERM, and SIGHUP where there is one, act like Ctrl-C."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    old = {number: signal.signal(number, interrupt) for number in (getattr(signal, name) for name in names)}
+    try:
+        yield
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def sigterm_kept() -> Iterator[None]:
+    """Keep the handler of SIGTERM, which some libraries replace as they are loaded."""
+    handler = signal.getsignal(signal.SIGTERM)
+    yield
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+
+
+@contextlib.contextmanager
+def exclusive_lock(path: Path) -> Iterator[None]:
+    """Hold a lock on a file. Child processes inherit it, and keep it if this process is killed.
+
+    Raises:
+        BlockingIOError: another process holds it.
+    """
+    fcntl = _posix("fcntl")
+    with open(path, "w") as file:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.set_inheritable(file.fileno(), True)
+        yield
+
+
+def peak_memory_mib() -> float | None:
+    """The most memory in MiB that this process has held at a time, or None where the system does not tell."""
+    resource = _posix("resource")
+    if resource is None:
+        return None
+    peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return peak / MEBIBYTE if os.uname().sysname == "Darwin" else peak / 1024
+
+
+def machine_busy_seconds() -> float | None:
+    """Processor seconds that the whole machine has been busy, or None where the system does not tell."""
+    try:
+        fields = [int(x) for x in Path("/proc/stat").read_text().partition("\n")[0].split()[1:]]
+    except (OSError, ValueError):
+        return None
+    user, nice, system, _, _, irq, softirq, *rest = fields
+    steal = rest[0] if rest else 0
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+
+
+def process_is_alive(pid: int) -> bool:
+    """Whether a process runs; a zombie, which has ended and waits to be asked about, does not."""
+    if os.name != "posix":  # there, signal 0 would end it
+        return True
+    try:
+        os.kill(pid, 0)
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except ProcessLookupError:
+        return False
+    except (OSError, IndexError):  # not ours to signal, or a system without /proc
+        return True
+    return state not in "ZX"
+
+
+def process_rank() -> int:
+    """The number of this process among those that torchrun started; 0 without it."""
+    return int(os.environ.get("RANK", "0"))
+
+
+def process_count() -> int:
+    """How many processes torchrun started for this training; 1 without it."""
+    return int(os.environ.get("WORLD_SIZE", "1"))

@@ -1,0 +1,246 @@
+"""``import polarguide``: training, opening, rendering and scoring from Python, in silence."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+import polarguide
+from polarguide import api
+from polarguide.evaluation import validate_metrics
+from polarguide.options import SceneOptions, SessionOptions
+from polarguide.progress import Advance
+from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY
+from polarguide.shading.result import LAYERS
+from polarguide.training.trainer import StepReport, Trainer
+
+EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
+ONE_THREAD = SessionOptions(threads=1)
+SMALL = SceneOptions(downscale=8)
+
+
+@pytest.fixture
+def copy(trained: Path, tmp_path: Path) -> Path:
+    """A copy of the training that may be changed."""
+    return Path(shutil.copytree(trained, tmp_path / "copy"))
+
+
+def edit(folder: Path, **changes: object) -> None:
+    path = folder / CONFIGURATION
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+class Listener(polarguide.Reporter):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        self.tracked: dict[str, tuple[int, str]] = {}
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    def warn(self, text: str) -> None:
+        self.said.append(f"warning: {text}")
+
+    @contextlib.contextmanager
+    def track(self, label: str, total: int | None) -> Iterator[Advance]:
+        def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+            self.tracked[label] = (done, note)
+
+        yield advance
+
+
+def test_every_public_name_is_there() -> None:
+    known = set(dir(polarguide))
+    assert set(polarguide.__all__) <= known
+    later = (
+        {"ablate", "compare"}
+        if not (Path(api.__file__).parent / "experiments" / "compare.py").exists()
+        else set()
+    )
+    for name in set(polarguide.__all__) - later:
+        assert getattr(polarguide, name) is not None
+    assert (Path(polarguide.__file__).parent / "py.typed").exists()
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = polarguide.nothing
+
+
+def test_training_is_silent_and_tells_the_reporter(
+    demo_scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    listener = Listener()
+    steps: list[int] = []
+
+    def should_stop() -> bool:
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+        steps.append(len(steps))
+        return False
+
+    run = polarguide.train(
+        demo_scene,
+        tmp_path / "run",
+        recipe="3dgs",
+        settings=polarguide.TrainSettings(12),
+        reading=SMALL,
+        session=ONE_THREAD,
+        reporter=listener,
+        should_stop=should_stop,
+    )
+    assert len(steps) == 12
+    assert listener.tracked["training"][0] == 12
+    assert "PSNR" in listener.tracked["training"][1]
+    assert listener.tracked["reading demo"][0] == 27
+    record = run.evaluate()
+    validate_metrics(record)
+    assert record == run.metrics() == polarguide.open_run(tmp_path / "run").metrics()
+    assert record["fps"] is None
+    printed = capfd.readouterr()
+    assert printed.out == printed.err == ""
+
+
+def test_what_training_returns_is_what_it_wrote(demo_scene: Path, tmp_path: Path) -> None:
+    scene = polarguide.load_scene(demo_scene, downscale=8)
+    settings = polarguide.TrainSettings(6, seed=3)
+    run = polarguide.train(
+        scene, tmp_path / "run", recipe="polarguide", settings=settings, session=ONE_THREAD
+    )
+    assert isinstance(run.recipe, polarguide.Recipe)
+    assert run.scene is scene
+    opened = polarguide.open_run(tmp_path / "run", recipe=run.recipe, scene=scene)
+    assert (opened.steps, opened.recipe.name) == (6, "polarguide")
+    for name, values in run.render("v000", layers=run.layers).items():
+        assert torch.equal(values, opened.render("v000", layers=[name])[name]), name
+    assert "reflection" in run.layers
+    assert set(run.layers) <= set(LAYERS)
+
+
+def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
+    trained: Path, demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the middle of a rendering, where nothing has changed yet; and in an optimizer's step, where it has."""
+    settings, reading = polarguide.TrainSettings(40), SceneOptions(downscale=4)
+    session = SessionOptions(threads=1, checkpoint_every=10)
+
+    def train(*, resume: bool) -> None:
+        polarguide.train(
+            demo_scene, tmp_path / "run", settings=settings, reading=reading, session=session, resume=resume
+        )
+
+    def interrupted_in(name: str, at: int) -> None:
+        inner = getattr(Trainer, name)
+
+        def stopped(self: Trainer, *arguments: object, **more: object) -> object:
+            if self.state.step == at:
+                raise KeyboardInterrupt
+            return inner(self, *arguments, **more)
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            train(resume=(tmp_path / "run" / CONFIGURATION).exists())
+
+    interrupted_in("_backpropagate", 17)
+    assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 17
+    assert not (tmp_path / "run" / PLY).exists()
+    interrupted_in("_optimize", 25)
+    assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 20
+    train(resume=True)
+    first, second = load_file(tmp_path / "run" / CHECKPOINT), load_file(trained / CHECKPOINT)
+    assert [name for name in second if not torch.equal(first[name], second[name])] == []
+
+
+def test_stopping_when_asked(demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[StepReport] = []
+    inner = Trainer.step
+    monkeypatch.setattr(Trainer, "step", lambda self: done.append(report := inner(self)) or report)
+    with pytest.raises(KeyboardInterrupt, match="stopped after step 4"):
+        polarguide.train(
+            demo_scene,
+            tmp_path / "run",
+            recipe="3dgs",
+            settings=polarguide.TrainSettings(12),
+            reading=SMALL,
+            session=ONE_THREAD,
+            should_stop=lambda: len(done) == 4,
+        )
+    assert polarguide.open_run(tmp_path / "run").steps == 4
+
+
+def test_a_run_renders_by_name_and_by_camera(trained: Path) -> None:
+    run = polarguide.open_run(trained)
+    layers = run.render("v000", layers=["final", "normal", "alpha"])
+    assert set(layers) == {"final", "normal", "alpha"}
+    assert layers["final"].shape == (*layers["alpha"].shape, 3)
+    torch.testing.assert_close(layers["final"], run.render(run.cameras["v000"])["final"])
+    assert len(run.gaussians["means"]) == len(run.gaussians["opacity_logits"]) == len(run.model)
+    assert run.light is not None
+    assert "Gaussians" in repr(run)
+    for wrong in (
+        lambda: run.render("v000", layers=["color"]),
+        lambda: run.render("nowhere"),
+        run.metrics,
+    ):
+        with pytest.raises(polarguide.PolarguideError):
+            wrong()
+
+
+def test_a_run_opens_without_its_scene(copy: Path, demo_scene: Path, tmp_path: Path) -> None:
+    edit(copy, scene=str(tmp_path / "gone"))
+    run = polarguide.open_run(copy)
+    camera = polarguide.open_run(copy, scene=demo_scene).cameras["v000"]
+    assert run.render(camera)["final"].shape == (camera.height, camera.width, 3)
+    with pytest.raises(polarguide.PolarguideError, match="gone"):
+        _ = run.cameras
+
+
+def test_a_changed_scene_is_warned_of_when_it_is_read(copy: Path, demo_scene: Path) -> None:
+    edit(copy, scene_digest="another")
+    run = polarguide.open_run(copy, scene=demo_scene)
+    with pytest.warns(polarguide.PolarguideWarning, match="has changed since"):
+        _ = run.scene
+    _ = run.scene  # once
+
+
+def test_a_changed_recipe_is_warned_of_on_opening(copy: Path) -> None:
+    data = json.loads((copy / CONFIGURATION).read_text())["recipe_data"]
+    edit(copy, recipe_data=data | {"ssim_weight": 0.875})
+    with pytest.warns(polarguide.PolarguideWarning, match="other values of the recipe"):
+        polarguide.open_run(copy)
+
+
+@pytest.mark.parametrize("version", ["0.1.0", "0.1.7", "9.0.0"])
+def test_a_run_of_another_version_is_refused_with_what_to_do(copy: Path, version: str) -> None:
+    edit(copy, version=version, unknown_then=3)
+    with pytest.raises(polarguide.PolarguideError) as error:
+        polarguide.open_run(copy)
+    assert f"found one of version {version}" in str(error.value)
+    assert "Train again into a new folder" in error.value.remedy
+    assert "\n" not in str(error.value)
+
+
+def test_a_film_and_pictures_from_python(trained: Path, tmp_path: Path) -> None:
+    run = polarguide.open_run(trained)
+    run.relight(degrees=45)
+    sheet = run.write_pictures(tmp_path / "pictures", views="v000", layers=["final", "normal"])
+    assert {path.name for path in sheet.parent.iterdir()} == {"v000_final.png", "v000_normal.png", sheet.name}
+    run.write_film(tmp_path / "film", frames=2, layers=["final"])
+    assert len(list((tmp_path / "film").iterdir())) == 2
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_run(example: Path, trained: Path, demo_scene: Path, tmp_path: Path) -> None:
+    trains = "polarguide.train(" in example.read_text()
+    given = [str(demo_scene), str(tmp_path / "out"), "8"] if trains else [str(trained), str(tmp_path / "out")]
+    done = subprocess.run([sys.executable, str(example), *given], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
