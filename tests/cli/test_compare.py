@@ -108,7 +108,7 @@ def test_interrupted_failed_and_finished(
         (["--recipes", "3dgs", "--seeds", "0"], "seeds: expected 1 or more"),
         (["--recipes", "3dgs", "--threads", "0"], "threads: expected 1 or more"),
         (["--recipes", "3dgs", "--jobs", "-1"], "jobs: expected"),
-        (["--recipes", "3dgs", "--report-views", "-1"], "report_views: expected"),
+        (["--recipes", "3dgs", "--report-views", "-1"], "report-views: expected"),
         (["--recipes", "3dgs", "--refractive-index", "5"], "--refractive-index"),
         (["--recipes", "3dgs", "--device", "cuda"], "--device cuda"),
         (["--recipes", "3dgs", "--downscale", "0"], "downscale: expected"),
