@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.cli.app import run
+from polarguide.cli.job_progress import JobReporter
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, plan_runs, scene_entries
 from polarguide.experiments.results import validate_results
@@ -72,7 +73,8 @@ def test_interrupted_failed_and_finished(
     assert run(command) == 2
     said = capsys.readouterr()
     assert "expected 2 finished runs, found that 1 failed (demo, 3dgs, seed 0: " in said.err
-    assert f"{second}/run.json: expected " in said.err
+    assert f"{second}/run.json" in said.err
+    assert len(said.err.splitlines()) == 1
     assert "done  demo, 3dgs-dr, seed 0" in said.out
     record = json.loads((out / "results.json").read_text())
     validate_results(record)
@@ -130,3 +132,14 @@ def test_two_scenes_of_one_name_are_refused(
     command = ["compare", str(demo_scene), str(demo_scene), "--recipes", "3dgs", "--downscale", "8"]
     assert run([*command, "--out", str(tmp_path / "out")]) == 2
     assert "expected scenes with names of their own, found demo twice" in capsys.readouterr().err
+
+
+def test_the_display_shows_markup_in_names_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = JobReporter()
+    with reporter.track("all", 2) as everything, reporter.track("[red]cup[/]", 1) as one:
+        one(1, note="[bold]scoring[/]")
+        everything(1)
+        reporter.say("failed  [red]cup[/]: no [bold]space[/] left")
+    with reporter.track("again"):
+        pass
+    assert "failed  [red]cup[/]: no [bold]space[/] left" in capsys.readouterr().out
