@@ -1,11 +1,13 @@
 """What the documentation says about the program is so: names, files, options, citations, spelling."""
 
 import ast
+import inspect
 import re
 from pathlib import Path
 
 import pytest
 
+import polarguide
 from polarguide.evaluation.table import METRICS
 from polarguide.recipes import ABLATIONS, RECIPES
 
@@ -86,6 +88,27 @@ def test_python_compiles(code):
     ast.parse(code)
 
 
+def called(node):
+    """The public function or method that a call in an example reaches: ``pg.NAME(...)`` or ``run.NAME(...)``."""
+    place = node.func
+    if isinstance(place, ast.Attribute) and isinstance(place.value, ast.Name):
+        return {"pg": polarguide, "run": polarguide.Run}.get(place.value.id), place.attr
+    return None, ""
+
+
+def test_calls_in_examples_fit():
+    fitted = 0
+    for code in python_blocks():
+        for node in ast.walk(ast.parse(code.values[0])):
+            owner, name = called(node) if isinstance(node, ast.Call) else (None, "")
+            if owner is not None:
+                itself = [None] if owner is polarguide.Run else []
+                given = {keyword.arg: None for keyword in node.keywords}
+                inspect.signature(getattr(owner, name)).bind(*itself, *node.args, **given)
+                fitted += 1
+    assert fitted > 20
+
+
 def test_every_metric_is_defined():
     page = text_of(DOCS / "reference" / "metrics.md")
     assert [metric.key for metric in METRICS if f"`{metric.key}`" not in page] == []
@@ -101,8 +124,18 @@ def test_every_recipe_is_described_and_every_named_one_exists():
     assert named - known == set()
 
 
+def parameters():
+    """Names of parameters and fields that an option can stand for: of verbs, and of the dataclasses that they read."""
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(text_of(path))):
+            if isinstance(node, ast.arg):
+                yield node.arg
+            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                yield node.target.id
+
+
 def test_options_exist():
-    words = set(re.findall(r"\w+", "\n".join(text_of(p) for p in PACKAGE.rglob("*.py"))))
+    words = set(parameters())
     unknown = {}
     for path in TEXTS:
         for option in re.findall(r"(?<![\w-])--([a-z][a-z-]+)", text_of(path)):

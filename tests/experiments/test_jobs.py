@@ -35,6 +35,7 @@ if verb in ("wait", "deaf"):
     def asked(*_):
         global count
         count += 1
+        (folder / "heard").touch()
     signal.signal(signal.SIGINT, asked)
     (folder / "ready").touch()
     end = time.monotonic() + 30
@@ -105,16 +106,15 @@ def test_a_failure_takes_no_other_job_down(job: Callable[..., Job]) -> None:
     assert did == [["train 3 3", "eval 3 3"], ["fail 3 3"], ["quiet 3 3"]]
 
 
-def interrupt_when(ready: Callable[[], bool], times: int = 1) -> threading.Thread:
-    """Ctrl-C for this process as soon as something is true, and again a little later."""
+def interrupt_when(*conditions: Callable[[], bool]) -> threading.Thread:
+    """Ctrl-C for this process as soon as each of the conditions is true, one after another."""
 
     def wait() -> None:
         end = time.monotonic() + 20
-        while not ready() and time.monotonic() < end:
-            time.sleep(0.02)
-        for _ in range(times):
+        for condition in conditions:
+            while not condition() and time.monotonic() < end:
+                time.sleep(0.02)
             os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.4)
 
     thread = threading.Thread(target=wait)
     thread.start()
@@ -135,7 +135,7 @@ def test_ctrl_c_asks_every_child_once_and_waits(job: Callable[..., Job]) -> None
 def test_a_second_ctrl_c_does_not_wait(job: Callable[..., Job]) -> None:
     deaf = job("a", "deaf")
     begin = time.monotonic()
-    thread = interrupt_when((deaf.folder / "ready").exists, times=2)
+    thread = interrupt_when((deaf.folder / "ready").exists, (deaf.folder / "heard").exists)
     with pytest.raises(KeyboardInterrupt):
         run_jobs([deaf], parallel=1, reporter=Watch(), command=COMMAND)
     assert time.monotonic() - begin < 20

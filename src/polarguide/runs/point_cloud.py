@@ -11,14 +11,14 @@ from torch import Tensor
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display, write_ply
 from polarguide.color import srgb_encode
-from polarguide.shading.model import Parameters, ShadingModel
+from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.files import atomic
 from polarguide.training.state import TrainingState
 
 
 @torch.no_grad()
 def gaussian_colors(
-    gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel, directions: Tensor
+    gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor
 ) -> Tensor:
     """Linear colors of every Gaussian toward viewing directions, reflections included.
 
@@ -29,20 +29,29 @@ def gaussian_colors(
     Returns:
         [N, K, 3]. Each Gaussian is shaded at its own normal, as far as a splat can carry a reflection.
     """
+    return torch.stack(_toward(gaussians, light, shading, directions), dim=1)
+
+
+@torch.no_grad()
+def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor) -> Tensor:
+    """``gaussian_colors`` of a training for display, [N, K, 3] in [0, 1]."""
+    linear = _toward(state.gaussians, state.light, shading, directions)
+    return torch.stack([srgb_encode(color.clamp(0, 1)) for color in linear], dim=1)
+
+
+def _toward(
+    gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor
+) -> list[Tensor]:
+    """``gaussian_colors`` direction by direction: K of [N, 3]."""
     means = gaussians["means"]
     center = means.new_zeros(3)
     normals = shortest_axis_normals(means, gaussians["quaternions"], gaussians["log_scales"], center)
-    columns = []
+    colors = []
     for direction in directions.to(means.device):
         # A camera far behind each Gaussian sees it along one direction.
         facing = torch.where((normals @ direction)[:, None] > 0, -normals, normals)
-        columns.append(shading.colors(gaussians, light, direction.expand(len(means), 3), facing))
-    return torch.stack(columns, dim=1)
-
-
-def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor) -> Tensor:
-    """``gaussian_colors`` of a training for display, [N, K, 3] in [0, 1]."""
-    return srgb_encode(gaussian_colors(state.gaussians, state.light, shading, directions).clamp(0, 1))
+        colors.append(shading.colors(gaussians, light, direction.expand(len(means), 3), facing))
+    return colors
 
 
 @torch.no_grad()

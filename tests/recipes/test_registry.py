@@ -1,0 +1,80 @@
+"""Recipes of plug-ins: found by name, loaded when asked for, and refused in one line."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from plugins import install
+
+from polarguide.errors import PolarguideError
+from polarguide.recipes import ABLATIONS, RECIPES, ablations_of, recipe_named
+
+MODULE = """
+from dataclasses import replace
+from polarguide.recipes import RECIPES
+ONE = replace(RECIPES["3dgs"], name="{name}", means_decay=0.5)
+SEVERAL = [ONE, replace(ONE, name="{name}:slow", means_decay=0.1)]
+NUMBER = 3
+TAKEN = replace(ONE, name="3dgs")
+def made(): return SEVERAL
+def broken(): raise RuntimeError("no GPU here")
+"""
+
+
+def module(monkeypatch: pytest.MonkeyPatch, folder: Path, name: str, what: str, *, entry: str = "") -> None:
+    """A package of one module that offers ``what``."""
+    site = folder / name
+    install(monkeypatch, site, **{entry or name: f"plug_{name}:{what}"})
+    (site / f"plug_{name}.py").write_text(MODULE.format(name=entry or name))
+    monkeypatch.delitem(sys.modules, f"plug_{name}", raising=False)
+
+
+@pytest.mark.parametrize("what", ["ONE", "SEVERAL", "made"])
+def test_a_plug_ins_recipe_is_found_by_its_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, what: str
+) -> None:
+    name = f"mine-{what.lower()}"
+    module(monkeypatch, tmp_path, what.lower(), what, entry=name)
+    expected = replace(RECIPES["3dgs"], name=name, means_decay=0.5)
+    assert recipe_named(name) == expected
+    assert [recipe.name for recipe in ablations_of(name)] == ([] if what == "ONE" else [f"{name}:slow"])
+
+
+def test_a_built_in_name_loads_no_plug_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    module(monkeypatch, tmp_path, "idle", "ONE")
+    assert recipe_named("polarguide") is RECIPES["polarguide"]
+    assert ablations_of("polarguide") == ABLATIONS["polarguide"]
+    assert ablations_of("3dgs") == ()
+    assert "plug_idle" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("what", "found"),
+    [
+        ("NUMBER", "TypeError"),
+        ("broken", "RuntimeError: no GPU here"),
+        ("none", "AttributeError"),
+        ("TAKEN", "3dgs, which is built in"),
+    ],
+)
+def test_a_plug_in_that_fails_is_named_when_it_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, what: str, found: str
+) -> None:
+    name = f"bad{what.lower()}"
+    module(monkeypatch, tmp_path, name, what)
+    for asked in (name, f"{name}:slow"):
+        with pytest.raises(PolarguideError, match=rf"plug-in {name} \(plug_{name}:{what}\).*found {found}"):
+            recipe_named(asked)
+    with pytest.raises(PolarguideError, match=f"found nobodys.*cannot be loaded: plug-in {name}"):
+        recipe_named("nobodys")
+    assert recipe_named("3dgs") is RECIPES["3dgs"]
+
+
+def test_two_plug_ins_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for part in ("first", "second"):
+        module(monkeypatch, tmp_path, part, "ONE", entry="shared")
+    with pytest.raises(PolarguideError, match=r"plug_\w+:ONE and plug_\w+:ONE"):
+        recipe_named("shared")

@@ -1,0 +1,166 @@
+"""The proof that a shading model is a plug: one from a plug-in goes all the way, from its name to a shared page."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plugins import install
+from polarguide.export.environment import needs_radiance
+from torch import Tensor
+
+from polarguide.capture import Scene
+from polarguide.errors import PolarguideError
+from polarguide.evaluation.scores import score_view
+from polarguide.evaluation.target import ViewTarget
+from polarguide.export.points import surface_points
+from polarguide.export.share import BAKED, share_page
+from polarguide.gaussians.ply import read_ply
+from polarguide.raster import choose_backend
+from polarguide.recipes import ablations_of, recipe_named
+from polarguide.runs.folder import load_checkpoint, recipe_data, save_checkpoint
+from polarguide.runs.point_cloud import write_run_ply
+from polarguide.scene_frame import scene_frame
+from polarguide.shading.gbuffer import render
+from polarguide.shading.result import LAYERS, RenderResult
+from polarguide.training.actions import reset_opacity
+from polarguide.training.recipe import Recipe
+from polarguide.training.state import TrainingState
+from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.viewer import shown_training
+from polarguide.viewer.appearance import Appearance, Crop, Painter
+
+SETTINGS = TrainSettings(steps=150, seed=2, refractive_index=1.4)
+STOP = 70  # after rounds of the density control, and before others
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recipe:
+    install(monkeypatch, tmp_path / "site", toy="toy_shading:recipes")
+    return recipe_named("toy")
+
+
+@pytest.fixture
+def trained(tiny_scene: Scene, toy: Recipe) -> Trainer:
+    return train(tiny_scene, toy)
+
+
+def train(
+    scene: Scene, recipe: Recipe, until: int | None = None, state: TrainingState | None = None
+) -> Trainer:
+    trainer = Trainer(scene, recipe, SETTINGS, choose_backend("cpu"), state)
+    trainer.run(lambda _: None, until=until)
+    return trainer
+
+
+def bits(tensors: dict[str, Tensor]) -> dict[str, bytes]:
+    return {name: values.numpy().tobytes() for name, values in tensors.items()}
+
+
+def picture(trainer: Trainer, **layers: bool) -> RenderResult:
+    view, state = trainer.scene.train_views[0], trainer.state
+    rasterize = trainer.backend.rasterize
+    with torch.no_grad():
+        return render(
+            state.gaussians, view.camera, rasterize, shading=trainer.shading, light=state.light, **layers
+        )
+
+
+def test_it_trains_and_resumes_to_the_same_bits(trained: Trainer, toy: Recipe, tmp_path: Path) -> None:
+    first = Trainer(trained.scene, toy, SETTINGS, trained.backend).state
+    for name in ("gloss_logits", "tint"):
+        assert trained.state.gaussians[name].detach().std() > 0, "not trained"
+        assert trained.state.gaussians[name].shape == (len(trained.state.gaussians), *toy.shapes[name])
+    assert (trained.state.light["sky"] - first.light["sky"]).abs().min() > 1e-3
+    assert len(trained.state.gaussians) != len(first.gaussians), "the density control did nothing"
+    begun = train(trained.scene, toy, until=STOP)
+    save_checkpoint(tmp_path, begun.state)
+    resumed = train(trained.scene, toy, state=load_checkpoint(tmp_path, toy))
+    assert bits(resumed.state.tensors()) == bits(trained.state.tensors())
+
+
+def test_a_run_records_its_values_and_no_place_of_code(toy: Recipe) -> None:
+    data = recipe_data(toy)
+    assert data["shading"] == {"model": "SkyShading", "first_gloss": 0.2, "sky_rate": 0.02}
+    assert "toy_shading" not in json.dumps(data)
+    assert recipe_data(recipe_named("toy:dull")) != data
+    assert ablations_of("toy") == (recipe_named("toy:dull"),)
+
+
+def test_it_renders_and_is_evaluated(trained: Trainer) -> None:
+    result, view = picture(trained, depth=True), trained.scene.train_views[0]
+    assert {name for name in LAYERS if getattr(result, name) is not None} == set(trained.shading.layers)
+    assert trained.shading.refractive_index == SETTINGS.refractive_index
+    target = ViewTarget.of(view.photograph(), view.invalid, view.ground_truth, torch.device("cpu"))
+    before = Trainer(trained.scene, trained.recipe, SETTINGS, trained.backend)
+    first, last = (score_view(target, picture(trainer))["psnr"] for trainer in (before, trained))
+    assert last > first + 1  # type: ignore[operator]
+
+
+def test_it_is_exported(trained: Trainer, tmp_path: Path) -> None:
+    write_run_ply(tmp_path / "run.ply", trained.state, trained.shading)
+    read = read_ply(tmp_path / "run.ply")
+    assert set(read["extra"]) == {"linear_dc", "linear_rest"}
+    # Display colors, reflections included: brighter than the base color alone.
+    assert float((read["sh_dc"] - read["extra"]["linear_dc"]).mean()) > 0
+    gaussians, views = trained.state.gaussians, trained.scene.train_views
+    gaussians.overwrite("opacity_logits", gaussians["opacity_logits"] + 3)
+    points, normals, colors = surface_points(gaussians, trained.shading, views, trained.backend.rasterize)
+    assert len(points) == len(normals) == len(colors) > 0
+    with pytest.raises(PolarguideError, match="learns the radiance"):
+        needs_radiance(trained.shading, what="--format environment")
+
+
+def test_it_is_shared_with_baked_colors_and_a_note(trained: Trainer) -> None:
+    cameras = {view.name: view.camera for view in trained.scene.views}
+    page = share_page(
+        trained.state.gaussians, trained.state.light, trained.shading, cameras, first="v0", title="toy"
+    )
+    assert BAKED in page
+    scene = json.loads(re.findall(r'id="scene">(.*?)</script>', page)[0])
+    assert (scene["kind"], scene["layers"]) == ("plain", ["final", "normal"])
+
+
+def test_it_is_viewed(trained: Trainer) -> None:
+    cameras = [view.camera for view in trained.scene.views]
+    painter, shown, camera = Painter(scene_frame(cameras)), shown_training(trained), cameras[0]
+    pictures = {layer: painter.paint(shown, camera, Appearance(layer=layer)) for layer in LAYERS}
+    assert {layer for layer, found in pictures.items() if found is not None} == set(trained.shading.layers)
+    stronger = Appearance(strength=2.0, turn=30.0, crop=Crop((-9, -9, -9), (9, 9, 9)))
+    found, plain = painter.paint(shown, camera, stronger), pictures["final"]
+    assert found is not None
+    assert plain is not None
+    assert found.mean() > plain.mean() + 1
+
+
+def test_a_reset_of_the_opacities_keeps_the_models_minimum(trained: Trainer) -> None:
+    gaussians = trained.state.gaussians
+    gaussians.overwrite("gloss_logits", torch.linspace(-9, 2, len(gaussians)))
+    tint = gaussians["tint"].detach().clone()
+    reset_opacity(trained.state, trained.shading)
+    gloss = gaussians["gloss_logits"].detach()
+    assert (float(gloss.min()), float(gloss.max())) == (-5.0, 2.0)
+    assert torch.equal(gaussians["tint"], tint)
+
+
+def test_normal_propagation_needs_a_strength(trained: Trainer, toy: Recipe) -> None:
+    stages = tuple(replace(stage, on_enter=("propagate_normals",)) for stage in toy.stages)
+    with pytest.raises(PolarguideError, match="reflection strength"):
+        train(trained.scene, replace(toy, stages=stages))
+
+
+def test_a_checkpoint_of_another_model_is_refused(trained: Trainer, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, trained.state)
+    for name in ("polarguide", "3dgs-dr"):
+        with pytest.raises(PolarguideError, match=r"no gaussians\.strength_logits"):
+            load_checkpoint(tmp_path, recipe_named(name))
+    with torch.no_grad():
+        trained.state.gaussians["tint"][3] = np.nan
+    save_checkpoint(tmp_path, trained.state)
+    with pytest.raises(PolarguideError, match=r"gaussians\.tint with values that are not finite"):
+        load_checkpoint(tmp_path, trained.recipe)
