@@ -1,10 +1,9 @@
-"""Reporters: silent by default, printed by the command line."""
+"""Reporters: silent by default."""
 
 from __future__ import annotations
 
 import pytest
 
-from polarguide.cli.progress import ConsoleReporter
 from polarguide.progress import SILENT
 
 
@@ -14,14 +13,3 @@ def test_the_default_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
     with SILENT.track("c", None) as advance:
         advance(1, total=2, note="d")
     assert capsys.readouterr() == ("", "")
-
-
-def test_the_console_shows_brackets_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    reporter = ConsoleReporter()
-    reporter.say("[bold]view[/] 1")
-    reporter.warn("[x] is odd")
-    with reporter.track("[y]") as advance:
-        advance(1)
-        advance(2, total=2, note="[z]")
-    out = capsys.readouterr().out
-    assert "[bold]view[/] 1\nwarning: [x] is odd\n" in out

@@ -38,3 +38,14 @@ def test_warnings_of_the_library_are_lines(capsys: pytest.CaptureFixture[str]) -
     with warnings_printed():
         warnings.warn("the [scene] has changed", PolarguideWarning, stacklevel=1)
     assert capsys.readouterr().out == "warning: the [scene] has changed\n"
+
+
+def test_the_console_shows_brackets_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = ConsoleReporter()
+    reporter.say("[bold]view[/] 1")
+    reporter.warn("[x] is odd")
+    with reporter.track("[y]") as advance:
+        advance(1)
+        advance(2, total=2, note="[z]")
+    out = capsys.readouterr().out
+    assert "[bold]view[/] 1\nwarning: [x] is odd\n" in out

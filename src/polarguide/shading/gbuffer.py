@@ -9,7 +9,7 @@ import torch
 from polarguide.camera import Camera
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
-from polarguide.shading.model import PLAIN, GBuffer, Parameters, ShadingModel, Light
+from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
 
 COLOR_CHANNELS = (0, 1, 2)
