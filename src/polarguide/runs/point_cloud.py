@@ -17,9 +17,7 @@ from polarguide.training.state import TrainingState
 
 
 @torch.no_grad()
-def gaussian_colors(
-    gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor
-) -> Tensor:
+def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> Tensor:
     """Linear colors of every Gaussian toward viewing directions, reflections included.
 
     Args:
@@ -39,9 +37,7 @@ def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor
     return torch.stack([srgb_encode(color.clamp(0, 1)) for color in linear], dim=1)
 
 
-def _toward(
-    gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor
-) -> list[Tensor]:
+def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> list[Tensor]:
     """``gaussian_colors`` direction by direction: K of [N, 3]."""
     means = gaussians["means"]
     center = means.new_zeros(3)
