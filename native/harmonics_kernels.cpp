@@ -9,6 +9,7 @@ namespace POLARGUIDE_ISA {
 namespace {
 
 constexpr int rest_values = 45; // fifteen coefficients, three channels
+// As in src/polarguide/gaussians/harmonics.py.
 constexpr float sh0 = 0.28209479f, sh1 = 0.48860251f;
 constexpr float sh2[5] = {1.09254843f, -1.09254843f, 0.31539157f, -1.09254843f, 0.54627422f};
 constexpr float sh3[7] = {-0.59004359f, 2.89061144f, -0.45704580f, 0.37317633f, -0.45704580f, 1.44530572f, -0.59004359f};

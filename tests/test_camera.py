@@ -33,3 +33,10 @@ def test_a_quaternion_makes_its_rotation_again() -> None:
     assert w**2 + x**2 + y**2 + z**2 == pytest.approx(1.0)
     again = quaternions_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
     torch.testing.assert_close(again, rotation)
+
+
+def test_matrices_project_a_point_like_the_camera() -> None:
+    camera = Camera(8, 6, 10.0, 11.0, 4.1, 2.9, *look_at(EYE, TARGET, UP))
+    point = torch.tensor([*TARGET, 1.0], dtype=torch.float64)
+    x, y, z = camera.intrinsics @ (camera.world_to_camera @ point)[:3]
+    assert (float(x / z), float(y / z)) == pytest.approx((4.1, 2.9))

@@ -136,11 +136,9 @@ class Plain:
         self.gaussians = Gaussians({name: parameters[name] for name in CORE_SHAPES}, rates)
         self._views = []
         for view in scene.train_views:
-            camera, matrix = view.camera, torch.eye(4, dtype=torch.float64)
-            matrix[:3, :3], matrix[:3, 3] = camera.rotation, camera.translation
-            intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+            camera = view.camera
             shown = srgb_encode(view.photograph().clamp(0, 1)).to(device)
-            poses = (t[None].to(device, torch.float32) for t in (matrix, intrinsics))
+            poses = (t[None].to(device, torch.float32) for t in (camera.world_to_camera, camera.intrinsics))
             self._views.append((*poses, camera.width, camera.height, shown))
         self._pull = torch.zeros(len(self.gaussians), device=device)
         self._turn = 0

@@ -73,6 +73,19 @@ class Camera:
         """Camera center in the world, [3] float64."""
         return -self.rotation.T @ self.translation
 
+    @property
+    def intrinsics(self) -> Tensor:
+        """Focal lengths and principal point as a matrix, [3, 3] float64."""
+        matrix = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(matrix, dtype=torch.float64)
+
+    @property
+    def world_to_camera(self) -> Tensor:
+        """The pose as a matrix, [4, 4] float64."""
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
+        return matrix
+
     def pose(self, dtype: torch.dtype, device: torch.device) -> Pose:
         """The pose on a device, not to be written to. It is kept, so that a second rendering copies nothing there."""
         poses: dict[tuple[torch.dtype, torch.device], Pose] = self.__dict__.setdefault("_poses", {})

@@ -89,8 +89,8 @@ def guarded(action: Callable[[], object], path: Path) -> None:
         action()
 
 
-def read_file(path: Path) -> bytes:
-    """The bytes of a file of up to 2 GiB.
+def read_file(path: Path, *, remedy: str = "Check that the file exists and may be read.") -> bytes:
+    """The bytes of a file of up to 2 GiB; ``remedy`` is for messages.
 
     Raises:
         PolarguideError: the file cannot be read.
@@ -107,7 +107,7 @@ def read_file(path: Path) -> bytes:
             path,
             expected="a readable file",
             found=error.strerror or str(error),
-            remedy="Check that the file exists and may be read.",
+            remedy=remedy,
         ) from error
 
 

@@ -34,7 +34,7 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
     Raises:
         PolarguideError: the file cannot be read, or ``decode`` refuses it.
     """
-    return decode(read_file(path), kind, path, remedy=remedy)
+    return decode(read_file(path, remedy=remedy), kind, path, remedy=remedy)
 
 
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:
@@ -177,8 +177,10 @@ def _limits(form: Any) -> str:
     for option in getattr(form, "types", (form,)):
         least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
         if least is not None and most is not None:
-            return f"{least:g} to {most:g}"
-        words = ((least, "{} or more"), (above, "above {}"), (most, "up to {}"), (below, "below {}"))
+            return f"{least:.10g} to {most:.10g}"
+        words = (
+            (least, "{:.10g} or more"), (above, "above {:.10g}"), (most, "up to {:.10g}"), (below, "below {:.10g}"),
+        )  # fmt: skip
         if any(limit is not None for limit, _ in words):
             return " and ".join(text.format(limit) for limit, text in words if limit is not None)
     return ""

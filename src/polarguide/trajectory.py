@@ -6,26 +6,30 @@ A file is JSON, ``{"cameras": [...], "frames_per_second": 30}``, each camera wit
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import torch
+from msgspec import Meta
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from polarguide.camera import Camera, look_at
 from polarguide.errors import PolarguideError
+from polarguide.records import read_record
 from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.vectors import dot, unit
 
 LARGEST_SIDE = 8192
 MOST_FRAMES = 100_000
+REMEDY = "Give orbit, spiral, interpolate, or a JSON file with cameras as docs/exporting.md shows it."
+Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
 
 
 def orbit(cameras: Sequence[Camera], frames: int, *, swing: float = 0.0) -> list[Camera]:
@@ -97,41 +101,43 @@ def camera_record(camera: Camera) -> dict[str, Any]:
     }
 
 
+class _CameraRecord(msgspec.Struct):
+    """A camera as the file holds it."""
+
+    width: Side
+    height: Side
+    fx: Annotated[float, Meta(gt=0)]
+    fy: Annotated[float, Meta(gt=0)]
+    cx: float
+    cy: float
+    rotation: Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)]
+    translation: tuple[float, float, float]
+
+
+class _PathRecord(msgspec.Struct):
+    cameras: Annotated[list[_CameraRecord], Meta(min_length=1, max_length=MOST_FRAMES)]
+    frames_per_second: Annotated[float, Meta(gt=0, le=1000)] = 30
+
+
 def read_path(path: Path) -> tuple[list[Camera], float]:
     """Cameras of a file, and its frames a second (30 if it does not say).
 
     Raises:
         PolarguideError: no such file, or one that is not as the module says.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        cameras = [_camera_of(record) for record in data["cameras"]]
-        speed = float(data.get("frames_per_second", 30))
-        if not 1 <= len(cameras) <= MOST_FRAMES or not 0 < speed <= 1000:
-            raise ValueError("no cameras, too many, or no such frames_per_second")
-        return cameras, speed
-    except FileNotFoundError:
-        found = "no such file"
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
-        found = f"something else ({error!r:.120})"
-    raise PolarguideError(
-        path,
-        expected="a camera path (orbit, spiral, interpolate, or JSON with cameras)",
-        found=found,
-        remedy="docs/exporting.md shows such a file.",
-    )
+    record = read_record(path, _PathRecord, remedy=REMEDY)
+    cameras = [
+        _camera_of(camera, f"{path} (cameras[{k}].rotation)") for k, camera in enumerate(record.cameras)
+    ]
+    return cameras, record.frames_per_second
 
 
-def _camera_of(record: dict[str, Any]) -> Camera:
-    numbers = [float(record[key]) for key in ("fx", "fy", "cx", "cy")]
-    size = int(record["width"]), int(record["height"])
-    rotation = torch.tensor([float(x) for x in record["rotation"]], dtype=torch.float64).reshape(3, 3)
-    translation = torch.tensor([float(x) for x in record["translation"]], dtype=torch.float64)
+def _camera_of(record: _CameraRecord, where: str) -> Camera:
+    rotation = torch.tensor(record.rotation, dtype=torch.float64).reshape(3, 3)
     turned = torch.dist(rotation @ rotation.T, torch.eye(3, dtype=torch.float64)) < 1e-3
-    finite = all(math.isfinite(x) for x in numbers) and bool(torch.isfinite(translation).all())
-    if not (turned and float(torch.linalg.det(rotation)) > 0 and finite and translation.shape == (3,)):
-        raise ValueError("a pose or lens that is none")
-    if not (min(size) >= 1 and max(size) <= LARGEST_SIDE and min(numbers[:2]) > 0):
-        raise ValueError("a size or focal length out of range")
-    (width, height), (fx, fy, cx, cy) = size, numbers
-    return Camera(width, height, fx, fy, cx, cy, rotation, translation)
+    if not (turned and float(torch.linalg.det(rotation)) > 0):
+        raise PolarguideError(where, expected="a rotation", found=str(list(record.rotation)), remedy=REMEDY)
+    return Camera(
+        record.width, record.height, record.fx, record.fy, record.cx, record.cy,
+        rotation, torch.tensor(record.translation, dtype=torch.float64),
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Averages over pixel boxes, against a slow twin that walks the boxes one by one."""
+"""Averages over pixel boxes, against a slow reference that walks the boxes one by one."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_ground_truth(capture: TinyCapture, factor: int) -> None:
     factor=st.integers(1, 4),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_box_functions_against_the_twin(height: int, width: int, factor: int, seed: int) -> None:
+def test_box_functions_against_the_reference(height: int, width: int, factor: int, seed: int) -> None:
     if factor > min(height, width):
         return
     codes = np.random.default_rng(seed).integers(0, 65536, (height, width, 3)).astype(np.uint16)

@@ -79,7 +79,8 @@ def test_words_and_other_files_do_not(package: Path, name: str, text: str) -> No
             "if TYPE_CHECKING:\n    from ours import vectors\nelse:\n    import ours.optics",
             ["optics/__init__.py"],
         ),
-        ("from ours.recipes import named\nimport ours\nimport torch, yours.vectors", []),
+        ("import ours\nimport torch, yours.vectors", []),
+        ("from ours.recipes import named", ["vectors.py"]),
         ("import ours.circle", ["circle.py"]),
     ],
 )

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from polarguide.cli.compare import signals_as_interrupts
-from polarguide.cli.job_progress import JobReporter
 from polarguide.experiments.jobs import Job, last_line, run_jobs
 from polarguide.experiments.worker import Scoring
 from polarguide.progress import Advance, Reporter
+from polarguide.system import signals_as_interrupts
 
 # Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
 PROGRAM = """
@@ -36,6 +35,7 @@ if verb in ("wait", "deaf"):
     def asked(*_):
         global count
         count += 1
+        (folder / "heard").touch()
     signal.signal(signal.SIGINT, asked)
     (folder / "ready").touch()
     end = time.monotonic() + 30
@@ -106,16 +106,15 @@ def test_a_failure_takes_no_other_job_down(job: Callable[..., Job]) -> None:
     assert did == [["train 3 3", "eval 3 3"], ["fail 3 3"], ["quiet 3 3"]]
 
 
-def interrupt_when(ready: Callable[[], bool], times: int = 1) -> threading.Thread:
-    """Ctrl-C for this process as soon as something is true, and again a little later."""
+def interrupt_when(*conditions: Callable[[], bool]) -> threading.Thread:
+    """Ctrl-C for this process as soon as each of the conditions is true, one after another."""
 
     def wait() -> None:
         end = time.monotonic() + 20
-        while not ready() and time.monotonic() < end:
-            time.sleep(0.02)
-        for _ in range(times):
+        for condition in conditions:
+            while not condition() and time.monotonic() < end:
+                time.sleep(0.02)
             os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.4)
 
     thread = threading.Thread(target=wait)
     thread.start()
@@ -136,7 +135,7 @@ def test_ctrl_c_asks_every_child_once_and_waits(job: Callable[..., Job]) -> None
 def test_a_second_ctrl_c_does_not_wait(job: Callable[..., Job]) -> None:
     deaf = job("a", "deaf")
     begin = time.monotonic()
-    thread = interrupt_when((deaf.folder / "ready").exists, times=2)
+    thread = interrupt_when((deaf.folder / "ready").exists, (deaf.folder / "heard").exists)
     with pytest.raises(KeyboardInterrupt):
         run_jobs([deaf], parallel=1, reporter=Watch(), command=COMMAND)
     assert time.monotonic() - begin < 20
@@ -186,14 +185,3 @@ def test_the_last_line_of_a_log(tmp_path: Path) -> None:
     assert last_line(log) == {"step": 19}
     log.write_text("nonsense\n")
     assert last_line(log) is None
-
-
-def test_the_display_shows_markup_in_names_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    reporter = JobReporter()
-    with reporter.track("all", 2) as everything, reporter.track("[red]cup[/]", 1) as one:
-        one(1, note="[bold]scoring[/]")
-        everything(1)
-        reporter.say("failed  [red]cup[/]: no [bold]space[/] left")
-    with reporter.track("again"):
-        pass
-    assert "failed  [red]cup[/]: no [bold]space[/] left" in capsys.readouterr().out

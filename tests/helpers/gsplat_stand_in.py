@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from polarguide.gaussians.geometry import quaternions_to_rotations
+
 COMPILED = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33)
 calls: list[int] = []
 """Channel counts of the pictures blended so far."""
@@ -28,13 +30,7 @@ def fully_fused_projection(
     *,
     opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    axes = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) * scales[:, None, :]
+    axes = quaternions_to_rotations(quats) * scales[:, None, :]
     turn, shift = viewmats[0, :3, :3], viewmats[0, :3, 3]
     fx, fy, cx, cy = Ks[0, 0, 0], Ks[0, 1, 1], Ks[0, 0, 2], Ks[0, 1, 2]
     local = means @ turn.T + shift

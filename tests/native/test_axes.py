@@ -1,4 +1,4 @@
-"""Shortest axes and mirrored rays: the kernels against their twins, forward and gradient."""
+"""Shortest axes and mirrored rays: the kernels against their reference implementations, forward and gradient."""
 
 import pytest
 import torch
@@ -36,13 +36,13 @@ def with_gradient(function, shape: tuple[Tensor, ...], center: Tensor) -> tuple[
 
 @pytest.mark.parametrize("oriented", [False, True])
 @pytest.mark.parametrize("count", [1, 17, 10_000])
-def test_kernel_agrees_with_the_twin(simd: str, count: int, oriented: bool) -> None:
+def test_kernel_agrees_with_the_reference(simd: str, count: int, oriented: bool) -> None:
     shape = gaussians(count)[: 4 if oriented else 3]
     found = with_gradient(shortest_axis_normals, shape, CENTER)
     exact = with_gradient(shortest_axis_normals_reference, tuple(t.double() for t in shape), CENTER.double())
-    for name, mine, twin in zip(("normals", "gradient"), found, exact, strict=True):
-        scale = 1 + float(twin.abs().max()) if name == "gradient" else 1.0
-        assert_close(mine.double(), twin, rtol=1e-5, atol=2e-6 * scale)
+    for name, mine, reference in zip(("normals", "gradient"), found, exact, strict=True):
+        scale = 1 + float(reference.abs().max()) if name == "gradient" else 1.0
+        assert_close(mine.double(), reference, rtol=1e-5, atol=2e-6 * scale)
 
 
 def test_threads_do_not_change_the_result() -> None:
@@ -64,13 +64,13 @@ def test_no_gaussian_and_no_length_are_no_trouble() -> None:
     assert torch.isfinite(gradient).all()
 
 
-def test_mirrored_directions_agree_with_the_twin(simd: str) -> None:
+def test_mirrored_directions_agree_with_the_reference(simd: str) -> None:
     means, quaternions, log_scales, _ = gaussians(1000)
     means[5] = CENTER
     normals = shortest_axis_normals(means, quaternions, log_scales, CENTER)
     found = mirrored_directions(means, CENTER, normals)
-    twin = mirrored_directions(means.double(), CENTER.double(), normals.double())
-    assert_close(found.double(), twin, rtol=1e-5, atol=2e-6)
+    reference = mirrored_directions(means.double(), CENTER.double(), normals.double())
+    assert_close(found.double(), reference, rtol=1e-5, atol=2e-6)
     assert_close(found[5], torch.zeros(3))
     others = torch.arange(1000) != 5
     assert_close(found[others].norm(dim=1), torch.ones(999))

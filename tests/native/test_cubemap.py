@@ -1,4 +1,4 @@
-"""The cubemap: kernel against twin, seams, orientation, and the twin against finite differences."""
+"""The cubemap: kernel against reference implementation, seams, orientation, finite differences."""
 
 import math
 
@@ -53,7 +53,7 @@ def with_gradients(function, texture: Tensor, directions: Tensor) -> tuple[Tenso
 @resolutions
 @pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 5000])
-def test_kernel_agrees_with_the_twin(simd: str, resolution: int, channels: int, count: int) -> None:
+def test_kernel_agrees_with_the_reference(simd: str, resolution: int, channels: int, count: int) -> None:
     texture, directions = texture_of(resolution, channels), some_directions(count)
     found = with_gradients(cubemap_lookup, texture, directions)
     exact = with_gradients(cubemap_lookup_reference, texture.double(), directions.double())
@@ -65,7 +65,7 @@ def test_kernel_agrees_with_the_twin(simd: str, resolution: int, channels: int, 
 
 
 @resolutions
-def test_gradient_of_the_twin(resolution: int) -> None:
+def test_gradient_of_the_reference(resolution: int) -> None:
     texture, directions = texture_of(resolution, 2, torch.float64), some_directions(60, torch.float64)
     directions = normalize(directions[away_from_kinks(directions, resolution)], dim=-1)[:8]
     assert len(directions) > 3

@@ -1,4 +1,4 @@
-"""The photometric loss: kernel against twin, both against scikit-image and finite differences; sRGB."""
+"""The photometric loss: kernel and reference implementation against scikit-image and finite differences; sRGB."""
 
 import math
 
@@ -47,7 +47,7 @@ def relative_error(found: Tensor, exact: Tensor) -> float:
 @sizes
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
-def test_kernel_agrees_with_the_twin(
+def test_kernel_agrees_with_the_reference(
     simd: str, height: int, width: int, weighted: bool, ssim_weight: float
 ) -> None:
     prediction, target = pictures(height, width)
@@ -67,7 +67,7 @@ def test_kernel_agrees_with_the_twin(
 @sizes
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
-def test_the_written_out_gradient_is_the_twins(
+def test_the_written_out_gradient_is_that_of_the_reference(
     height: int, width: int, weighted: bool, ssim_weight: float
 ) -> None:
     """What other devices compute."""
@@ -91,7 +91,7 @@ def test_smooth_pictures_agree_too(simd: str) -> None:
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_gradient_of_the_twin(weighted: bool) -> None:
+def test_gradient_of_the_reference(weighted: bool) -> None:
     prediction, target = pictures(6, 7, low=0.05, high=0.95)
     weight = some_weights(6, 7).double() if weighted else None
     torch.autograd.gradcheck(
@@ -117,8 +117,8 @@ def test_ssim_agrees_with_scikit_image(simd: str) -> None:
     interior[5:-5, 5:-5] = 1
     expected = 1 - values[5:-5, 5:-5].mean()
     assert float(photometric_loss(prediction, target, interior, 1.0)) == pytest.approx(expected, rel=2e-5)
-    twin = photometric_loss_reference(prediction.double(), target.double(), interior.double(), 1.0)
-    assert float(twin) == pytest.approx(expected, rel=1e-6)
+    reference = photometric_loss_reference(prediction.double(), target.double(), interior.double(), 1.0)
+    assert float(reference) == pytest.approx(expected, rel=1e-6)
 
 
 def exact_srgb(value: float) -> float:

@@ -1,4 +1,4 @@
-"""Spherical harmonics: the kernel against its twin, the twin against theory and finite differences."""
+"""Spherical harmonics: the kernel against its reference implementation, both against theory and finite differences."""
 
 import math
 
@@ -33,7 +33,7 @@ def with_gradients(function, inputs: tuple[Tensor, ...], degree: int) -> list[Te
 
 @degrees
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 1000])
-def test_kernel_agrees_with_the_twin(simd: str, degree: int, count: int) -> None:
+def test_kernel_agrees_with_the_reference(simd: str, degree: int, count: int) -> None:
     inputs = gaussians(count)
     exact = with_gradients(evaluate_sh_reference, tuple(t.double() for t in inputs), degree)
     for found, expected in zip(with_gradients(evaluate_sh, inputs, degree), exact, strict=True):
@@ -41,7 +41,7 @@ def test_kernel_agrees_with_the_twin(simd: str, degree: int, count: int) -> None
 
 
 @degrees
-def test_gradient_of_the_twin(degree: int) -> None:
+def test_gradient_of_the_reference(degree: int) -> None:
     inputs = [t.requires_grad_() for t in gaussians(3, torch.float64)]
     torch.autograd.gradcheck(
         lambda m, d, r: evaluate_sh_reference(m, CENTER.double(), d, r, degree),

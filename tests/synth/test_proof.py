@@ -14,11 +14,11 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.camera import Camera, look_at
-from polarguide.synth.build import Built, build_scene
-from polarguide.synth.film import Light, expose
-from polarguide.synth.geometry import pixel_truth
+from polarguide.synth.build import BuiltScene, build_scene
+from polarguide.synth.film import LobeRadiance, render_lobes
+from polarguide.synth.geometry import ground_truth_maps
 from polarguide.synth.schema import parse_scene
-from polarguide.synth.transport import Walk
+from polarguide.synth.transport import PathLimits
 from polarguide.synth.variant import Variant
 from polarguide.vectors import unit_array as unit
 
@@ -46,14 +46,14 @@ def camera() -> Camera:
 
 
 @pytest.fixture(scope="module")
-def ball(variant: Variant, tmp_path_factory: pytest.TempPathFactory) -> Built:
+def ball(variant: Variant, tmp_path_factory: pytest.TempPathFactory) -> BuiltScene:
     folder = tmp_path_factory.mktemp("ball")
     return build_scene(parse_scene(BALL, "ball", folder=folder), folder, variant)
 
 
 @pytest.fixture(scope="module")
-def light(ball: Built, camera: Camera) -> Light:
-    return expose(ball.scenes, camera, 64, seed=3, walk=Walk(depth=3), center=True)
+def light(ball: BuiltScene, camera: Camera) -> LobeRadiance:
+    return render_lobes(ball.scenes, camera, 64, seed=3, limits=PathLimits(depth=3), center=True)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def angle_error(stokes: Tensor, expected: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("lobe", ["specular", "diffuse"])
 def test_each_lobe_obeys_fresnel(
-    lobe: str, light: Light, normals: tuple[Tensor, Tensor], camera: Camera
+    lobe: str, light: LobeRadiance, normals: tuple[Tensor, Tensor], camera: Camera
 ) -> None:
     normal, where = normals
     rays = camera.rays(dtype=torch.float64)
@@ -94,7 +94,7 @@ def test_each_lobe_obeys_fresnel(
 
 
 def test_specular_light_is_fresnels_reflectance(
-    light: Light, normals: tuple[Tensor, Tensor], camera: Camera, variant: Variant
+    light: LobeRadiance, normals: tuple[Tensor, Tensor], camera: Camera, variant: Variant
 ) -> None:
     normal, where = normals
     zenith = optics.zenith(normal, camera.rays(dtype=torch.float64))
@@ -107,7 +107,7 @@ def test_specular_light_is_fresnels_reflectance(
 
 
 def test_full_polarization_at_brewsters_angle(
-    ball: Built, camera: Camera, variant: Variant, normals: tuple[Tensor, Tensor], light: Light
+    ball: BuiltScene, camera: Camera, variant: Variant, normals: tuple[Tensor, Tensor], light: LobeRadiance
 ) -> None:
     normal, where = normals
     zenith = optics.zenith(normal, camera.rays(dtype=torch.float64))
@@ -125,11 +125,11 @@ def test_full_polarization_at_brewsters_angle(
 
 
 def test_lobes_add_up_and_predict_the_polarization(
-    light: Light, normals: tuple[Tensor, Tensor], camera: Camera
+    light: LobeRadiance, normals: tuple[Tensor, Tensor], camera: Camera
 ) -> None:
     normal, where = normals
     total = light.stokes
-    np.testing.assert_allclose(total[0], light.specular[0] + light.diffuse[0] + light.seen, atol=1e-12)
+    np.testing.assert_allclose(total[0], light.specular[0] + light.diffuse[0] + light.emitted, atol=1e-12)
     rays = camera.rays(dtype=torch.float64)
     where = where & (optics.zenith(normal, rays) < math.radians(78))
     model = optics.predicted_stokes(
@@ -138,18 +138,18 @@ def test_lobes_add_up_and_predict_the_polarization(
     assert (model - torch.from_numpy(total)).abs()[:, where].max() < 1e-3
 
 
-def test_what_is_seen_directly_is_the_sky(light: Light, normals: tuple[Tensor, Tensor]) -> None:
+def test_what_is_seen_directly_is_the_sky(light: LobeRadiance, normals: tuple[Tensor, Tensor]) -> None:
     _, where = normals
-    assert light.seen[0, 0] == pytest.approx(1.0, abs=0.02)
+    assert light.emitted[0, 0] == pytest.approx(1.0, abs=0.02)
     assert not light.specular[0, 0].any()
     assert not light.diffuse[:, 0, 0].any()
-    assert not light.seen[where.numpy()].any()
+    assert not light.emitted[where.numpy()].any()
 
 
 def test_pixel_truth_agrees_with_the_geometry(
-    ball: Built, camera: Camera, normals: tuple[Tensor, Tensor]
+    ball: BuiltScene, camera: Camera, normals: tuple[Tensor, Tensor]
 ) -> None:
-    ground_truth = pixel_truth(ball, camera)
+    ground_truth = ground_truth_maps(ball, camera)
     normal, where = normals
     found = camera.to_camera(torch.from_numpy(ground_truth["normal"].astype(np.float64)))
     assert ((torch.nn.functional.normalize(found, dim=-1) * normal).sum(-1)[where] > 0.99999).all()
@@ -165,7 +165,7 @@ def test_pixel_truth_agrees_with_the_geometry(
 
 
 def test_lobes_add_up_to_mitsubas_own_path_tracer(
-    ball: Built, camera: Camera, light: Light, variant: Variant
+    ball: BuiltScene, camera: Camera, light: LobeRadiance, variant: Variant
 ) -> None:
     """The same scene by ``stokes`` over ``path``; its frame differs off the axis, S0 and DoLP do not."""
     import mitsuba as mi
@@ -186,7 +186,7 @@ def test_lobes_add_up_to_mitsubas_own_path_tracer(
         theirs[..., theirs.shape[-1] - len(names) + names.index(f"S{k}.{c}")] for k in range(3) for c in "RGB"
     ]
     other = np.stack(found).reshape(3, 3, camera.height, camera.width).transpose(0, 2, 3, 1)
-    mine = expose(ball.scenes, camera, 64, seed=5, walk=Walk(depth=3)).stokes
+    mine = render_lobes(ball.scenes, camera, 64, seed=5, limits=PathLimits(depth=3)).stokes
     channel = slice(0, 1) if variant.channels == 3 else slice(0, 3)
     inside = np.s_[5:11, 6:14]
     for image in (other, mine):

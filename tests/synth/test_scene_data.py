@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from polarguide.errors import PolarguideError
 from polarguide.synth.cameras import place_cameras
 from polarguide.synth.environment import ENVIRONMENTS, directions, make_environment
 from polarguide.synth.mesh import Mesh, write_ply
-from polarguide.synth.schema import parse_scene, read_scene_file
+from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file, with_current_keys
 from polarguide.synth.settings import PRESETS, Overrides, find_scene
 from polarguide.synth.shapes import make_mesh
 from polarguide.synth.sweep import parse_sweep
@@ -48,7 +49,7 @@ SHAPES = [
 ]
 
 
-def parsed(**changes: object) -> object:
+def parsed(**changes: object) -> SceneSpec:
     return parse_scene({**json.loads(json.dumps(SMALL)), **changes}, "test", folder=Path())
 
 
@@ -63,11 +64,21 @@ def test_presets_are_full_scenes(name: str) -> None:
         assert not all(thing.foreground for thing in spec.things)
 
 
+def test_keys_of_earlier_versions_are_accepted() -> None:
+    color = {"type": "stripes", "colors": [[0, 0, 0]]}
+    things = [{"name": "ball", "shape": {"type": "ball"}, "material": {"color": color}}]
+    lights = [{"position": [0, 0, 2], "toward": [0, 0, 0], "size": [1, 1], "radiance": [1, 1, 1]}]
+    new = {**SMALL, "things": things, "lights": lights}
+    old = json.loads(json.dumps(new).replace('"color', '"colour').replace('"toward', '"towards'))
+    assert "towards" in json.dumps(old)
+    assert parse_scene(old, "old", folder=Path()) == parse_scene(new, "new", folder=Path())
+
+
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [
         ({"wings": 2}, "wings"),
-        ({"things": []}, "0"),
+        ({"things": []}, "(things): expected a list of length >= 1, found []"),
         ({"things": [{"name": "a", "shape": {}}, {"name": "a", "shape": {}}]}, "'a', 'a'"),
         ({"things": [{"name": "a"}]}, "field shape"),
         ({"things": [{"name": "a", "shape": {}, "material": {"index": 0.9}}]}, "0.9"),
@@ -88,6 +99,12 @@ def test_files_that_are_no_scene(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("{")
     with pytest.raises(PolarguideError, match="JSON"):
         read_scene_file(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_use_names_of_today(name: str) -> None:
+    text = (resources.files("polarguide") / "synth" / "presets" / f"{name}.json").read_text("utf-8")
+    assert with_current_keys(json.loads(text)) == json.loads(text)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape["type"])
@@ -180,7 +197,7 @@ def test_overrides_reach_foreground_plastic_only() -> None:
         changed = thing.foreground and thing.material.type == "plastic"
         assert thing.material.roughness == (0.3 if changed else before.material.roughness)
         assert thing.material.index == (1.7 if changed else before.material.index)
-    with pytest.raises(PolarguideError, match="less than 4, found"):
+    with pytest.raises(PolarguideError, match="above 1 and below 4, found 0"):
         Overrides(index=0.5).apply(find_scene("cup"))
 
 

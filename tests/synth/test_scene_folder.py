@@ -8,7 +8,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +42,7 @@ TINY = {
          "material": {"color": [0.2, 0.3, 0.1]}},
     ],
 }  # fmt: skip
-SETTINGS = SynthSettings(width=16, height=16, samples=1, points=60)
+SETTINGS = SynthSettings(size="16x16", samples=1, points=60)
 # The scalar variant has no threads, and takes minutes for pictures with little noise.
 COMPILED = pytest.mark.parametrize("variant", ["compiled"], indirect=True)
 
@@ -63,7 +62,7 @@ def test_the_folder_is_read_like_a_capture(scene: Path) -> None:
     assert [view.name for view in found.views] == ["v000", "v001", "v002", "v003"]
     assert found.test_names == ("v000",)
     assert found.refractive_index == 1.5
-    assert not [text for text in found.warnings if "belong to no view" in text]
+    assert not [text for text in found.warnings if "without a view" in text]
     assert len(found.points) > 20
     (view,) = found.test_views
     ground_truth = view.ground_truth
@@ -94,10 +93,10 @@ def test_points_lie_near_surfaces(scene: Path) -> None:
 def test_rendering_goes_on_to_the_same_files(
     scene: Path, spec: SceneSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stopped(job: runner.Job, number: int) -> None:
-        if number == 2:
+    def stopped(job: runner.Job, opaque: int) -> None:
+        if opaque == 2:
             raise KeyboardInterrupt
-        render(job, number)
+        render(job, opaque)
 
     render = runner._render_view
     out = tmp_path / "again"
@@ -113,8 +112,8 @@ def test_rendering_goes_on_to_the_same_files(
 
 @COMPILED
 def test_the_files_do_not_depend_on_the_threads(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
-    settings = SynthSettings(width=64, height=48, samples=16, points=60)
-    two = replace(spec, camera=replace(spec.camera, views=2))
+    settings = SynthSettings(size="64x48", samples=16, points=60)
+    two = Overrides(views=2).apply(spec)
     digests = []
     for threads in (1, 2):
         out = synthesize(two, tmp_path / str(threads), settings, Reporter(), threads=threads)
@@ -153,7 +152,7 @@ def test_a_finished_scene_is_verified(
 
 def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSpec, tmp_path: Path) -> None:
     with pytest.raises(Exception, match="same settings"):
-        synthesize(spec, scene, SynthSettings(width=16, height=16, samples=2), Reporter())
+        synthesize(spec, scene, SynthSettings(size="16x16", samples=2), Reporter())
     (tmp_path / "x").write_text("mine")
     with pytest.raises(Exception, match="empty folder"):
         synthesize(spec, tmp_path, SETTINGS, Reporter())
@@ -244,7 +243,7 @@ def test_members_of_a_sweep_sort_like_their_numbers(
 
 
 def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.synth.variant._llvm_lack", lambda: "none was found")
+    monkeypatch.setattr("polarguide.synth.variant._missing_llvm", lambda: "none was found")
     try:
         found = choose_variant("rgb")
         assert not found.fast

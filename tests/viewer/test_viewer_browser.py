@@ -94,7 +94,7 @@ def psnr(picture: np.ndarray, expected: np.ndarray) -> float:
 @pytest.fixture(scope="module")
 def opened() -> Iterator[Opened]:
     with chromium() as browser, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("polarguide.viewer.place.ARRIVAL", PATIENCE)  # a busy machine's browser takes its time
+        patch.setattr("polarguide.viewer.pose.ARRIVAL", PATIENCE)  # a busy machine's browser takes its time
         viewing = Opened(browser)
         yield viewing
         viewing.close()
@@ -105,7 +105,7 @@ def test_layers_at_a_photographs_pose_are_those_of_render(opened, layer):
     opened.choose("Layer", layer)
     expected = opened.expected("v0", layer)
     found = opened.until(lambda picture: psnr(picture, expected) > 35)
-    assert psnr(found, expected) > 35
+    assert psnr(found, expected) > 35, opened.page.get_by_label("Go to").first.input_value()
 
 
 def test_going_on_to_the_next_photograph(opened):

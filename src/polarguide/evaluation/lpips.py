@@ -27,7 +27,7 @@ def lpips(
 ) -> tuple[float | None, str | None]:
     """Learned perceptual distance of two shown pictures.
 
-    The network looks at whole pictures, so pixels outside ``keep`` are set to the truth in both.
+    The network reads whole pictures, so pixels outside ``keep`` are set to the true picture in both.
 
     Args:
         pred_linear, true_linear: [H, W, 3] linear radiance.

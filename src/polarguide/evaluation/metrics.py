@@ -137,7 +137,7 @@ def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
 
     Returns:
         [...] float64 in [0, 180]. A prediction without a direction (zero, or not finite) counts as 90 degrees
-        off, so that holes are not free. NaN where the truth has none.
+        off, so that holes are not free. NaN where the ground truth has none.
     """
     if pred.shape != true.shape or pred.shape[-1] != 3:
         raise ValueError(
@@ -183,7 +183,7 @@ def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: b
         contribution: [H, W, 3] linear, the layer as it is added to the final picture (an S0/2).
         true_s0: [H, W, 3] linear, the true S0 of the lobe.
         keep: [H, W] bool or a selection, the pixels that count; None counts all.
-        aligned: first multiply each channel by the one factor that brings it closest to the truth in linear
+        aligned: first multiply each channel by the one factor that brings it closest to the true layer in linear
             least squares, so that a wrong overall brightness or tint costs nothing.
 
     Returns:

@@ -25,7 +25,7 @@ infinity, and counts the pixels; they were scored as black, and their normals as
 def score_view(target: ViewTarget, rendered: Any) -> ViewScores:
     """Score one rendered view, on the device where it was rendered, which is waited for once.
 
-    (LPIPS, where its network is at hand, waits by itself: torchmetrics looks at the pictures' values.)
+    (LPIPS, where its network is at hand, waits by itself: torchmetrics checks the pictures' values.)
 
     Args:
         target: what it is compared with, on the same device.

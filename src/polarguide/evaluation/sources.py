@@ -14,12 +14,12 @@ from functools import lru_cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
-TRAINED_BY = ("training/trainer.py", "capture/reader.py", "raster/backends.py")
-"""What trains, and what makes its scene and its backend. With all that they import, they decide the result."""
+TRAINED_BY = ("training/trainer.py", "capture/reader.py", "raster/backends.py", "recipes/__init__.py")
+"""What trains, and what makes its scene, backend and shading: with all that they import, they decide the result."""
 SCORED_BY = ("evaluation/evaluate.py",)
 """What decides, beside that, the numbers of a finished training."""
-APART = ("recipes", "__init__.py")
-"""Below the package, what is not followed: recipes, and the package's own names, which open all of it."""
+DATA = "recipes"
+"""What is followed but does not count."""
 NATIVE = "_native"
 COMMIT = "_commit.txt"
 """Beside the package's modules in a wheel: the commit it was built from, empty where that was not known."""
@@ -67,19 +67,19 @@ def imported_files(package: Path, roots: tuple[str, ...]) -> tuple[str, ...]:
         roots: modules, as paths below it.
 
     Returns:
-        Their paths below the package, sorted; ``_native`` for the compiled library.
+        Their paths below the package, sorted, without recipes; ``_native`` for the compiled library.
     """
     found: set[str] = set()
     waiting = list(roots)
     while waiting:
         part = waiting.pop()
-        if part in found or part.split("/")[0] in APART:
+        if part in found:
             continue
         found.add(part)
         if part != NATIVE:
             for name in _imported_names(package, part):
                 waiting += _files(package, name)
-    return tuple(sorted(found))
+    return tuple(sorted(part for part in found if part.split("/")[0] != DATA))
 
 
 def _imported_names(package: Path, part: str) -> Iterator[tuple[str, ...]]:

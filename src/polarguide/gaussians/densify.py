@@ -24,8 +24,8 @@ class Densification:
         minimum_opacity: below it a Gaussian is pruned.
         maximum_scale_share: wider than this share of the extent is pruned once opacities have been reset; far
             surroundings are exempt in proportion to their distance.
-        pixels_each: pixels of all training pictures for each Gaussian at least. A Gaussian has some sixty values to
-            learn and a pixel three to teach: with fewer than twenty pixels each, unknowns outnumber data.
+        pixels_each: least number of pixels, of all training pictures, for each Gaussian. A Gaussian has some sixty
+            parameters and a pixel three values: with fewer than twenty pixels each, unknowns outnumber data.
     """
 
     every: int = 100
@@ -39,9 +39,9 @@ class Densification:
 class DensityStatistics:
     """Sums of the screen-space gradient norms over the pictures in which each Gaussian was seen.
 
-    With several views a step, the first view of each step adds to the first of several sums, and so on; they are
-    added up in this order when they are asked for. So processes that share a step's views need to exchange sums only
-    then, and the result does not depend on how many processes there were.
+    With several views a step, the first view of each step adds to the first of several sums, and so on; these are
+    added up in order when the mean is taken. So processes that share a step's views exchange sums only then, and the
+    result does not depend on the number of processes.
 
     Args:
         count: N, of the Gaussians. slots: S, views a step. device: of the Gaussians.
@@ -62,7 +62,7 @@ class DensityStatistics:
         return statistics
 
     def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int, slot: int = 0) -> None:
-        """Count one picture. screen_gradient: [N, 2] per pixel; it is taken to units of half a picture."""
+        """Add one picture. screen_gradient: [N, 2] per pixel, converted to units of half a picture."""
         x, y = screen_gradient.unbind(1)
         norm = torch.stack((x * (width / 2), y * (height / 2)), dim=1).norm(dim=1)
         gradient, seen = (t[slot] if t.ndim == 2 else t for t in (self.gradient, self.seen))
@@ -81,7 +81,7 @@ class DensityStatistics:
 
 
 def _in_order(sums: Tensor) -> Tensor:
-    """Sums [S, N] added up from the first on; [N] as they are."""
+    """Sums [S, N] added up in order; [N] as they are."""
     if sums.ndim == 1:
         return sums
     total = sums[0]
@@ -103,14 +103,14 @@ def densify(
     limit: int,
     generator: torch.Generator,
 ) -> None:
-    """One round: clone small Gaussians that pull hard, split large ones, prune the transparent and the huge.
+    """One round: clone small Gaussians with a large gradient, split large ones, prune transparent and huge ones.
 
     Args:
         extent: the scene's extent (``scene_extent``). middle: [3], the cameras' mean position.
         prune_large: also prune the huge ones (after the first opacity reset).
-        empty: where Gaussians are pruned, too.
-        limit: no more Gaussians than this.
-        generator: draws the positions of the split ones' children.
+        empty: space in which Gaussians are pruned, too.
+        limit: the largest number of Gaussians.
+        generator: draws the positions of the children.
     """
     pulled = statistics.mean() >= settings.gradient
     wide = gaussians["log_scales"].exp().amax(dim=1) > settings.dense_share * extent
@@ -128,7 +128,7 @@ def densify(
     opacity = torch.sigmoid(gaussians["opacity_logits"])
     doomed = opacity < settings.minimum_opacity
     if empty is not None:
-        doomed |= empty.holds(gaussians["means"].detach())
+        doomed |= empty.contains(gaussians["means"].detach())
     if prune_large:
         distance = (gaussians["means"] - middle).norm(dim=1)
         allowed = settings.maximum_scale_share * distance.clamp(min=extent)

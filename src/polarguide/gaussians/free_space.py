@@ -1,7 +1,7 @@
-"""Where nothing can be: the space just in front of the cameras.
+"""Free space: the space just in front of the cameras, where no surface can be.
 
-A Gaussian close to one camera explains that one picture and stands in the way of every new view nearby. The points
-of the structure from motion say how near the nearest surface of a view is; well before it, there is none.
+A Gaussian close to one camera explains that one picture and occludes every new view nearby. The SfM points bound the
+distance of the nearest surface of a view; well before it, space is free.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 
-# Share of the depth of a view's nearest points that is taken to be empty, and which points are its nearest.
-EMPTY_SHARE = 0.4
+# Share of the depth of a view's nearest points that counts as free, and the quantile of depth that is the nearest.
+FREE_SHARE = 0.4
 NEAREST = 0.02
 
 
@@ -31,22 +31,22 @@ class FreeSpace:
     radii: Tensor
 
     def to(self, device: torch.device) -> FreeSpace:
-        """The same on a device."""
+        """The same free space on a device."""
         return FreeSpace(self.centers.to(device), self.radii.to(device))
 
-    def holds(self, means: Tensor) -> Tensor:
+    def contains(self, means: Tensor) -> Tensor:
         """Which of the positions [N, 3] lie in it, [N] bool."""
         return (torch.cdist(means, self.centers) < self.radii).any(dim=1)
 
 
 def free_space(points: Tensor, cameras: Sequence[Camera]) -> FreeSpace:
-    """The space in front of the cameras that points [M, 3] leave free: see ``EMPTY_SHARE`` and ``NEAREST``."""
+    """The free space in front of cameras that see SfM points [M, 3]; see ``FREE_SHARE`` and ``NEAREST``."""
     radii = []
     for camera in cameras:
         x, y, z = camera.to_camera(points.double() - camera.center).unbind(-1)
         column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         depths = z[inside]
-        radii.append(EMPTY_SHARE * float(torch.quantile(depths, NEAREST)) if len(depths) else 0.0)
+        radii.append(FREE_SHARE * float(torch.quantile(depths, NEAREST)) if len(depths) else 0.0)
     centers = torch.stack([camera.center for camera in cameras]).float()
     return FreeSpace(centers, torch.tensor(radii))

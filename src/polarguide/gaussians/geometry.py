@@ -1,4 +1,4 @@
-"""What a Gaussian's shape says: its normal, and its values on the scale they are used."""
+"""Geometry of Gaussians: rotations, the normals of flat ones, and directions mirrored at them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from polarguide.vectors import dot, unit
 GRAZING = 0.35
 
 
-def quaternions_to_rotations(quats: Tensor) -> Tensor:
+def quaternions_to_rotations(quaternions: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalized first."""
-    w, x, y, z = normalize(quats, dim=-1, eps=1e-12).unbind(-1)
+    w, x, y, z = normalize(quaternions, dim=-1, eps=1e-12).unbind(-1)
     entries = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -30,8 +30,8 @@ def quaternions_to_rotations(quats: Tensor) -> Tensor:
 def shortest_axis_normals_reference(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, center: Tensor, outward: Tensor | None = None
 ) -> Tensor:
-    """The slow twin of ``shortest_axis_normals``: plain torch, any dtype and device."""
-    # Component by component: reductions over three or four, and one-hot rows, are several times slower.
+    """The reference implementation of ``shortest_axis_normals``: plain torch, any dtype and device."""
+    # Component by component: reductions over three or four, and one-hot vectors, are several times slower.
     w, x, y, z = quaternions.unbind(-1)
     first, second, third = log_scales.detach().unbind(-1)
     is_first = (first <= second) & (first <= third)
@@ -55,7 +55,7 @@ def shortest_axis_normals_reference(
         facing = dot(to_camera, normals)
         if outward is not None:
             side = dot(outward, normals)
-            # An opaque surface does not face away from a camera that sees it by more than its Gaussians' width.
+            # Opaque surfaces that are seen do not face away, but for the width of their Gaussians.
             grazing = facing.square() < GRAZING**2 * dot(to_camera, to_camera)
             facing = torch.where(grazing & (side != 0), side, facing)
         sign = torch.where(facing >= 0, 1.0, -1.0).to(normals)[:, None]
@@ -95,12 +95,12 @@ def shortest_axis_normals(
 ) -> Tensor:
     """Unit normals of flat Gaussians: the axis of the smallest scale, turned outward.
 
-    Without ``outward``, outward is toward the camera. At a silhouette that turns the Gaussians just beyond it over, so
-    that they cancel those just before it and the blended normal leans to the camera; with it they stay as they are.
+    Without ``outward``, normals point toward the camera. That flips the Gaussians just beyond a silhouette: they cancel
+    those just before it, and the blended normal leans to the camera. With ``outward``, they keep their side.
 
     Args:
         means: [N, 3]. quaternions: [N, 4] (w, x, y, z), any length. log_scales: [N, 3]. center: [3] camera center.
-        outward: [N, 3] direction from which each is seen, which decides at grazing angles; zero where not known.
+        outward: [N, 3] direction from which each is seen, which decides at grazing angles; zero where unknown.
 
     Returns:
         [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
@@ -114,7 +114,7 @@ def shortest_axis_normals(
 
 
 def mirrored_directions(means: Tensor, center: Tensor, normals: Tensor) -> Tensor:
-    """Where a ray from the camera goes after reflection at each Gaussian; without gradients.
+    """Directions of the rays from the camera after reflection at each Gaussian; without gradients.
 
     Args:
         means: [N, 3]. center: [3] camera center. normals: [N, 3] unit.

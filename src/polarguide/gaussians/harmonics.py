@@ -1,7 +1,8 @@
 """Real spherical harmonics to degree 3, in the order and with the signs of the 3DGS release.
 
 Degree 1 is in the order -y, z, -x. On the CPU in float32 a native kernel evaluates the colors;
-``evaluate_sh_reference`` is its twin in plain torch.
+``evaluate_sh_reference`` is its reference implementation in plain torch. The constants stand a second time in
+``native/harmonics_kernels.cpp`` and a third time in ``export/page/derive.frag``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from torch.autograd.function import once_differentiable
 from polarguide import _native
 
 SH_C0 = 0.28209479177387814
+"""The basis function of degree 0."""
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 _C3 = (
@@ -77,7 +79,7 @@ def _directions(means: Tensor, center: Tensor) -> Tensor:
 
 
 def evaluate_sh_reference(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
-    """The slow twin of ``evaluate_sh``: plain torch, any dtype and device."""
+    """The reference implementation of ``evaluate_sh``: plain torch, any dtype and device."""
     basis = sh_basis(_directions(means, center), degree)
     coefficients = torch.cat((dc[:, None], rest), dim=1)[:, : basis.shape[-1]]
     return (basis[..., None] * coefficients).sum(dim=1)

@@ -1,4 +1,4 @@
-"""First Gaussians: on the SfM points, and far around the capture, where SfM has none."""
+"""Initial Gaussians: at the SfM points, and on shells far around the capture, where SfM has none."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from polarguide.gaussians.harmonics import SH_C0
 
 @dataclass(frozen=True)
 class Initialization:
-    """How many Gaussians are added to the SfM points.
+    """How training is initialized beyond the SfM points.
 
     Attributes:
-        shell: ones far around the capture, for surroundings that SfM does not triangulate. None are added inside:
+        shell: Gaussians far around the capture, for surroundings that SfM does not triangulate. None are added inside:
             random Gaussians among the cameras end as haze in front of them.
-        shell_radii: nearest and farthest shell, in units of the cameras' distance from the middle of the points.
-        opacity: first opacity of all.
+        shell_radii: of the nearest and the farthest, in units of the cameras' distance from the median of the points.
+        opacity: initial opacity of all Gaussians.
     """
 
     shell: int = 4000
@@ -46,17 +46,17 @@ def neighbor_distance(points: np.ndarray) -> np.ndarray:
 def initial_parameters(
     points: Tensor, colors: Tensor, centers: Tensor, settings: Initialization, *, seed: int
 ) -> dict[str, Tensor]:
-    """The rows to begin with.
+    """The parameters to begin with.
 
     Args:
         points: [M, 3] SfM points.
         colors: [M, 3] linear colors in [0, 1].
         centers: [V, 3] camera centers.
-        settings: how many are added.
+        settings: how many Gaussians are added, where, and the opacity.
         seed: of the random positions and orientations.
 
     Returns:
-        The tensors of ``CORE_SHAPES``, float32.
+        The tensors of ``CORE_SHAPES`` by name, float32.
     """
     random = np.random.default_rng(seed)
     sfm = points.double().numpy()

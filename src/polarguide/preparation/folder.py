@@ -10,18 +10,48 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
-from polarguide.records import read_record
+from polarguide.records import decode, read_record, to_json
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
 SFM = ".sfm"
+REMEDY = "Give another --out; nothing was written."
 _OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
+
+
+class _Settings(msgspec.Struct):
+    poses: str
+
+
+class _Request(msgspec.Struct):
+    settings: _Settings
+    source: str
+    format: str
+    file: dict[str, tuple[int, int]]
+
+
+class _View(msgspec.Struct):
+    files: dict[str, int]
+    geometry: dict[str, Any]
+    clipped_share: float
+
+
+class _State(msgspec.Struct):
+    request: _Request
+    views: dict[str, _View] = {}
+
+
+class _Journal(msgspec.Struct):
+    """What is relied on of a journal; there is more in it."""
+
+    prepare: _State
 
 
 class SceneFolder:
@@ -57,19 +87,23 @@ class SceneFolder:
                 root,
                 expected="a new or empty folder, or an unfinished preparation",
                 found="other files",
-                remedy="Give another --out; nothing was written.",
+                remedy=REMEDY,
             )
 
     def _go_on(self, path: Path) -> None:
-        state = read_record(path, dict[str, Any]).get("prepare")
-        if not isinstance(state, dict) or not isinstance(state.get("request"), dict):
+        content = read_record(path, dict[str, Any])
+        if "prepare" not in content:
             raise PolarguideError(
                 self.root,
                 expected="a new folder, or one that prepare wrote",
                 found=f"a {path.name} of another origin",
-                remedy="Give another --out; nothing was written.",
+                remedy=REMEDY,
             )
+        decode(content, _Journal, path, remedy=REMEDY)
+        state = content["prepare"]
         before, now = json.loads(json.dumps(state["request"])), json.loads(json.dumps(self.request))
+        if before["settings"].get("white_balance") == "grey":  # its name in earlier journals
+            before["settings"]["white_balance"] = "gray"
         self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
         if self._follows_none:
             for record in (before, now):
@@ -95,11 +129,11 @@ class SceneFolder:
 
     def save(self) -> None:
         """Write the journal."""
-        write_whole(self.root / JOURNAL, _json({"prepare": self._state()}))
+        write_whole(self.root / JOURNAL, to_json({"prepare": self._state()}))
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Write ``scene.json``, the sign that the scene is whole, and drop the journal."""
-        write_whole(self.root / SCENE, _json({**summary, "prepare": self._state()}))
+        write_whole(self.root / SCENE, to_json({**summary, "prepare": self._state()}))
         (self.root / JOURNAL).unlink(missing_ok=True)
 
     def has(self, view: str, warp: object) -> bool:
@@ -135,10 +169,6 @@ class SceneFolder:
 
     def _state(self) -> dict[str, Any]:
         return {"request": self.request, "measured": self.measured, "views": self.views}
-
-
-def _json(content: dict[str, Any]) -> bytes:
-    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
 
 
 def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> tuple[str, str, str] | None:

@@ -1,4 +1,4 @@
-"""The one place where a backend is chosen."""
+"""The choice of a backend."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ class Backend(NamedTuple):
     rasterize: Rasterize
 
 
-def choose_backend(name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = print) -> Backend:
+def choose_backend(
+    name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = lambda _: None
+) -> Backend:
     """The backend for ``--device``: ``auto`` takes the GPU where there is one and gsplat is installed.
 
     Args:

@@ -1,12 +1,13 @@
 """The CUDA backend: gsplat's projection, tiling and blending behind the interface. The only file that knows gsplat.
 
-gsplat is found, and its kernels are compiled, by ``load_gsplat``; nothing of it is imported before. Of its interface
-only what 1.5.3 and 1.6.0 share is used, by keyword; what differs between them is in ``load_gsplat`` and ``COMPILED``.
+gsplat is found, and its kernels are compiled, by ``load_gsplat``; nothing of it is imported before. Only the
+interface that 1.5.3 and 1.6.0 share is used, by keyword; what differs between them is in ``load_gsplat`` and
+``COMPILED``.
 
 Where its definition departs from ours (docs/gpu.md has the table): alpha is at most 0.999 in 1.5.3, and 0.99 as here in
 1.6.0; a pixel ends at a transmittance of 1e-4 exactly, too; the radius is that of the wider side of the box that is
-drawn, whole pixels, and at most 3.33 standard deviations; exponentials are fast ones. Inputs are not searched for NaN,
-since the answer would have to be waited for.
+drawn, whole pixels, and at most 3.33 standard deviations; exponentials are approximate. Inputs are not searched for
+NaN, since the process would wait for the answer.
 """
 
 from __future__ import annotations
@@ -57,13 +58,11 @@ _views: WeakKeyDictionary[Camera, dict[torch.device, _View]] = WeakKeyDictionary
 
 
 def _view(camera: Camera, device: torch.device) -> _View:
-    """Kept for each camera, so that a second rendering copies nothing to the device."""
+    """The camera on a device, kept for each camera, so that a second rendering copies nothing there."""
     kept = _views.setdefault(camera, {})
     if device not in kept:
-        matrix = torch.eye(4, dtype=torch.float64)
-        matrix[:3, :3], matrix[:3, 3] = camera.rotation, camera.translation
-        intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        kept[device] = _View(*(t[None].to(device, torch.float32) for t in (matrix, intrinsics)))
+        matrices = (camera.world_to_camera, camera.intrinsics)
+        kept[device] = _View(*(t[None].to(device, torch.float32) for t in matrices))
     return kept[device]
 
 
@@ -79,7 +78,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
     CUDA toolkit; a failed compilation is whatever exception the compiler's driver raises.
 
     Args:
-        say: takes a line for the user once it is clear that this will take a while.
+        say: takes a line for the user once compiling has begun.
 
     Raises:
         PolarguideError: it is not installed, or its kernels cannot be had.
@@ -96,7 +95,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
     timer.daemon = True
     timer.start()
     try:
-        _offer_headers()
+        _add_headers()
         kernels = importlib.import_module("gsplat.cuda._backend")._C
     except Exception as error:  # compilers, loaders and their drivers raise all kinds
         lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
@@ -108,8 +107,8 @@ def load_gsplat(say: Callable[[str], None]) -> None:
         raise _no_kernels("no CUDA toolkit (nvcc)")
 
 
-def _offer_headers() -> None:
-    """Show the compiler the headers of PyTorch's CUDA packages where the toolkit comes without.
+def _add_headers() -> None:
+    """Add the headers of PyTorch's CUDA packages to the compiler's path where the toolkit lacks them.
 
     PyTorch's own headers include those of cuBLAS, cuSOLVER and cuSPARSE, which a bare compiler package lacks.
     """
@@ -218,9 +217,9 @@ def _blend_with_statistic(
     """``_blend``, with the statistic filled by the backward pass.
 
     gsplat's gradient of the projected means sums over all channels. But channels blend independently of each other, so
-    those that count are blended in a call of their own, with projected means of their own: their gradient is the
-    statistic, exactly, and both add up to the whole. It costs the alphas of every Gaussian and pixel twice; where all
-    channels count, nothing.
+    those of the statistic are blended in a call of their own, with a copy of the projected means: the gradient of the
+    copy is the statistic, exactly, and both gradients add up to the whole. This evaluates the alphas of every Gaussian
+    and pixel twice; where all channels count, it costs nothing.
     """
     chosen = list(statistic.channels)
     others = [channel for channel in range(features.shape[1]) if channel not in chosen]
@@ -233,17 +232,17 @@ def _blend_with_statistic(
 
     own = projected.means2d.clone()
     own.register_hook(fill)
-    picture, alpha = _blend(projected._replace(means2d=own), _columns(features, chosen), camera)
+    picture, alpha = _blend(projected._replace(means2d=own), _channels(features, chosen), camera)
     if others:
-        rest, alpha = _blend(projected, _columns(features, others), camera)
+        rest, alpha = _blend(projected, _channels(features, others), camera)
         picture = torch.cat((picture, rest), dim=-1)
     else:
         inputs = (projected.means2d, projected.conics, projected.opacities)
         alpha = _AlphaAlone.apply(*inputs, alpha, projected, camera)
-    return _in_place(picture, chosen + others), alpha
+    return _sorted_channels(picture, chosen + others), alpha
 
 
-def _columns(features: Tensor, chosen: list[int]) -> Tensor:
+def _channels(features: Tensor, chosen: list[int]) -> Tensor:
     """Some channels of [N, D], without an index that would be copied to the device."""
     first, last = chosen[0], chosen[-1] + 1
     if chosen == list(range(first, last)):
@@ -251,8 +250,8 @@ def _columns(features: Tensor, chosen: list[int]) -> Tensor:
     return torch.stack([features[:, channel] for channel in chosen], dim=1)
 
 
-def _in_place(picture: Tensor, channels: list[int]) -> Tensor:
-    """A picture whose channels came in another order, in the order of their numbers."""
+def _sorted_channels(picture: Tensor, channels: list[int]) -> Tensor:
+    """A picture whose last axis holds these channels, with the channels in order."""
     if channels == sorted(channels):
         return picture
     return torch.stack([picture[..., channels.index(k)] for k in range(len(channels))], dim=-1)

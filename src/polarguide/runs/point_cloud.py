@@ -11,14 +11,14 @@ from torch import Tensor
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display, write_ply
 from polarguide.color import srgb_encode
-from polarguide.shading.model import Parameters, ShadingModel
+from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.files import atomic
 from polarguide.training.state import TrainingState
 
 
 @torch.no_grad()
 def gaussian_colors(
-    gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel, directions: Tensor
+    gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor
 ) -> Tensor:
     """Linear colors of every Gaussian toward viewing directions, reflections included.
 
@@ -40,7 +40,7 @@ def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor
 
 
 def _toward(
-    gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel, directions: Tensor
+    gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor
 ) -> list[Tensor]:
     """``gaussian_colors`` direction by direction: K of [N, 3]."""
     means = gaussians["means"]

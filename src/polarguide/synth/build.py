@@ -1,4 +1,4 @@
-"""A scene as data -> Mitsuba's scenes: one for all wavelengths, or one for each of red, green and blue."""
+"""Build Mitsuba scenes from scene data: one for all wavelengths, or one each for red, green and blue."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import numpy as np
 from polarguide.errors import PolarguideError
 from polarguide.synth.environment import make_environment
 from polarguide.synth.mesh import Array, Mesh, rotation, write_ply
+from polarguide.synth.mitsuba_dicts import area_light_dict, bsdf_dict, environment_dict
 from polarguide.synth.schema import SceneSpec, Thing
 from polarguide.synth.shapes import make_mesh, sphere
-from polarguide.synth.surfaces import lamp, sky, surface
 from polarguide.synth.textures import make_texture
 from polarguide.synth.variant import Variant
 
 
 @dataclass(frozen=True, eq=False)
-class Built:
-    """A scene that can be rendered.
+class BuiltScene:
+    """A scene ready to be rendered.
 
     Attributes:
-        spec: as data.
-        scenes: Mitsuba's scenes, one or three (see ``film.expose``).
-        shapes: of the first scene, Mitsuba's shape of every thing, in their order.
+        spec: the scene data.
+        scenes: Mitsuba's scenes, one or three (see ``film.render_lobes``).
+        shapes: Mitsuba's shape of every object in the first scene, in the order of the data.
         panorama: the environment, [H, W, 3].
     """
 
@@ -36,10 +36,10 @@ class Built:
     panorama: Array
 
 
-def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> Built:
-    """Make meshes, textures and the environment, write them to ``folder`` and load them.
+def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
+    """Generate meshes, textures and the environment, write them to ``folder`` and load them.
 
-    ``folder`` receives ``mesh/<thing>.ply`` and ``environment.hdr``.
+    The files are ``mesh/<thing>.ply`` and ``environment.hdr``.
     """
     import mitsuba as mi
 
@@ -49,22 +49,22 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> Built:
         write_ply(folder / "mesh" / f"{thing.name}.ply", mesh)
     panorama = make_environment(spec.environment, spec.name, spec.folder)
     cv2.imwrite(str(folder / "environment.hdr"), panorama[..., ::-1].astype(np.float32))
-    pictures = [_picture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
+    pictures = [_texture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
     scenes: list[Any] = []
     first: list[Any] = []
     for channel in range(3) if variant.channels == 3 else (None,):
-        content: dict[str, Any] = {"type": "scene", "sky": sky(panorama, channel)}
+        content: dict[str, Any] = {"type": "scene", "sky": environment_dict(panorama, channel)}
         for number, thing in enumerate(spec.things):
             place = folder / "mesh" / f"{thing.name}.ply"
-            shape = _shape(thing, meshes[number], place, surface(thing.material, pictures[number], channel))
+            shape = _shape(thing, meshes[number], place, bsdf_dict(thing.material, pictures[number], channel))
             content[f"thing{number}"] = shape
         for number, light in enumerate(spec.lights):
-            content[f"light{number}"] = lamp(light, channel, spec.name)
+            content[f"light{number}"] = area_light_dict(light, channel, spec.name)
         scene = mi.load_dict(content)
         scenes.append(scene)
         if not first:
             first = [content[f"thing{number}"] for number in range(len(spec.things))]
-    return Built(spec, scenes, first, panorama)
+    return BuiltScene(spec, scenes, first, panorama)
 
 
 def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
@@ -72,14 +72,14 @@ def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
     if thing.shape.get("type") == "ball":
         mesh = sphere(float(thing.shape.get("radius", 1.0)))
     elif thing.shape.get("type") == "mesh":
-        mesh = _own_mesh(spec.folder / str(thing.shape.get("file")))
+        mesh = _user_mesh(spec.folder / str(thing.shape.get("file")))
     else:
         mesh = make_mesh(thing.shape, thing.name)
     return mesh.moved(thing.scale, turn, position)
 
 
-def _own_mesh(path: Path) -> Mesh:
-    """A PLY or OBJ file of the user's, by Mitsuba's readers."""
+def _user_mesh(path: Path) -> Mesh:
+    """The mesh in a user's PLY or OBJ file, read by Mitsuba."""
     import mitsuba as mi
 
     kind = path.suffix.lower().lstrip(".")
@@ -88,7 +88,7 @@ def _own_mesh(path: Path) -> Mesh:
             path,
             expected="a mesh as .ply or .obj",
             found="nothing" if not path.is_file() else f"a {path.suffix} file",
-            remedy="File names of meshes start at the folder of the scene file.",
+            remedy="File names of meshes are relative to the folder of the scene file.",
         )
     params = mi.traverse(mi.load_dict({"type": kind, "filename": str(path)}))
     points = np.array(params["vertex_positions"], float).reshape(-1, 3)
@@ -100,23 +100,23 @@ def _own_mesh(path: Path) -> Mesh:
     )
 
 
-def _picture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
-    """The texture of a thing, [H, W, 3], or None where it has one color."""
+def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
+    """The texture of an object, [H, W, 3], or None if it has one color."""
     color = thing.material.color
     if color != "own":
         return make_texture(color, thing.name, folder) if isinstance(color, dict) else None
     if mesh.palette is None:
         raise PolarguideError(
             f"{thing.name} material.color",
-            expected='a shape that brings colors, where the color is "own"',
-            found=f"a {thing.shape.get('type')} without",
-            remedy="Give the parts of a solid a color each, or the material one.",
+            expected='a shape with colors of its own if the color is "own"',
+            found=f"a {thing.shape.get('type')} without colors",
+            remedy="Give the parts of a solid or the material a color.",
         )
     return mesh.palette[None]
 
 
 def _shape(thing: Thing, mesh: Mesh, path: Path, bsdf: dict[str, Any]) -> Any:
-    """Mitsuba's shape with its surface."""
+    """Mitsuba's shape with its BSDF."""
     import mitsuba as mi
 
     if thing.shape.get("type") == "ball":

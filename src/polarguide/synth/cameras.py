@@ -1,4 +1,4 @@
-"""Where the cameras of a scene stand."""
+"""Camera placement."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ TEST_EVERY = 8
 
 
 def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[Camera]:
-    """The cameras of a path, ring after ring, turning about z; neighbors are neighbors on a ring.
+    """The cameras of a path, ring by ring, in the order of their angle about z.
 
-    A few percent of jitter in radius, height and angle keep the views from standing on exact circles.
+    Radius, height and angle are jittered by a few percent, so that the views do not lie on exact circles.
     """
     random = np.random.default_rng((seed, 11))
     shares = np.array([float(ring.get("share", 1.0)) for ring in path.rings])
@@ -52,5 +52,5 @@ def view_names(count: int) -> list[str]:
 
 
 def held_out_names(names: list[str]) -> list[str]:
-    """Every eighth view, beginning with the first; none of fewer than two."""
+    """Every eighth view, starting with the first; none if there are fewer than two views."""
     return names[::TEST_EVERY] if len(names) > 1 else []

@@ -1,4 +1,4 @@
-"""Writing a scene folder view by view, so that a rendering that was stopped can go on."""
+"""Write a scene folder view by view, so that an interrupted rendering can be resumed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
 from polarguide.polarizer import ANGLES, malus
+from polarguide.records import read_record
 from polarguide.synth.mesh import Array
+from polarguide.synth.schema import with_current_keys
 
 REQUEST = "request.json"
 STEP = 16
@@ -25,13 +27,14 @@ TOP = 65535 // STEP
 
 
 def open_folder(out: Path, request: dict[str, Any]) -> bool:
-    """Make the folder, or find in it an earlier start of the same request; True if that has been finished.
+    """Create the folder, or resume the same request in it; returns whether the scene is finished.
 
     Raises:
         PolarguideError: the folder holds something else, or the same scene with other settings.
     """
     path = out / REQUEST
     text = json.dumps(request, indent=1)
+    remedy = "Give another --out, or remove the folder."
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         out.mkdir(parents=True, exist_ok=True)
         write_file(path, text.encode())
@@ -43,12 +46,13 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
             found="one with other files",
             remedy="Give another --out.",
         )
-    if path.read_text(encoding="utf-8") != text:
+    before = with_current_keys(read_record(path, dict[str, Any], remedy=remedy))
+    if before != json.loads(text):
         raise PolarguideError(
             out,
             expected="a scene that was begun with the same settings",
-            found="one with others",
-            remedy="Give another --out, or remove the folder.",
+            found="a scene with other settings",
+            remedy=remedy,
         )
     return (out / "scene.json").exists()
 
@@ -68,33 +72,33 @@ def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.
 
     Args:
         stokes: [3, H, W, 3], full scale 1.
-        change: what happens to intensities [4, H, W, 3] before they are stored (noise).
+        change: applied to the intensities [4, H, W, 3] before they are stored (noise).
     """
     light = np.stack([malus(stokes, np.radians(angle)) for angle in ANGLES])
     return np.clip(np.round(change(light) * (65535 / STEP)), 0, TOP).astype(np.uint16) * STEP
 
 
 def clipped_share(out: Path, names: Sequence[str]) -> float:
-    """Share of the samples of these views' pictures that stand at full scale."""
+    """Share of the samples of these views' pictures that are at full scale."""
     files = [file for name in names for file in view_files(out, name, ground_truth=False, raw=False)]
     pictures = (np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files)
     return float(np.mean([(picture == TOP * STEP).mean() for picture in pictures]))
 
 
 def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[Path]:
-    """All files of a view; it is finished when they exist."""
+    """All files of a view; the view is finished when they exist."""
     files = [out / picture_name(name, angle) for angle in ANGLES]
     files += [out / "gt" / f"{name}.npz"] if ground_truth else []
     return files + ([out / "raw" / f"{name}.png"] if raw else [])
 
 
 def photograph(out: Path, name: str) -> NDArray[np.uint8]:
-    """The mean of a view's four pictures as shown on a screen (sRGB), [H, W, 3]."""
+    """The mean of a view's four pictures as 8-bit sRGB, [H, W, 3]."""
     files = view_files(out, name, ground_truth=False, raw=False)
     parts = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files]
-    return shown(np.mean(parts, axis=0)[..., ::-1] / 65535)
+    return display_encoded(np.mean(parts, axis=0)[..., ::-1] / 65535)
 
 
-def shown(linear: Array) -> NDArray[np.uint8]:
+def display_encoded(linear: Array) -> NDArray[np.uint8]:
     """Linear values in [0, 1] as 8-bit sRGB."""
     return np.asarray(np.round(255 * srgb_encode_array(np.clip(linear, 0, 1))), np.uint8)

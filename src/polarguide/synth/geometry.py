@@ -1,4 +1,4 @@
-"""Rays against the surfaces of a scene: what is known exactly about a pixel, without any light."""
+"""Ray casting against the surfaces of a scene: normals, depth and object masks without light."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera
-from polarguide.synth.build import Built
+from polarguide.synth.build import BuiltScene
 from polarguide.synth.mesh import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Hits:
-    """Where rays meet surfaces.
+class Intersections:
+    """The first intersections of rays with surfaces.
 
     Attributes:
-        distance: [N] along the ray, 0 where it meets nothing.
-        normal: [N, 3] unit shading normal that faces the ray's origin, 0 where it meets nothing.
-        thing: [N] number of the object, counted from 1; 0 where it meets a light or nothing.
+        distance: [N] along the ray, 0 without intersection.
+        normal: [N, 3] unit shading normal that faces the ray's origin, 0 without intersection.
+        thing: [N] number of the object, counted from 1; 0 for a light source or no intersection.
     """
 
     distance: Array
@@ -28,25 +28,25 @@ class Hits:
     thing: NDArray[np.uint8]
 
 
-def cast(built: Built, origins: Array, toward: Array) -> Hits:
-    """Follow rays [N, 3] to the first surface."""
+def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections:
+    """Intersect rays with origins [N, 3] and unit directions [N, 3] with the scene."""
     import mitsuba as mi
 
     if mi.variant().startswith("scalar"):
         pairs = zip(origins.tolist(), toward.tolist(), strict=True)
-        rows = [_cast(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in pairs]
+        rows = [_intersect(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in pairs]
         distance, normal, thing = (np.array(column, float) for column in zip(*rows, strict=True))
     else:
         origin = mi.Point3f(np.ascontiguousarray(origins.T, np.float32))
         direction = mi.Vector3f(np.ascontiguousarray(toward.T, np.float32))
-        distance, normal, thing = (np.array(value, float) for value in _cast(built, origin, direction))
+        distance, normal, thing = (np.array(value, float) for value in _intersect(built, origin, direction))
         normal = normal.T
     known = thing > 0
     normal = np.where((normal * toward).sum(-1, keepdims=True) > 0, -normal, normal) * known[:, None]
-    return Hits(distance * known, normal, thing.astype(np.uint8))
+    return Intersections(distance * known, normal, thing.astype(np.uint8))
 
 
-def _cast(built: Built, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
+def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
     import drjit as dr
     import mitsuba as mi
 
@@ -60,11 +60,11 @@ def _cast(built: Built, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
     return dr.select(si.is_valid(), si.t, 0.0), si.sh_frame.n, number
 
 
-def pixel_truth(built: Built, camera: Camera) -> dict[str, NDArray[Any]]:
-    """Normals, depth, mask and object numbers at the centers of pixels, under the names of a ground-truth file."""
+def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[Any]]:
+    """Normals, depth, mask and object numbers at pixel centers, with the keys of a ground-truth file."""
     rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     origins = np.broadcast_to(camera.center.numpy(), rays.shape)
-    hits = cast(built, origins, rays)
+    hits = intersect(built, origins, rays)
     shape = (camera.height, camera.width)
     front = np.array([False] + [thing.foreground for thing in built.spec.things])
     depth = hits.distance * (rays @ camera.rotation[2].numpy())

@@ -1,6 +1,6 @@
-"""``checksums.txt`` of a rendered scene: SHA-256 of all its files, as ``sha256sum -c`` reads them.
+"""``checksums.txt`` of a rendered scene: SHA-256 of all its files, in the format of ``sha256sum -c``.
 
-``scene.json`` is not among them, since it names the digest of the list itself: one number for the whole scene.
+The list leaves out ``scene.json``, which holds the digest of the list: one digest for the whole scene.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _FILES = ("calibration.json", "environment.hdr", "request.json", "sheet.jpg", "s
 
 
 def write_manifest(out: Path) -> str:
-    """Write the list of a scene that is complete but for ``scene.json``; the SHA-256 of the list."""
+    """Write the list of a scene that is complete except ``scene.json``; returns the SHA-256 of the list."""
     lines = [f"{_digest(path)}  {path.relative_to(out).as_posix()}\n" for path in sorted(_written(out))]
     data = "".join(lines).encode()
     write_file(out / MANIFEST, data)
@@ -27,7 +27,7 @@ def write_manifest(out: Path) -> str:
 
 
 def verify_scene(out: Path) -> str:
-    """Compare a finished scene with its list; the SHA-256 of the list.
+    """Compare a finished scene with its list; returns the SHA-256 of the list.
 
     Raises:
         PolarguideError: a file is missing or has changed, or the list has.
@@ -47,7 +47,7 @@ def verify_scene(out: Path) -> str:
 
 
 def scene_digest(out: Path) -> str:
-    """The digest that ``scene.json`` names; empty where it names none."""
+    """The digest in ``scene.json``, or an empty string."""
     return str(json.loads((out / "scene.json").read_text(encoding="utf-8")).get("sha256", ""))
 
 

@@ -1,4 +1,4 @@
-"""Triangle meshes as arrays: the common ground of all procedural shapes."""
+"""Triangle meshes as arrays."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles.
+    """A triangle mesh.
 
     Attributes:
         points: [V, 3].
         faces: [F, 3] indices, counter-clockwise seen from outside.
         uv: [V, 2] texture coordinates.
-        normals: [V, 3] unit normals to shade with, or None for flat triangles.
-        palette: [N, 3] linear colors, side by side along u, where the shape brings its own; else None.
+        normals: [V, 3] unit shading normals, or None for flat triangles.
+        palette: [N, 3] linear colors, side by side along u, if the shape has its own colors; else None.
     """
 
     points: Array
@@ -32,14 +32,14 @@ class Mesh:
     palette: Array | None = None
 
     def moved(self, scale: float, rotation: Array, position: Array) -> Mesh:
-        """Scaled, rotated [3, 3] and moved."""
+        """The mesh scaled, then rotated by a matrix [3, 3], then translated."""
         normals = None if self.normals is None else self.normals @ rotation.T
         points = scale * self.points @ rotation.T + position
         return Mesh(points, self.faces, self.uv, normals, self.palette)
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Several meshes as one; all have normals or none has."""
+    """Several meshes as one, with normals if all have normals."""
     starts = np.cumsum([0] + [len(mesh.points) for mesh in meshes[:-1]])
     normals = [mesh.normals for mesh in meshes if mesh.normals is not None]
     return Mesh(
@@ -51,7 +51,7 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def smooth_normals(points: Array, faces: NDArray[np.int64]) -> Array:
-    """Vertex normals: face normals averaged by area, over all vertices at one place."""
+    """Vertex normals: area-weighted means of face normals over all vertices at one position."""
     _, place = np.unique(np.round(points, 9), axis=0, return_inverse=True)
     a, b, c = (points[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)

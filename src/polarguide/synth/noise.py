@@ -1,4 +1,4 @@
-"""Smooth random fields: value noise on a lattice, summed over octaves."""
+"""Fractal value noise."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from polarguide.synth.mesh import Array
 
 
-def fractal(points: Array, seed: int, octaves: int = 4) -> Array:
-    """Random field in [0, 1] at points [..., D], of unit size, each octave half as large and half as strong."""
+def fractal_noise(points: Array, seed: int, octaves: int = 4) -> Array:
+    """Value noise in [0, 1] at points [..., D]: octaves of halving scale and amplitude, the first with unit cells."""
     total = np.zeros(points.shape[:-1])
     weight, sums = 1.0, 0.0
     for octave in range(octaves):
@@ -21,7 +21,7 @@ def fractal(points: Array, seed: int, octaves: int = 4) -> Array:
 
 
 def _value(points: Array, seed: int) -> Array:
-    """Random numbers of the lattice's corners, blended with a quintic step (its second derivative is continuous)."""
+    """Random numbers at lattice points, interpolated by a quintic (its second derivative is continuous)."""
     cell = np.floor(points).astype(np.int64)
     t = points - cell
     t = t * t * t * (t * (6 * t - 15) + 10)
@@ -33,7 +33,7 @@ def _value(points: Array, seed: int) -> Array:
 
 
 def _hash(cell: np.ndarray, seed: int) -> Array:
-    """A number in [0, 1) for each lattice point: a multiplicative hash with xor shifts."""
+    """A pseudorandom number in [0, 1) for each lattice point: a multiplicative hash with xor shifts."""
     value = np.full(cell.shape[:-1], (seed * 0x9E3779B9 + 0x7F4A7C15) & 0xFFFFFFFF, np.uint64)
     for k in range(cell.shape[-1]):
         value = (value ^ (cell[..., k].astype(np.uint64) & np.uint64(0xFFFFFFFF))) * np.uint64(

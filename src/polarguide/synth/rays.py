@@ -1,4 +1,4 @@
-"""Rays of a pinhole camera, and the light that arrives along them, in Mitsuba's numbers."""
+"""Primary rays of a pinhole camera, and Stokes vectors in its lens frames, in Mitsuba's types."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 from polarguide.camera import Camera
 
 
-def number(kind: Any, value: float) -> Any:
-    """A number that is no literal of the compiled code, so that one kernel serves all views."""
+def opaque_value(kind: Any, value: float) -> Any:
+    """A number that is not compiled into the kernel as a literal, so that one kernel serves all views."""
     import drjit as dr
     import mitsuba as mi
 
@@ -16,26 +16,26 @@ def number(kind: Any, value: float) -> Any:
 
 
 def pinhole(camera: Camera) -> list[Any]:
-    """A camera as Mitsuba's numbers: width, (fx, fy, cx, cy), the axes of the camera in the world, and its center."""
+    """A camera in Mitsuba's types: width, (fx, fy, cx, cy), the axes of the camera in the world, and its center."""
     import mitsuba as mi
 
-    inner = [number(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    inner = [opaque_value(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
     # The rows of the world-to-camera rotation are the camera's axes in the world.
-    axes = [mi.Vector3f(*(number(mi.Float, float(v)) for v in row)) for row in camera.rotation]
-    origin = mi.Point3f(*(number(mi.Float, float(v)) for v in camera.center))
-    return [number(mi.UInt32, camera.width), inner, axes, origin]
+    axes = [mi.Vector3f(*(opaque_value(mi.Float, float(v)) for v in row)) for row in camera.rotation]
+    origin = mi.Point3f(*(opaque_value(mi.Float, float(v)) for v in camera.center))
+    return [opaque_value(mi.UInt32, camera.width), inner, axes, origin]
 
 
 def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
-    """Rays through points of pixels.
+    """Rays through points in pixels.
 
     Args:
-        camera: what ``pinhole`` gives.
+        camera: from ``pinhole``.
         pixel: index of the pixel, row by row.
-        place: point in the pixel, [0, 1)^2.
+        place: position in the pixel, [0, 1)^2.
 
     Returns:
-        Mitsuba's rays, and image right in the lens frame of each ray (see ``optics.lens_frame``), in world axes.
+        Mitsuba's rays, and the x axis of the lens frame of each ray (see ``optics.lens_frame``), in world axes.
     """
     import drjit as dr
     import mitsuba as mi
@@ -52,10 +52,10 @@ def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
 
 
 def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
-    """S0, S1, S2 in the project's lens frame of light that arrives along rays, from Mitsuba's frame of ``-ray.d``.
+    """Convert Stokes vectors from Mitsuba's frame of ``-ray.d`` to our lens frame.
 
-    Mitsuba counts angles from its basis counter-clockwise as seen against the light, that is in the picture, as the
-    project does; only the basis itself has to be turned.
+    Mitsuba measures angles from its basis counter-clockwise as seen against the light, that is in the picture, as we
+    do; only the basis has to be rotated.
     """
     import mitsuba as mi
 

@@ -14,10 +14,10 @@ from polarguide.camera import Camera
 from polarguide.capture.write import write_png, write_view
 from polarguide.progress import Reporter
 from polarguide.synth import folder
-from polarguide.synth.build import Built, build_scene
+from polarguide.synth.build import BuiltScene, build_scene
 from polarguide.synth.cameras import held_out_names, place_cameras, view_names
-from polarguide.synth.film import Light, expose
-from polarguide.synth.geometry import pixel_truth
+from polarguide.synth.film import LobeRadiance, render_lobes
+from polarguide.synth.geometry import ground_truth_maps
 from polarguide.synth.manifest import verify_scene, write_manifest
 from polarguide.synth.mesh import Array
 from polarguide.synth.record import scene_record
@@ -25,8 +25,8 @@ from polarguide.synth.schema import SceneSpec
 from polarguide.synth.sensor import Sensor, mosaic, noisy
 from polarguide.synth.settings import SynthSettings
 from polarguide.synth.sheet import write_sheet
-from polarguide.synth.sparse import find_points, write_model
-from polarguide.synth.transport import Walk
+from polarguide.synth.sparse import sample_sparse_points, write_model
+from polarguide.synth.transport import PathLimits
 from polarguide.synth.variant import choose_variant, slow_estimate
 
 TEST_SAMPLES = 4
@@ -38,7 +38,7 @@ BRIGHT = 1.5
 class Job:
     """All that the rendering of a view needs."""
 
-    built: Built
+    built: BuiltScene
     settings: SynthSettings
     out: Path
     names: list[str]
@@ -94,7 +94,7 @@ def synthesize(
         reporter.warn(f"{variant.note} It will take {slow_estimate(paths)} on this scene.")
     built = build_scene(spec, out, variant)
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
-    exposure = spec.exposure or _metered(built, cameras, settings.seed)
+    exposure = spec.exposure or _metered_exposure(built, cameras, settings.seed)
     job = Job(built, settings, out, names, tests, cameras, exposure, Sensor())
     _render_all(job, reporter)
     _write_model(job, names)
@@ -132,16 +132,16 @@ def _render_view(job: Job, number: int) -> None:
     big = _doubled(camera) if job.mosaics else camera
     if job.mosaics:
         samples = max(1, samples // 4)
-    walk = Walk(job.built.spec.depth, job.built.spec.clamp / job.exposure)
-    light = expose(job.built.scenes, big, samples, seed=settings.seed * 100003 + number, walk=walk)
+    limits = PathLimits(job.built.spec.depth, job.built.spec.clamp / job.exposure)
+    light = render_lobes(job.built.scenes, big, samples, seed=settings.seed * 100003 + number, limits=limits)
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
         raw = mosaic(light.stokes * job.exposure, settings.sensor.upper(), settings.noise, random, job.sensor)
         write_png(job.out / "raw" / f"{name}.png", raw)
-        light = Light(_halved(light.specular), _halved(light.diffuse), _halved(light.seen))
+        light = LobeRadiance(_halved(light.specular), _halved(light.diffuse), _halved(light.emitted))
     stokes = light.stokes * job.exposure
     if job.has_ground_truth(name):
-        arrays: dict[str, Any] = pixel_truth(job.built, camera)
+        arrays: dict[str, Any] = ground_truth_maps(job.built, camera)
         arrays["stokes"] = stokes.astype(np.float16)
         arrays["specular"] = (light.specular[0] * job.exposure).astype(np.float16)
         arrays["diffuse"] = (light.diffuse[0] * job.exposure).astype(np.float16)
@@ -156,17 +156,21 @@ def _render_view(job: Job, number: int) -> None:
 
 def _write_model(job: Job, names: list[str]) -> None:
     pictures = [folder.photograph(job.out, name) for name in names]
-    sparse = find_points(job.built, job.cameras, pictures, job.settings.points, job.settings.seed)
+    sparse = sample_sparse_points(job.built, job.cameras, pictures, job.settings.points, job.settings.seed)
     write_model(job.out / "sparse" / "0", job.cameras, names, sparse)
 
 
-def _metered(built: Built, cameras: list[Camera], seed: int) -> float:
+def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> float:
     """The exposure by which 1 % of S0 in some small pictures lies above ``BRIGHT``, three quarters of full scale."""
     values = []
     for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
         factor = max(1, camera.width // METER_WIDTH)
-        light = expose(
-            built.scenes, camera.downscaled(factor), METER_SAMPLES, seed=seed, walk=Walk(built.spec.depth)
+        light = render_lobes(
+            built.scenes,
+            camera.downscaled(factor),
+            METER_SAMPLES,
+            seed=seed,
+            limits=PathLimits(built.spec.depth),
         )
         values.append(light.stokes[0].ravel())
     return float(f"{BRIGHT / max(float(np.percentile(np.concatenate(values), 99)), 1e-9):.4g}")

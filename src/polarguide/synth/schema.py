@@ -6,20 +6,23 @@ sRGB in [0, 1], radiance is linear and unbounded, angles are degrees.
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
 
 from polarguide.errors import PolarguideError
+from polarguide.records import decode, read_record
 
 Vector = tuple[float, float, float]
 Data = dict[str, Any]
+OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
+"""Names that fields had in earlier scene files and requests."""
+REMEDY = "docs/dataset.md describes the fields."
 
 
-@dataclass(frozen=True)
-class Material:
+class Material(Struct, frozen=True, forbid_unknown_fields=True):
     """A surface.
 
     Attributes:
@@ -31,16 +34,15 @@ class Material:
         eta, k: complex index of a metal for red, green and blue.
     """
 
-    type: str = "plastic"
+    type: Literal["plastic", "metal", "matte"] = "plastic"
     color: Any = (0.5, 0.5, 0.5)
-    roughness: float = 0.05
-    index: float = 1.5
+    roughness: Annotated[float, Meta(ge=0.001, le=1)] = 0.05
+    index: Annotated[float, Meta(gt=1, lt=4)] = 1.5
     eta: Vector = (1.35, 0.97, 0.62)
     k: Vector = (7.5, 6.4, 5.3)
 
 
-@dataclass(frozen=True)
-class Thing:
+class Thing(Struct, frozen=True, forbid_unknown_fields=True):
     """An object.
 
     Attributes:
@@ -53,15 +55,14 @@ class Thing:
 
     name: str
     shape: Data
-    material: Material = field(default_factory=Material)
+    material: Material = Material()
     foreground: bool = True
     position: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (0.0, 0.0, 0.0)
     scale: float = 1.0
 
 
-@dataclass(frozen=True)
-class CameraPath:
+class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
     """Where the cameras stand: rings about the target, or arcs of rings.
 
     Attributes:
@@ -72,33 +73,32 @@ class CameraPath:
         spacing: degrees between neighbors on a ring, about the middle of its arc; None fills the arc evenly.
     """
 
-    rings: tuple[Data, ...]
+    rings: Annotated[tuple[Data, ...], Meta(min_length=1)]
     target: Vector = (0.0, 0.0, 0.0)
     wander: float = 0.0
-    fov: float = 40.0
-    views: int = 72
+    fov: Annotated[float, Meta(gt=1, lt=150)] = 40.0
+    views: Annotated[int, Meta(ge=1)] = 72
     spacing: float | None = None
 
 
-@dataclass(frozen=True)
-class SceneSpec:
+class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
     """A whole scene.
 
     Attributes:
         name, about: what it is.
         camera: the views.
         things: objects.
-        environment: light from afar (see ``environment``).
-        lights: rectangles that shine, each with ``position``, ``toward``, ``size`` and ``radiance``.
-        depth: largest number of surfaces that a path of light touches.
-        clamp: see ``transport.Walk``.
+        environment: environment light (see ``environment``).
+        lights: rectangular area lights, each with ``position``, ``toward``, ``size`` and ``radiance``.
+        depth: largest number of surfaces on a light path.
+        clamp: see ``transport.PathLimits``.
         exposure: display value of radiance 1; None takes one by which 1 % of S0 lies above 1.5.
         folder: where relative file names of meshes and pictures start.
     """
 
     name: str
     camera: CameraPath
-    things: tuple[Thing, ...]
+    things: Annotated[tuple[Thing, ...], Meta(min_length=1, max_length=254)]
     environment: Data
     about: str = ""
     lights: tuple[Data, ...] = ()
@@ -109,12 +109,9 @@ class SceneSpec:
 
     def data(self) -> Data:
         """The scene as JSON data, without the folder."""
-        values = dataclasses.asdict(self)
+        values: Data = msgspec.to_builtins(self, enc_hook=str)
         del values["folder"]
         return values
-
-
-Record = TypeVar("Record")
 
 
 def read_scene_file(path: Path) -> SceneSpec:
@@ -123,78 +120,26 @@ def read_scene_file(path: Path) -> SceneSpec:
     Raises:
         PolarguideError: it cannot be read, lacks a field, has an unknown one or a value out of range.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise PolarguideError(
-            path,
-            expected="a scene file in JSON",
-            found=str(error),
-            remedy="docs/dataset.md describes the fields.",
-        ) from None
-    return parse_scene(data, str(path), folder=path.parent)
+    return parse_scene(read_record(path, Data, remedy=REMEDY), str(path), folder=path.parent)
 
 
 def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
-    """A scene from JSON data; ``where`` names it in messages."""
-    if not isinstance(data, dict):
-        raise _wrong(where, "an object with name, camera, things and environment", type(data).__name__)
-    values = dict(data, folder=folder)
-    camera = _record(CameraPath, values.get("camera"), f"{where} (camera)")
-    things = []
-    for number, item in enumerate(values.get("things") or ()):
-        place = f"{where} (things[{number}])"
-        if not isinstance(item, dict):
-            raise _wrong(place, "an object", type(item).__name__)
-        material = _record(Material, item.get("material", {}), f"{place[:-1]}.material)")
-        _check_material(material, place)
-        things.append(_record(Thing, dict(item, material=material), place))
-    names = [thing.name for thing in things]
-    if not things or len(set(names)) < len(names) or len(things) > 254:
-        raise _wrong(f"{where} (things)", "1 to 254 objects with different names", f"{len(things)}: {names}")
-    values |= {"camera": camera, "things": tuple(things), "lights": tuple(values.get("lights") or ())}
-    spec = _record(SceneSpec, values, where)
-    if not camera.rings or camera.views < 1 or not 1 < camera.fov < 150:
-        raise _wrong(
-            f"{where} (camera)", "rings, 1 or more views, a field of view from 1 to 150 degrees", str(camera)
+    """A scene from JSON data; ``where`` names it in messages.
+
+    Raises:
+        PolarguideError: it lacks a field, has an unknown one or a value out of range.
+    """
+    spec = decode(with_current_keys(data), SceneSpec, where, remedy=REMEDY)
+    names = [thing.name for thing in spec.things]
+    if len(set(names)) < len(names):
+        raise PolarguideError(
+            f"{where} (things)", expected="objects with different names", found=str(names), remedy=REMEDY
         )
-    return spec
+    return msgspec.structs.replace(spec, folder=folder)
 
 
-def _check_material(material: Material, where: str) -> None:
-    if material.type not in ("plastic", "metal", "matte"):
-        raise _wrong(f"{where} material.type", "plastic, metal or matte", repr(material.type))
-    if not 0.001 <= material.roughness <= 1:
-        raise _wrong(f"{where} material.roughness", "0.001 to 1", str(material.roughness))
-    if not 1 < material.index < 4:
-        raise _wrong(f"{where} material.index", "more than 1 and less than 4", str(material.index))
-
-
-def _record(kind: type[Record], data: Any, where: str) -> Record:
-    """A dataclass from a dictionary, lists turned into tuples."""
-    if not isinstance(data, dict):
-        raise _wrong(where, "an object", "nothing" if data is None else type(data).__name__)
-    fields = {item.name: item for item in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    unknown = sorted(data.keys() - fields.keys())
-    if unknown:
-        raise _wrong(where, f"only {', '.join(fields)}", ", ".join(unknown))
-    missing = [
-        name
-        for name, item in fields.items()
-        if name not in data
-        and item.default is dataclasses.MISSING
-        and item.default_factory is dataclasses.MISSING
-    ]
-    if missing:
-        raise _wrong(where, f"the field{'s' if len(missing) > 1 else ''} {', '.join(missing)}", "none")
-    return kind(**{name: _tuple(value) for name, value in data.items()})
-
-
-def _tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _wrong(where: str, expected: str, found: str) -> PolarguideError:
-    return PolarguideError(
-        where, expected=expected, found=found, remedy="docs/dataset.md describes the fields."
-    )
+def with_current_keys(data: Any) -> Any:
+    """JSON data with today's names of fields."""
+    if isinstance(data, dict):
+        return {OLD_KEYS.get(key, key): with_current_keys(value) for key, value in data.items()}
+    return [with_current_keys(value) for value in data] if isinstance(data, list) else data

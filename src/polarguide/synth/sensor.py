@@ -1,7 +1,7 @@
-"""What a polarization camera would have recorded: raw mosaics with the faults of real sensors.
+"""Simulate a polarization camera: raw mosaics with noise, gains and finite extinction.
 
-Electrons at full scale, read noise and extinction ratio are about those of Sony's IMX250MYR; noise follows Poisson's
-law for photons and a normal distribution for reading (EMVA 1288).
+Full well, read noise and extinction ratio are close to those of Sony's IMX250MYR; photon noise is Poisson distributed,
+read noise normal (EMVA 1288).
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from polarguide.synth.mesh import Array
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor.
+    """Parameters of a sensor.
 
     Attributes:
-        full_well: electrons of a sample at full scale.
-        read_noise: standard deviation of reading, electrons.
-        extinction: light through a polarizer along its axis, over light across it.
+        full_well: electrons at full scale.
+        read_noise: standard deviation of the read noise in electrons.
+        extinction: extinction ratio of the polarizers.
         gains: of the samples behind polarizers at 0, 45, 90 and 135 degrees.
-        bits: of a stored value.
-        black: stored value without light.
+        bits: bits of a stored value.
+        black: black level in stored values.
     """
 
     full_well: float = 10500.0
@@ -48,9 +48,9 @@ def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: S
 
     Args:
         intensity: linear, 1 is full scale.
-        noise: 1 is a sensor exposed to its full well, 2 one with a quarter of that light, 0 none at all.
-        random: source of the noise.
-        sensor: its electrons.
+        noise: 1 for exposure to the full well, 2 for a quarter of that light, 0 for no noise.
+        random: generator.
+        sensor: its full well and read noise.
     """
     if noise <= 0:
         return intensity
@@ -64,10 +64,9 @@ def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: S
 def mosaic(
     stokes: Array, name: str, noise: float, random: np.random.Generator, sensor: Sensor
 ) -> NDArray[np.uint16]:
-    """The raw picture that a sensor stores, [H, W], of light [3, H, W, 3] whose radiance 1 is full scale.
+    """The raw mosaic that a sensor stores, [H, W], given Stokes vectors [3, H, W, 3] whose full scale is 1.
 
-    A polarizer of finite extinction E weakens S1 and S2 by (E - 1) / (E + 1). A monochrome sensor sees the mean of the
-    colors.
+    An extinction ratio E scales S1 and S2 by (E - 1) / (E + 1). A monochrome sensor measures the mean of the colors.
     """
     height, width = stokes.shape[1:3]
     pattern = sensor_pattern(name)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from polarguide.errors import PolarguideError
+from polarguide.records import check_options
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file
 from polarguide.synth.variant import Color
 
 PRESETS = ("figure", "kit", "car", "cup", "water", "proof")
-SensorName = Literal["ideal", "imx250myr", "imx250mzr"]
 
 
 @dataclass(frozen=True)
@@ -21,40 +22,62 @@ class SynthSettings:
     """How a scene is rendered and recorded.
 
     Attributes:
-        width, height: size of the pictures; a simulated sensor has twice as many pixels each way.
-        samples: paths per pixel and lobe; test views take four times as many.
-        seed: of every random draw.
-        sensor: "ideal", or a sensor whose raw mosaics are written, too.
-        noise: photon and read noise, see ``sensor.noisy``.
-        color: see ``variant.Variant``.
-        truth: views that get ground truth, "test" or "all".
-        points: sparse points to look for.
+        size: Width and height of the pictures; a simulated sensor has twice as many pixels each way.
+        samples: Paths per pixel and lobe; test views take four times as many.
+        seed: Seed of every random draw.
+        sensor: A sensor whose 12-bit raw mosaics are written, too, for polarguide prepare.
+        noise: Photon and read noise: 1 is a sensor exposed to full scale, 2 a quarter of that light, 0 none.
+        color: Three channels with exact values, or a sampled spectrum.
+        ground_truth: Views that get ground truth.
+        points: Sparse points to look for.
     """
 
-    width: int = 256
-    height: int = 192
-    samples: int = 64
-    seed: int = 0
-    sensor: SensorName = "ideal"
-    noise: float = 0.0
+    size: str = "256x192"
+    samples: Annotated[int, Meta(ge=1, le=65536)] = 64
+    seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
+    sensor: Literal["ideal", "imx250myr", "imx250mzr"] = "ideal"
+    noise: Annotated[float, Meta(ge=0, le=100)] = 0.0
     color: Color = "rgb"
     ground_truth: Literal["test", "all"] = "test"
-    points: int = 5000
+    points: Annotated[int, Meta(ge=0)] = 5000
+
+    @property
+    def width(self) -> int:
+        """Of the pictures."""
+        return _pixels(self.size)[0]
+
+    @property
+    def height(self) -> int:
+        """Of the pictures."""
+        return _pixels(self.size)[1]
 
     def data(self) -> dict[str, Any]:
         """As JSON."""
-        return asdict(self)
+        values = asdict(self)
+        del values["size"]
+        return {"width": self.width, "height": self.height, **values}
 
     def check(self) -> None:
-        """Raises PolarguideError where a number makes no sense."""
-        for flag, value, low, high in (
-            ("--size", self.width, 16, 8192), ("--size", self.height, 16, 8192), ("--samples", self.samples, 1, 65536),
-            ("--seed", self.seed, 0, 2**31 - 1), ("--noise", self.noise, 0, 100),
-        ):  # fmt: skip
-            if not low <= value <= high:
-                raise PolarguideError(
-                    flag, expected=f"{low} to {high}", found=str(value), remedy="See polarguide synth --help."
-                )
+        """Raises PolarguideError where a value makes no sense."""
+        check_options(self)
+        _pixels(self.size)
+
+
+def _pixels(size: str) -> tuple[int, int]:
+    """Width and height from text such as 256x192."""
+    try:
+        width, height = (int(part) for part in size.lower().split("x"))
+        right = min(width, height) >= 16 and max(width, height) <= 8192
+    except ValueError:
+        right = False
+    if not right:
+        raise PolarguideError(
+            "--size",
+            expected="width and height from 16 to 8192 such as 256x192",
+            found=repr(size),
+            remedy="Give whole numbers.",
+        )
+    return width, height
 
 
 @dataclass(frozen=True)
@@ -62,9 +85,10 @@ class Overrides:
     """Changes to a scene for controlled studies; None leaves what the scene says.
 
     Attributes:
-        views: number of views.
-        spacing: degrees between neighbors on a ring.
-        roughness, index: of all plastic objects in the foreground.
+        views: Number of views; without it what the scene says.
+        spacing: Degrees between neighboring views on a ring.
+        roughness: Roughness of all plastic objects in the foreground.
+        index: Refractive index of these.
     """
 
     views: int | None = None
@@ -74,23 +98,13 @@ class Overrides:
 
     def apply(self, spec: SceneSpec) -> SceneSpec:
         """The scene with the changes."""
-        camera = spec.camera
-        if self.views is not None:
-            camera = replace(camera, views=self.views)
-        if self.spacing is not None:
-            camera = replace(camera, spacing=self.spacing)
-        things = []
-        for thing in spec.things:
-            material = thing.material
-            if thing.foreground and material.type == "plastic":
-                if self.roughness is not None:
-                    material = replace(material, roughness=self.roughness)
-                if self.index is not None:
-                    material = replace(material, index=self.index)
-            things.append(replace(thing, material=material))
-        changed = replace(spec, camera=camera, things=tuple(things))
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        data = spec.data()
+        data["camera"] |= {name: value for name, value in given.items() if name in ("views", "spacing")}
+        for thing in data["things"]:
+            if thing["foreground"] and thing["material"]["type"] == "plastic":
+                thing["material"] |= {k: v for k, v in given.items() if k in ("roughness", "index")}
         # The changes have to pass the checks of a file.
-        data = json.loads(json.dumps(changed.data()))
         return parse_scene(data, f"{spec.name} with the flags", folder=spec.folder)
 
 

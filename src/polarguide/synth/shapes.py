@@ -1,6 +1,6 @@
-"""Procedural geometry by name: what the ``shape`` of an object may be.
+"""Procedural geometry: the types of ``shape`` of an object.
 
-Every shape is centered at the origin or stands on it, z up; see docs/dataset.md for the fields.
+Every shape is centered at the origin or stands on it, with z up; docs/dataset.md describes the fields.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from polarguide.errors import PolarguideError
+from polarguide.synth.implicit_surface import solid
 from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals
-from polarguide.synth.noise import fractal
-from polarguide.synth.solid import solid
+from polarguide.synth.noise import fractal_noise
 from polarguide.vectors import unit_array as unit
 
 
@@ -107,7 +107,7 @@ def waves(
     """A rectangle that looks up with smooth random waves: ``height`` from crest to trough, ``length`` apart."""
     x, y = (np.linspace(-s / 2, s / 2, detail) for s in size)
     a, b = np.meshgrid(x, y, indexing="ij")
-    z = height * (fractal(np.stack((a, b * 0.6), -1) / length, seed, octaves=2) - 0.5)
+    z = height * (fractal_noise(np.stack((a, b * 0.6), -1) / length, seed, octaves=2) - 0.5)
     points = np.stack((a, b, z), -1)
     slope_x, slope_y = np.gradient(z, x, y)
     normals = unit(np.stack((-slope_x, -slope_y, np.ones_like(z)), -1))
@@ -119,7 +119,7 @@ def waves(
 def rock(radius: float = 1.0, rough: float = 0.25, seed: int = 0, detail: int = 96) -> Mesh:
     """A ball with random bumps of ``rough`` times its radius."""
     ball = sphere(1.0, detail)
-    bumps = fractal(ball.points * 1.3 + 10, seed, octaves=4) - 0.5
+    bumps = fractal_noise(ball.points * 1.3 + 10, seed, octaves=4) - 0.5
     points = radius * ball.points * (1 + 2 * rough * bumps[:, None])
     return Mesh(points, ball.faces, ball.uv, smooth_normals(points, ball.faces))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from polarguide import optics
 from polarguide.camera import Camera
-from polarguide.synth.folder import shown, write_file
+from polarguide.synth.folder import display_encoded, write_file
 from polarguide.synth.mesh import Array
 
 COLUMNS = ("photograph", "DoLP", "AoLP", "specular", "diffuse", "normals", "depth")
@@ -21,7 +21,7 @@ QUALITY = 82
 
 
 def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> Path:
-    """Write ``sheet.jpg`` of up to three of these views, which have ground truth."""
+    """Write ``sheet.jpg`` with up to three of these views; all must have ground truth."""
     chosen = sorted({round(k) for k in np.linspace(0, len(names) - 1, min(ROWS, len(names)))})
     rows = [np.concatenate(_layers(out / "gt" / f"{names[k]}.npz", cameras[k]), axis=1) for k in chosen]
     sheet = np.ascontiguousarray(np.concatenate(rows)[..., ::-1])
@@ -51,11 +51,11 @@ def _layers(path: Path, camera: Camera) -> list[NDArray[np.uint8]]:
     facing = camera.to_camera(torch.from_numpy(normal)).numpy() * [1, -1, -1]
     near, far = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
     return [
-        shown(stokes[0] / 2),
+        display_encoded(stokes[0] / 2),
         _gray(np.sqrt(degree)),
         _hue(angle / np.pi, np.clip(degree * 4, 0, 1)),
-        shown(specular / 2),
-        shown(diffuse / 2),
+        display_encoded(specular / 2),
+        display_encoded(diffuse / 2),
         np.where(known[..., None], np.round(127.5 * (facing + 1)), 0).astype(np.uint8),
         _gray(np.where(known, 1 - 0.9 * np.clip((depth - near) / max(far - near, 1e-9), 0, 1), 0)),
     ]
@@ -66,6 +66,6 @@ def _gray(values: Array) -> NDArray[np.uint8]:
 
 
 def _hue(turn: Array, strength: Array) -> NDArray[np.uint8]:
-    """Angles in turns as colors of full brightness, dark where ``strength`` is small."""
+    """Angles in half turns as hues, dark where ``strength`` is small."""
     codes = np.stack((turn * 180 % 180, np.full_like(turn, 255), 255 * strength), -1).astype(np.uint8)
     return np.asarray(cv2.cvtColor(codes, cv2.COLOR_HSV2RGB), np.uint8)

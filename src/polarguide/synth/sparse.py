@@ -1,7 +1,7 @@
-"""A COLMAP model as structure from motion would leave it: exact poses, imperfect points.
+"""Simulate the result of structure from motion: a COLMAP model with exact poses and imperfect points.
 
-Points are spread over surfaces where pictures have contrast, seen in the views to which nothing hides them, and moved
-by the noise of matching; one in a hundred is grossly wrong, and some lie behind mirrors, where reflections seem to be.
+Points are sampled on surfaces where pictures have contrast, observed in views without occlusion, and perturbed by
+matching noise; 1 % are outliers, and some lie behind mirrors, at the virtual images of reflections.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera, quaternion
-from polarguide.synth.build import Built
-from polarguide.synth.geometry import cast
+from polarguide.synth.build import BuiltScene
+from polarguide.synth.geometry import intersect
 from polarguide.synth.mesh import Array
 
 NOISE_PIXELS = 0.6
@@ -24,17 +24,17 @@ VIRTUAL = 0.02
 SMOOTH = 0.1
 """Roughness below which reflections are sharp enough to be matched."""
 FOUND = 0.6
-"""Share of the views that see a point in which it is found."""
+"""Probability that a view that sees a point observes it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sparse:
-    """Points and where they were found.
+class SparsePoints:
+    """Points and their observations.
 
     Attributes:
         points: [M, 3]. colors: [M, 3] display-encoded.
         tracks: of each point, (view, x, y) of each observation.
-        virtual, outliers: how many points lie behind mirrors, and are grossly wrong.
+        virtual, outliers: number of points behind mirrors, and of outliers.
     """
 
     points: Array
@@ -44,17 +44,17 @@ class Sparse:
     outliers: int
 
 
-def find_points(
-    built: Built, cameras: Sequence[Camera], pictures: Sequence[NDArray[np.uint8]], count: int, seed: int
-) -> Sparse:
-    """About ``count`` points.
+def sample_sparse_points(
+    built: BuiltScene, cameras: Sequence[Camera], pictures: Sequence[NDArray[np.uint8]], count: int, seed: int
+) -> SparsePoints:
+    """Sample about ``count`` points.
 
     Args:
         built: the scene.
-        cameras: of the views that take part.
+        cameras: of the views.
         pictures: their photographs, display-encoded [H, W, 3].
-        count: points to look for.
-        seed: of every random draw.
+        count: number of points.
+        seed: of the random numbers.
     """
     random = np.random.default_rng((seed, 23))
     origins, rays, colors, home = [], [], [], []
@@ -70,11 +70,13 @@ def find_points(
         home.append(np.full(amount, number))
     origin, ray = np.concatenate(origins), np.concatenate(rays)
     color, view = np.concatenate(colors), np.concatenate(home)
-    hits = cast(built, origin, ray)
+    hits = intersect(built, origin, ray)
     places = origin + hits.distance[:, None] * ray
     seen = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < FOUND)
     ghost, places = _mirrored(built, origin, ray, places, hits.normal, hits.thing, random)
-    near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1  # a reflection holds only between neighbors
+    near = (
+        np.abs(np.arange(len(cameras)) - view[:, None]) <= 1
+    )  # a reflection is consistent only between neighbors
     seen = np.where(ghost[:, None], near, seen)
     seen[np.arange(len(view)), view] = True
     keep = np.flatnonzero((hits.thing > 0) & (seen.sum(1) >= 2))
@@ -88,11 +90,11 @@ def find_points(
     wrong = random.random(len(keep)) < OUTLIERS
     stretch = random.uniform(0.5, 1.8, len(keep))[:, None]
     moved = np.where(wrong[:, None], origin[keep] + stretch * (moved - origin[keep]), moved)
-    return Sparse(moved, color[keep], tracks, int(ghost[keep].sum()), int(wrong.sum()))
+    return SparsePoints(moved, color[keep], tracks, int(ghost[keep].sum()), int(wrong.sum()))
 
 
-def _visible(built: Built, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:
-    """Which of the points [M, 3] every camera sees: [M, V]."""
+def _visible(built: BuiltScene, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:
+    """Whether each camera sees each of the points [M, 3]: [M, V]."""
     seen = np.zeros((len(places), len(cameras)), bool)
     for number, camera in enumerate(cameras):
         x, y, z = _project(camera, places).T
@@ -103,13 +105,13 @@ def _visible(built: Built, cameras: Sequence[Camera], places: Array) -> NDArray[
             continue
         way = places[inside] - camera.center.numpy()
         length = np.linalg.norm(way, axis=1)
-        hits = cast(built, np.broadcast_to(camera.center.numpy(), way.shape), way / length[:, None])
+        hits = intersect(built, np.broadcast_to(camera.center.numpy(), way.shape), way / length[:, None])
         seen[inside, number] = np.abs(hits.distance - length) < 2e-3 * length
     return seen
 
 
 def _mirrored(
-    built: Built,
+    built: BuiltScene,
     origin: Array,
     ray: Array,
     places: Array,
@@ -117,7 +119,7 @@ def _mirrored(
     thing: NDArray[np.uint8],
     random: np.random.Generator,
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Some points on smooth surfaces replaced by what is seen in them: (which, points)."""
+    """Replace some points on smooth surfaces by the virtual images of reflected points: (which, points)."""
     sharp = np.array([False] + [item.material.roughness < SMOOTH for item in built.spec.things])
     wanted = np.flatnonzero(
         sharp[thing] & (random.random(len(thing)) < VIRTUAL / max(sharp[thing].mean(), VIRTUAL))
@@ -127,7 +129,7 @@ def _mirrored(
         return ghost, places
     d, n = ray[wanted], normal[wanted]
     back = d - 2 * (d * n).sum(-1, keepdims=True) * n
-    hits = cast(built, places[wanted] + 1e-4 * n, back)
+    hits = intersect(built, places[wanted] + 1e-4 * n, back)
     hit = hits.distance > 0
     ghost[wanted[hit]] = True
     places = places.copy()
@@ -156,8 +158,8 @@ def _project(camera: Camera, places: Array) -> Array:
     )
 
 
-def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], sparse: Sparse) -> None:
-    """Write COLMAP's text files."""
+def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], sparse: SparsePoints) -> None:
+    """Write a COLMAP model as text files."""
     folder.mkdir(parents=True, exist_ok=True)
     first = cameras[0]
     inner = " ".join(f"{float(v)!r}" for v in (first.fx, first.fy, first.cx, first.cy))

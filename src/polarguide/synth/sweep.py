@@ -1,4 +1,4 @@
-"""Families of scenes that differ in one number, for controlled studies."""
+"""Parameter sweeps: scenes that differ in one parameter, for controlled studies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from polarguide.synth.manifest import verify_scene, write_manifest
 from polarguide.synth.render import synthesize
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, SynthSettings
-from polarguide.synth.sparse import find_points, write_model
+from polarguide.synth.sparse import sample_sparse_points, write_model
 from polarguide.synth.variant import choose_variant
 
 PARAMETERS = ("views", "noise", "roughness", "index", "spacing")
@@ -130,7 +130,7 @@ def _fewer_views(
             member / "sparse" / "0",
             some,
             names,
-            find_points(built, some, pictures, settings.points, settings.seed),
+            sample_sparse_points(built, some, pictures, settings.points, settings.seed),
         )
         folder.write_file(member / "split.json", json.dumps({"test": tests}).encode())
         smaller = {**record, "views": names, "train": chosen, "sha256": write_manifest(member)}

@@ -1,7 +1,7 @@
-"""Procedural textures by name: linear RGB pictures that tile or fill a surface.
+"""Procedural textures: linear RGB pictures that tile or fill a surface.
 
-A texture is data, ``{"type": "wood", ...}``; each function below is a type and its parameters are the fields. Colors
-are linear sRGB. ``image`` takes a picture of the user's instead.
+A texture is data, ``{"type": "wood", ...}``; each function below is a type, and its parameters are the fields. Colors
+are linear sRGB. The type ``image`` reads a user's picture.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from polarguide.color import srgb_decode_array
 from polarguide.errors import PolarguideError
 from polarguide.synth.mesh import Array
-from polarguide.synth.noise import fractal
+from polarguide.synth.noise import fractal_noise
 
 Color = tuple[float, float, float]
 
@@ -30,9 +30,9 @@ def wood(
     board = np.floor(v * planks)
     inner = v * planks - board
     shift = _random(board, seed)
-    grain = fractal(np.stack((u * 3 + 7 * shift, v * planks * 9 + 13 * shift), -1), seed, 4)
+    grain = fractal_noise(np.stack((u * 3 + 7 * shift, v * planks * 9 + 13 * shift), -1), seed, 4)
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * (inner * 2.5 + 1.6 * grain + 3 * shift))
-    fine = fractal(np.stack((u * 14 + 3 * shift, v * planks * 70), -1), seed + 1, 2)
+    fine = fractal_noise(np.stack((u * 14 + 3 * shift, v * planks * 70), -1), seed + 1, 2)
     mix = np.clip(0.55 * rings + 0.35 * fine + 0.5 * (shift - 0.5), 0, 1)[..., None]
     picture = np.array(dark) * mix + np.array(light) * (1 - mix)
     joint = np.minimum(inner, 1 - inner) * pixels / planks
@@ -49,7 +49,7 @@ def checker(
     """A chessboard, a little worn."""
     u, v = _grid(pixels)
     odd = (np.floor(u * cells) + np.floor(v * cells)) % 2
-    worn = 0.8 + 0.4 * fractal(np.stack((u, v), -1) * 10, seed, 4)
+    worn = 0.8 + 0.4 * fractal_noise(np.stack((u, v), -1) * 10, seed, 4)
     return np.asarray(np.where(odd[..., None] > 0, a, b) * worn[..., None])
 
 
@@ -65,7 +65,7 @@ def bricks(
     edge_u = np.minimum(shifted - np.floor(shifted), np.ceil(shifted) - shifted) * rows / columns * 1.2
     edge = np.minimum(np.minimum(v * rows - row, 1 - (v * rows - row)), edge_u)
     tone = 0.55 + 0.9 * _random(row * 57 + column, seed)
-    grit = 0.7 + 0.6 * fractal(np.stack((u, v), -1) * 60, seed, 3)
+    grit = 0.7 + 0.6 * fractal_noise(np.stack((u, v), -1) * 60, seed, 3)
     stone = np.clip((edge - joint / 2) * 25, 0, 1)[..., None]
     picture = np.array(mortar) * (1 - stone) + np.array(brick) * tone[..., None] * stone
     return np.asarray(np.clip(picture * grit[..., None], 0, 0.95))
@@ -77,7 +77,7 @@ def mottled(
 ) -> Array:  # fmt: skip
     """Two colors mixed at random: plaster, stone, asphalt, cloth, rust."""
     u, v = _grid(pixels)
-    mix = fractal(np.stack((u, v), -1) * scale, seed, 6)
+    mix = fractal_noise(np.stack((u, v), -1) * scale, seed, 6)
     mix = np.clip((mix - 0.5) * 2.5 * sharp + 0.5, 0, 1)[..., None]
     return np.asarray(np.array(a) * mix + np.array(b) * (1 - mix))
 
@@ -89,7 +89,7 @@ def stripes(
     """Even stripes along u, or along v where ``across``; a little worn."""
     u, v = _grid(pixels)
     which = np.floor((u if across else v) * count).astype(int) % len(colors)
-    worn = 0.85 + 0.3 * fractal(np.stack((u, v), -1) * 12, seed, 4)
+    worn = 0.85 + 0.3 * fractal_noise(np.stack((u, v), -1) * 12, seed, 4)
     return np.asarray(np.array(colors)[which] * worn[..., None])
 
 
@@ -105,7 +105,7 @@ def tiles(
         [u * cells - column, column + 1 - u * cells, v * cells - row, row + 1 - v * cells]
     )
     face = np.clip((edge - 0.02) * 60, 0, 1)[..., None]
-    tone = 0.8 + 0.4 * fractal(np.stack((u, v), -1) * cells * 2, seed, 4)
+    tone = 0.8 + 0.4 * fractal_noise(np.stack((u, v), -1) * cells * 2, seed, 4)
     return np.asarray((np.array(colors)[which] * face + np.array(joint) * (1 - face)) * tone[..., None])
 
 
@@ -118,7 +118,7 @@ def printed(
     picture = np.tile(np.array(paper), (pixels, pixels, 1))
     u, v = _grid(pixels)
     block = (u > 0.1) & (u < 0.9) & (v > 0.1) & (v < 0.58)
-    tone = fractal(np.stack((u, v), -1) * 5, seed, 5)[..., None]
+    tone = fractal_noise(np.stack((u, v), -1) * 5, seed, 5)[..., None]
     sky = np.array(accent) * (1 - v[..., None]) + np.array([0.1, 0.2, 0.4]) * v[..., None]
     picture[block] = (sky * (0.5 + tone))[block]
     for _ in range(9):

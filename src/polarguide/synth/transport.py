@@ -1,12 +1,12 @@
-"""Polarized path tracing that keeps the two lobes of the first surface apart.
+"""Polarized path tracing that separates the two lobes of the first surface.
 
-Mitsuba supplies geometry, polarized reflection models and emitters; the walk is ours, because Mitsuba's own
-integrators add up the lobes. From the first surface two independent paths are followed, one that leaves it by the
-specular lobe and one by the diffuse lobe, so that specular + diffuse = S0 holds sample by sample and both layers
-carry full Stokes vectors. Light that other surfaces polarized before arrives polarized.
+Mitsuba supplies geometry, polarized BSDFs and emitters; the integrator is our own, because those of Mitsuba add the
+lobes. Two independent paths start at the first surface, one by the specular lobe and one by the diffuse lobe, so that
+specular + diffuse = S0 holds for every sample and both layers carry full Stokes vectors. Polarization by further
+surfaces is included.
 
-Direct light is found by multiple importance sampling with the balance heuristic (Veach, Guibas 1995). Unpolarized
-emitters are all there is, so that of every Mueller matrix only the first column is summed up.
+Direct light is estimated by multiple importance sampling with the balance heuristic (Veach and Guibas 1995). All
+emitters are unpolarized, so only the first column of every Mueller matrix is needed.
 """
 
 from __future__ import annotations
@@ -14,60 +14,67 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.synth.draws import Draws
-from polarguide.synth.sampling import Sampler, by_cosine, by_surface
+from polarguide.synth.bsdf_sampling import DirectionSampler, sample_bsdf, sample_cosine
+from polarguide.synth.sampler import Sampler
 
 TINY = 1e-30
-LOTTERY_FROM = 1
-"""Number of surfaces after which paths may end by chance."""
+ROULETTE_FROM = 1
+"""Number of surfaces after which Russian roulette starts."""
 
 
 @dataclass(frozen=True)
-class Walk:
-    """How far light is followed.
+class PathLimits:
+    """Limits of the traced paths.
 
     Attributes:
-        depth: largest number of surfaces that a path touches.
-        clamp: largest radiance that one path may bring from beyond its second surface, in scene units; the whole
-            Stokes vector of a brighter one is scaled down, which keeps its polarization. 0: no limit, no bias.
+        depth: largest number of surfaces on a path.
+        clamp: largest radiance that one path may contribute from beyond its second surface, in scene units; the Stokes
+            vector of a brighter path is scaled down as a whole. 0: no limit and no bias.
     """
 
     depth: int = 6
     clamp: float = 0.0
 
 
-def follow(scene: Any, ray: Any, draws: Draws, walk: Walk) -> tuple[list[Any], list[Any], Any]:
-    """Light that arrives along rays, by the lobe of the first surface.
+def trace_paths(
+    scene: Any, ray: Any, sampler: Sampler, limits: PathLimits
+) -> tuple[list[Any], list[Any], Any]:
+    """Trace the light that arrives along rays, separately for the lobes of the first surface.
 
     Args:
         scene: Mitsuba scene, of a polarized variant.
         ray: primary rays, with wavelengths in a spectral variant.
-        draws: random numbers of every ray.
-        walk: limits.
+        sampler: random numbers of every ray.
+        limits: of the paths.
 
     Returns:
-        (specular, diffuse, seen): [S0, S1, S2] of either lobe in Mitsuba's frame of the direction ``-ray.d``, and the
-        radiance that a light or the environment sends straight to the camera.
+        (specular, diffuse, emitted): [S0, S1, S2] of either lobe in Mitsuba's frame of the direction ``-ray.d``; the
+        directly visible radiance of light sources and environment.
     """
     import drjit as dr
     import mitsuba as mi
 
     si = scene.ray_intersect(ray)
-    seen = _emitted(scene, si, mi.Bool(True))
+    emitted = _emitted(scene, si, mi.Bool(True))
     flags = mi.BSDFFlags
     lobes = []
-    for kinds, sampler in ((flags.Glossy | flags.Delta, by_surface), (flags.Diffuse, by_cosine)):
+    for kinds, sample_direction in (
+        (flags.Glossy | flags.Delta, sample_bsdf),
+        (flags.Diffuse, sample_cosine),
+    ):
         context = mi.BSDFContext()
         context.type_mask = int(kinds)
-        numbers = (draws.next(), draws.pair(), draws.pair())
+        numbers = (sampler.next(), sampler.pair(), sampler.pair())
         start = (dr.identity(mi.Spectrum), numbers, si.is_valid())
-        direct, after = _scatter(scene, ray, si, context, *start, sampler)
-        lobes.append(_onwards(scene, direct, after, draws, walk))
-    return lobes[0], lobes[1], seen
+        direct, after = _scatter(scene, ray, si, context, *start, sample_direction)
+        lobes.append(_continue_paths(scene, direct, after, sampler, limits))
+    return lobes[0], lobes[1], emitted
 
 
-def _onwards(scene: Any, light: list[Any], after: tuple[Any, ...], draws: Draws, walk: Walk) -> list[Any]:
-    """``light`` and all that the paths collect behind the first surface: [S0, S1, S2]."""
+def _continue_paths(
+    scene: Any, light: list[Any], after: tuple[Any, ...], sampler: Sampler, limits: PathLimits
+) -> list[Any]:
+    """Add to ``light`` what the paths collect after the first surface: [S0, S1, S2]."""
     import drjit as dr
     import mitsuba as mi
 
@@ -80,23 +87,23 @@ def _onwards(scene: Any, light: list[Any], after: tuple[Any, ...], draws: Draws,
              delta: Any, random: Any) -> Any:  # fmt: skip
         si = scene.ray_intersect(ray, active)
         rival = 0.0
-        if si.emitter(scene) is not None:  # always, unless paths are followed one at a time
+        if si.emitter(scene) is not None:  # always, except in the scalar variant
             seen_from = mi.DirectionSample3f(scene, si, place)
             rival = scene.pdf_emitter_direction(place, seen_from, active & (delta ^ True))
         share = dr.select(delta, 1.0, pdf / dr.maximum(pdf + rival, TINY))
         emitted = _emitted(scene, si, active) * dr.select(active, share, 0.0)
-        found = _limited([gain[i, 0] * emitted for i in range(3)], walk.clamp, depth > 1)
-        active = active & si.is_valid() & (depth < walk.depth)
+        found = _limited([gain[i, 0] * emitted for i in range(3)], limits.clamp, depth > 1)
+        active = active & si.is_valid() & (depth < limits.depth)
         numbers = (random.next_float32(), _point(random), _point(random))
-        direct, state = _scatter(scene, ray, si, both, gain, numbers, active, by_surface)
-        direct = _limited(direct, walk.clamp, mi.Bool(True))
-        state = _lottery(state, random.next_float32(), depth > LOTTERY_FROM)
+        direct, state = _scatter(scene, ray, si, both, gain, numbers, active, sample_bsdf)
+        direct = _limited(direct, limits.clamp, mi.Bool(True))
+        state = _russian_roulette(state, random.next_float32(), depth > ROULETTE_FROM)
         s0, s1, s2 = (s + a + b for s, a, b in zip((s0, s1, s2), found, direct, strict=True))
         return (depth + 1, s0, s1, s2, *state, random)
 
-    start = (mi.UInt32(1), *light, *after, draws.later)
-    end = dr.while_loop(start, alive, step, label="path", max_iterations=walk.depth + 1)
-    draws.later = end[-1]
+    start = (mi.UInt32(1), *light, *after, sampler.later)
+    end = dr.while_loop(start, alive, step, label="path", max_iterations=limits.depth + 1)
+    sampler.later = end[-1]
     return list(end[1:4])
 
 
@@ -108,15 +115,15 @@ def _scatter(
     gain: Any,
     numbers: tuple[Any, Any, Any],
     active: Any,
-    sampler: Sampler,
+    sample_direction: DirectionSampler,
 ) -> tuple[list[Any], tuple[Any, ...]]:
-    """Direct light at a surface, and how the path goes on.
+    """Direct light at a surface, and the continuation of the path.
 
     Args:
-        context: lobes that take part.
+        context: selects the lobes.
         gain: Mueller matrix of the path from this surface to the camera.
         numbers: to choose a lobe, a direction and a light.
-        sampler: how directions are drawn.
+        sample_direction: samples directions, and evaluates the density of given ones.
 
     Returns:
         [S0, S1, S2] at the camera, and (active, ray, gain, place, density, delta) of the ray that leaves.
@@ -124,7 +131,7 @@ def _scatter(
     import drjit as dr
     import mitsuba as mi
 
-    if active is False:  # one path at a time: there is no surface to ask
+    if active is False:  # the scalar variant: there is no surface
         dark = [mi.UnpolarizedSpectrum(0.0)] * 3
         return dark, (False, mi.Ray3f(ray), gain, mi.Interaction3f(si), 0.0, False)
     choose, turn, light = numbers
@@ -132,7 +139,9 @@ def _scatter(
     ds, brought = scene.sample_emitter_direction(si, light, True, active)
     lit = active & (ds.pdf > 0)
     toward = si.to_local(ds.d)
-    (value, pdf), (wo, density, weight, delta) = sampler(bsdf, context, si, (choose, turn), toward, active)
+    (value, pdf), (wo, density, weight, delta) = sample_direction(
+        bsdf, context, si, (choose, turn), toward, active
+    )
     back = gain @ si.to_world_mueller(value, -toward, si.wi)
     share = dr.select(ds.delta, 1.0, ds.pdf / dr.maximum(ds.pdf + pdf, TINY))
     arriving = brought[0, 0] * dr.select(lit, share, 0.0)
@@ -144,8 +153,8 @@ def _scatter(
     return direct, (active, mi.Ray3f(leaving), gain, mi.Interaction3f(si), density, delta)
 
 
-def _lottery(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]:
-    """Russian roulette: paths that bring little end early, the others count for more."""
+def _russian_roulette(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]:
+    """Russian roulette: end paths of small throughput at random, and raise the weight of the others."""
     import drjit as dr
 
     active, ray, gain, *rest = state
@@ -154,7 +163,7 @@ def _lottery(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]
 
 
 def _emitted(scene: Any, si: Any, active: Any) -> Any:
-    """Radiance of the light or environment at an intersection, unpolarized."""
+    """Unpolarized radiance of the light source or environment at an intersection."""
     import mitsuba as mi
 
     emitter = si.emitter(scene)

@@ -1,4 +1,4 @@
-"""Which of Mitsuba's variants computes, and what to say when the fast ones cannot."""
+"""Choose a Mitsuba variant, with a note if no fast one is available."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Variant:
         name: Mitsuba's name.
         color: "rgb" renders three channels one after the other, each with exact values; "spectral" follows four
             wavelengths a path and converts.
-        fast: compiled for all paths at once, not one by one.
-        note: why the slow one had to be taken; empty otherwise.
+        fast: whether paths are vectorized (LLVM) instead of scalar.
+        note: the reason for a slow variant; else empty.
     """
 
     name: str
@@ -43,10 +43,10 @@ class Variant:
 
 
 def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
-    """Make a polarized variant current: a fast one where LLVM's library can be loaded, else the scalar one.
+    """Select a polarized variant: a fast one if the LLVM library can be loaded, else the scalar one.
 
     Args:
-        color: how colors are rendered; the scalar variant knows only "spectral".
+        color: how colors are rendered; the scalar variant supports "spectral" only.
         threads: threads to use; 0 takes all cores.
 
     Raises:
@@ -59,29 +59,29 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
             found="no package mitsuba",
             remedy="Install the optional extra: pip install 'polarguide[synth]'.",
         )
-    with _hushed():
+    with _silent_stderr():
         import mitsuba as mi
 
-        lack = _llvm_lack()
-    if not lack:
+        missing = _missing_llvm()
+    if not missing:
         mi.set_variant("llvm_ad_mono_polarized" if color == "rgb" else "llvm_ad_spectral_polarized")
         if threads:
             import drjit as dr
 
             dr.set_thread_count(threads)
         return Variant(mi.variant(), color, True)
-    with _hushed():
+    with _silent_stderr():
         mi.set_variant("scalar_spectral_polarized")
     note = (
-        f"Mitsuba's fast variants need LLVM {OLDEST_LLVM} or newer as a shared library ({lack}); on Debian "
+        f"Mitsuba's fast variants need LLVM {OLDEST_LLVM} or newer as a shared library ({missing}); on Debian "
         "'apt-get install libllvm19', elsewhere set DRJIT_LIBLLVM_PATH. The slow scalar variant is used."
     )
     return Variant(mi.variant(), "spectral", False, note)
 
 
 @contextlib.contextmanager
-def _hushed() -> Iterator[None]:
-    """Keep what a library prints to the error stream behind Python's back from the user: its loading, here."""
+def _silent_stderr() -> Iterator[None]:
+    """Suppress what a library writes to the error stream past Python while it loads."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
@@ -93,12 +93,12 @@ def _hushed() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _llvm_lack() -> str:
-    """Why LLVM cannot be used, or nothing."""
+def _missing_llvm() -> str:
+    """Why LLVM cannot be used; empty if it can."""
     import mitsuba as mi
 
     path = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if path and not os.path.exists(path):  # asking would make the library print lines of its own
+    if path and not os.path.exists(path):  # otherwise the library prints messages
         return f"DRJIT_LIBLLVM_PATH names {path}, which does not exist"
     try:
         mi.set_variant("llvm_ad_mono_polarized")
@@ -113,6 +113,6 @@ def _llvm_lack() -> str:
 
 
 def slow_estimate(paths: float) -> str:
-    """A time for that many paths with the scalar variant, in words."""
+    """The estimated time for that many paths with the scalar variant, in words."""
     hours = paths / SLOW_PATHS_PER_SECOND / 3600
     return f"about {hours:.0f} hours" if hours >= 2 else f"about {max(2.0, hours * 60):.0f} minutes"

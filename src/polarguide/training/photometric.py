@@ -2,7 +2,7 @@
 
 On the CPU in float32 a native kernel computes the loss and its gradient in one call. Elsewhere the same gradient is
 written out in plain torch, which blurs nine planes each way where autograd would blur fifteen and keep what lies
-between. ``photometric_loss_reference`` is the twin of both.
+between. ``photometric_loss_reference`` is the reference implementation.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _blur(planes: Tensor) -> Tensor:
 def photometric_loss_reference(
     prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Tensor:
-    """The slow twin of ``photometric_loss``: plain torch, any dtype and device."""
+    """The reference implementation of ``photometric_loss``: plain torch, any dtype and device."""
     shown = srgb_encode(_Clip.apply(prediction))
     weight = (torch.ones_like(prediction[..., 0]) if weight is None else weight)[..., None]
     x, y = shown.permute(2, 0, 1), target.permute(2, 0, 1)

@@ -1,1 +1,1 @@
-"""Arrays to pictures for people: false colors, contact sheets, layers, pictures inside a page."""
+"""Arrays to 8-bit pictures: false colors, contact sheets, layers, pictures inside a page."""

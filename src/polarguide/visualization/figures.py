@@ -1,4 +1,4 @@
-"""Layers as pictures for people, uint8 RGB [H, W, 3]: false colors, PNG files and contact sheets."""
+"""Layers as 8-bit pictures, uint8 RGB [H, W, 3]: false colors, PNG files and contact sheets."""
 
 from __future__ import annotations
 

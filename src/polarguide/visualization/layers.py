@@ -45,7 +45,7 @@ def depth_range(depth: Tensor, seen: Tensor) -> tuple[float, float]:
 
 
 def true_depth_range(view: View) -> tuple[float, float] | None:
-    """The range of the true depths, so that rendered and true pictures share their colors; None without truth."""
+    """The range of the true depths, so that rendered and true pictures share their colors; None if it is unknown."""
     ground_truth = view.ground_truth
     if ground_truth is None or ground_truth.depth is None or ground_truth.mask is None:
         return None

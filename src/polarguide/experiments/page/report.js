@@ -4,9 +4,9 @@
   const element = (id) => document.getElementById(id);
   const views = read("data"), layers = read("layer-data"), legend = read("legend-data");
   const tiles = element("tiles");
-  const state = { index: 0, layer: "final", scale: 1, x: 0, y: 0, truth: false };
+  const state = { index: 0, layer: "final", scale: 1, x: 0, y: 0, groundTruth: false };
   const MOST = 32, STEP = 1.25, PAN = 0.1;
-  /* What the tile of the truth shows beside maps of errors, to see where an error is. */
+  /* The layer in the ground-truth tile beside error maps. */
   const BESIDE = { error: "final", normal_error: "normal" };
 
   /* Zoom: one scale and one offset for all pictures. The offset is in widths and heights of a tile, so that tiles of
@@ -43,16 +43,16 @@
 
   function draw() {
     const view = views[state.index];
-    const truth = view.tiles[0][1];
+    const groundTruth = view.tiles[0][1];
     const beside = BESIDE[state.layer] || state.layer;
     tiles.replaceChildren(...view.tiles.map(([name, pictures, scores], index) => {
-      const tile = make("figure", index ? "tile" : "tile truth");
+      const tile = make("figure", index ? "tile" : "tile ground-truth");
       const caption = make("figcaption");
       const beneath = index || beside === state.layer ? scores[state.layer] : layers[beside];
       caption.append(make("b", "", name), make("span", "", beneath || ""));
       const frame = make("div", "window");
       frame.style.aspectRatio = view.width + " / " + view.height;
-      const source = index === 0 || (state.truth && truth[beside]) ? truth[beside] : pictures[state.layer];
+      const source = index === 0 || (state.groundTruth && groundTruth[beside]) ? groundTruth[beside] : pictures[state.layer];
       if (source) {
         const picture = make("img");
         picture.src = source;
@@ -114,7 +114,7 @@
     let drag = null;
     tiles.addEventListener("wheel", (event) => {
       const frame = event.target.closest(".window");
-      if (!frame || (state.scale === 1 && event.deltaY > 0)) return; /* nothing to zoom out of: scroll the page */
+      if (!frame || (state.scale === 1 && event.deltaY > 0)) return; /* at full size: scroll the page */
       event.preventDefault();
       const box = frame.getBoundingClientRect();
       const factor = Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0018));
@@ -155,7 +155,7 @@
         state.y += y;
         place();
       } else if (event.key === "t" && !event.repeat) {
-        state.truth = true;
+        state.groundTruth = true;
         draw();
       } else if (event.key in keys) {
         keys[event.key]();
@@ -164,7 +164,7 @@
       }
       event.preventDefault();
     });
-    const release = () => { if (state.truth) { state.truth = false; draw(); } };
+    const release = () => { if (state.groundTruth) { state.groundTruth = false; draw(); } };
     document.addEventListener("keyup", (event) => { if (event.key === "t") release(); });
     window.addEventListener("blur", release);
   }

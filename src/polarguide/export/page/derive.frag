@@ -13,7 +13,7 @@ float signedByte(uint words[12], int index) {
   return float(int(words[index >> 2] << (24 - 8 * (index & 3))) >> 24);
 }
 
-// Harmonics of degrees 1 to 3 in the order and with the signs of the 3DGS release.
+// Harmonics of degrees 1 to 3, as in gaussians/harmonics.py.
 vec3 harmonics(int gaussian, int first, float scale, vec3 d) {
   uvec4 a = texel(gaussian, first), b = texel(gaussian, first + 1), c = texel(gaussian, first + 2);
   uint words[12] = uint[12](a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w);

@@ -1,4 +1,4 @@
-"""How a path chooses its direction at a surface, and how densely it would have chosen another."""
+"""Sampling of directions at a surface, and the density of given directions."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from collections.abc import Callable
 from typing import Any
 
 LEAST_DENSITY = 1e-5
-Sampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
+DirectionSampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
 
 
-def by_surface(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
-    """Directions as the surface draws them: (value, density) toward a light, and (direction, density, weight, delta)
-    of a drawn one."""
+def sample_bsdf(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
+    """Sample a direction by Mitsuba's BSDF.
+
+    Returns:
+        (value, density) for the direction ``toward`` a light; (direction, density, weight, delta) of the sampled one.
+    """
     import mitsuba as mi
 
     given = bsdf.eval_pdf(context, si, toward, active)
@@ -20,10 +23,12 @@ def by_surface(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, acti
     return given, (sample.wo, sample.pdf, weight, delta)
 
 
-def by_cosine(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
-    """Directions by Lambert's law; result as of ``by_surface``.
+def sample_cosine(
+    bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any
+) -> tuple[Any, Any]:
+    """Sample a direction with a density proportional to the cosine; returns what ``sample_bsdf`` does.
 
-    Mitsuba 3.9 gives values of a coated surface's diffuse lobe rightly, but when that lobe alone is asked for, its
+    Mitsuba 3.9 evaluates the diffuse lobe of a coated surface correctly, but if only this lobe is selected, its
     densities are those of both lobes together.
     """
     import drjit as dr

@@ -1,4 +1,4 @@
-"""Random numbers of paths: evenly spread in their first dimensions, independent later."""
+"""Random numbers of paths: a low-discrepancy sequence in the first dimensions, independent numbers after them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41)
 _WHOLE = 2**32
 
 
-class Draws:
+class Sampler:
     """Random numbers for one sample of each pixel.
 
-    The first dimensions follow a Kronecker sequence with the square roots of primes, shifted by a random number of the
-    pixel and the dimension (Cranley, Patterson 1976). Every sample alone is uniform, so that nothing is biased.
+    The first dimensions follow a Kronecker sequence with the square roots of primes, with a random shift per pixel and
+    dimension (Cranley and Patterson 1976). Every single sample is uniform, so that estimates are unbiased.
 
     Args:
         pixel: index of the pixel.
@@ -20,7 +20,7 @@ class Draws:
         seed: seed of the view, as Mitsuba's unsigned integer.
 
     Attributes:
-        later: generator of independent numbers for all that follows.
+        later: generator of independent numbers for the later dimensions.
     """
 
     def __init__(self, pixel: Any, sample: Any, seed: Any) -> None:
@@ -39,7 +39,7 @@ class Draws:
         step = int((_PRIMES[self._used] ** 0.5 % 1) * _WHOLE)
         self._used += 1
         shift = mi.sample_tea_32(self._pixel, self._seed + mi.UInt32(self._used))[0]
-        # In whole numbers modulo 2^32, since floats lose digits as the index grows.
+        # In integers modulo 2^32, because floats lose digits as the index grows.
         turned = mi.UInt32((self._sample * mi.UInt32(step) + shift) & mi.UInt32(_WHOLE - 1))
         return dr.minimum(mi.Float(turned) * (1 / _WHOLE), 1 - 2.0**-24)
 

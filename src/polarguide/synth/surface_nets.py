@@ -1,4 +1,4 @@
-"""Triangles of a surface that is given by values on a grid."""
+"""Surface nets: triangles of the zero level set of values on a grid."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from polarguide.synth.mesh import Array
 
 
 def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
-    """Vertices [V, 3] in units of cells and triangles [F, 3] of the zero level of values on a grid."""
+    """Naive surface nets (Gibson 1998): vertices [V, 3] in units of cells, and triangles [F, 3].
+
+    Args:
+        values: signed distances on a grid, [X, Y, Z], negative inside.
+    """
     inside = values < 0
     shape = tuple(n - 1 for n in values.shape)
     sums, counts = np.zeros((*shape, 3)), np.zeros(shape)

@@ -1,4 +1,4 @@
-"""Signed distances to the simple parts of a solid."""
+"""Signed distances to the primitives of a solid."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from polarguide.synth.mesh import Array, rotation
 
 
-def part_distance(points: Array, part: dict[str, Any]) -> Array:
-    """Signed distance (of an ellipsoid: to first order) to one part."""
+def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
+    """Signed distance from points [..., 3] to one primitive (for an ellipsoid to first order), [...]."""
     kind = part["kind"]
     if "from" in part:
         start, end = np.array(part["from"], float), np.array(part["to"], float)
@@ -42,5 +42,5 @@ def part_distance(points: Array, part: dict[str, Any]) -> Array:
 
 
 def _outside(sides: Array) -> Array:
-    """Distance to a box from the signed distances to its pairs of sides."""
+    """Signed distance to a box, given the signed distances to its pairs of sides."""
     return np.asarray(np.linalg.norm(np.maximum(sides, 0), axis=-1) + np.minimum(sides.max(-1), 0))

@@ -1,4 +1,4 @@
-"""Surfaces and lights as Mitsuba describes them, for one channel or, where ``channel`` is None, for all wavelengths."""
+"""Mitsuba dictionaries of BSDFs and emitters, for one color channel, or for all wavelengths if ``channel`` is None."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from polarguide.synth.schema import Material
 AIR = 1.0
 
 
-def surface(material: Material, picture: Array | None, channel: int | None) -> dict[str, Any]:
-    """Mitsuba's description of a surface, of one channel or of all."""
+def bsdf_dict(material: Material, picture: Array | None, channel: int | None) -> dict[str, Any]:
+    """The BSDF of a material, with the texture ``picture`` [H, W, 3] if it has one."""
     base = _value(material.color, channel) if picture is None else _bitmap(picture, channel)
     if material.type == "metal":
         index = {name: _metal(getattr(material, name), channel) for name in ("eta", "k")}
@@ -28,14 +28,14 @@ def surface(material: Material, picture: Array | None, channel: int | None) -> d
 
 
 def _value(color: Any, channel: int | None) -> dict[str, Any]:
-    """A reflectance or radiance."""
+    """The dictionary of a reflectance or radiance."""
     if channel is None:
         return {"type": "rgb", "value": [float(c) for c in color]}
     return {"type": "uniform", "value": float(color[channel])}
 
 
 def _metal(index: tuple[float, float, float], channel: int | None) -> dict[str, Any]:
-    """A complex index given at red, green and blue."""
+    """The spectrum of an index that is given at red, green and blue."""
     if channel is not None:
         return {"type": "uniform", "value": float(index[channel])}
     red, green, blue = index
@@ -53,17 +53,23 @@ def _bitmap(picture: Array, channel: int | None) -> dict[str, Any]:
     return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": channel is not None, "filter_type": blend}
 
 
-def sky(panorama: Array, channel: int | None) -> dict[str, Any]:
+def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
+    """The environment emitter of a panorama [H, W, 3]."""
     import mitsuba as mi
 
     part = panorama if channel is None else np.repeat(panorama[..., channel : channel + 1], 3, -1)
-    # Mitsuba's panoramas look down its -z at their left edge, with y up and columns that turn to the right.
+    # The left edge of Mitsuba's panoramas is its -z; y is up and columns proceed to the right.
     axes = np.array([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
     return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(part, np.float32)),
             "to_world": mi.ScalarTransform4f(axes)}  # fmt: skip
 
 
-def lamp(light: dict[str, Any], channel: int | None, where: str) -> dict[str, Any]:
+def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> dict[str, Any]:
+    """A rectangular area light.
+
+    Raises:
+        PolarguideError: a field is missing or has another type; ``where`` names the scene.
+    """
     import mitsuba as mi
 
     try:

@@ -1,8 +1,7 @@
-"""Smooth solids: simple parts blended by their signed distances, and made triangles of.
+"""Meshes of implicit surfaces: primitives blended by their signed distances.
 
-The blend is the polynomial smooth minimum; triangles come from the dual of the grid (naive surface nets: one vertex in
-every cell that the surface crosses), moved onto the surface by Newton's method, with the gradient of the distance as
-normal, so that highlights run smoothly over the blends.
+The blend is the polynomial smooth minimum. Triangles come from naive surface nets, are moved onto the surface by
+Newton's method, and have the gradient of the distance as normal, so that highlights are smooth across blends.
 """
 
 from __future__ import annotations
@@ -12,28 +11,28 @@ from typing import Any
 import numpy as np
 
 from polarguide.synth.mesh import Array, Mesh
-from polarguide.synth.nets import surface_nets
-from polarguide.synth.parts import part_distance
+from polarguide.synth.signed_distance import primitive_distance
+from polarguide.synth.surface_nets import surface_nets
 from polarguide.vectors import unit_array as unit
 
 NEWTON_STEPS = 2
 COARSE = 4
 FEW = 8
 BLOCK = 10
-"""Side of the cubes that are looked at together, in cells."""
+"""Side of the cubes that are evaluated together, in cells."""
 
 
 def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) -> Mesh:
-    """Parts as one surface.
+    """Mesh a union of blended primitives.
 
     Args:
         parts: each with ``kind``: "ellipsoid" (``at``, ``size``: half axes), "box" (``at``, ``size``: half sides,
             ``round``), "capsule" (``from``, ``to``, ``radius``, and ``end``, that at ``to``), "cylinder" (``from``,
             ``to``, ``radius``, ``round``) or "ring" (``at``, ``radius``, ``thick``; about z); any with ``rotation``
-            about its ``at``, ``cut`` to take it away, ``blend`` of its own, ``mirror`` ("x" or "y": a second one) and
+            about its ``at``, ``cut`` to subtract it, ``blend`` of its own, ``mirror`` ("x" or "y": a second one) and
             ``color``.
-        blend: width over which neighbors flow into each other.
-        detail: cells along the longest side.
+        blend: width of the transition between neighboring parts.
+        detail: grid cells along the longest side.
     """
     whole = []
     for part in parts:
@@ -52,11 +51,11 @@ def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) ->
     uv = np.stack(
         (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi), (points[:, 2] - low[2]) / span[2]), -1
     )
-    return _painted(Mesh(points, faces, uv, normals), whole)
+    return _colored(Mesh(points, faces, uv, normals), whole)
 
 
 def _sampled(parts: list[dict[str, Any]], blend: float, low: Array, high: Array, step: float) -> Array:
-    """Distances on a grid with two cells of margin: exact near the surface, elsewhere those of a coarser grid."""
+    """Distances on a grid with a margin of two cells: exact near the surface, from a coarser grid elsewhere."""
     counts = np.ceil((np.ceil((high - low) / step) + 5) / COARSE).astype(int) + 1
     coarse = np.stack(np.meshgrid(*(np.arange(n) * COARSE for n in counts), indexing="ij"), -1)
     values = _distance(low + step * (coarse - 2.0), parts, blend)
@@ -95,19 +94,19 @@ def _bounds(parts: list[dict[str, Any]]) -> tuple[Array, Array]:
 
 
 def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: float = 0.0) -> Array:
-    """Signed distance of all parts; with ``block``, the points [N, 3] are gone through in cubes of this side, and in
-    each only the parts that can matter there are asked."""
+    """Signed distance of all parts; with ``block``, points [N, 3] are evaluated in cubes of this side, each with only
+    the parts that can matter there."""
     if block <= 0 or len(parts) < FEW:
         return _combined(points, parts, blend)
     cubes, which = np.unique(np.floor(points / block).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(which.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(cubes)))
     centers: Array = ((cubes + 0.5) * block).astype(np.float64)
-    apart = np.stack([part_distance(centers, part) for part in parts])
+    apart = np.stack([primitive_distance(centers, part) for part in parts])
     cut = np.array([bool(part.get("cut")) for part in parts])
     width = np.array([part.get("blend", blend) for part in parts])
     nearest = np.where(cut[:, None], np.inf, apart).min(0)
-    # Half the diagonal of a cube, twice, and a reserve since distances of ellipsoids are not exact.
+    # Twice half the diagonal of a cube, and a margin because distances to ellipsoids are not exact.
     reach = 3 * block + width[:, None] + np.maximum(nearest, 0)
     matters = apart < np.where(cut[:, None], 0, np.minimum(nearest, 0)) + reach
     result = np.empty(len(points))
@@ -122,7 +121,7 @@ def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: f
 def _combined(points: Array, parts: list[dict[str, Any]], blend: float) -> Array:
     total: Array | None = None
     for part in parts:
-        value, width = part_distance(points, part), part.get("blend", blend)
+        value, width = primitive_distance(points, part), part.get("blend", blend)
         if total is None:
             total = value
         elif part.get("cut"):
@@ -150,16 +149,16 @@ def _gradient(points: Array, parts: list[dict[str, Any]], blend: float, step: fl
     return np.stack(slopes, -1)
 
 
-def _painted(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
-    """The mesh with a palette: every triangle has the color of the colored part nearest to its middle.
+def _colored(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
+    """Color every triangle like the colored part nearest to its center.
 
-    Vertices between two colors become two, and texture coordinates choose a color of the palette.
+    Vertices between two colors are duplicated; texture coordinates select a color of the palette.
     """
     colored = [part for part in parts if "color" in part and not part.get("cut")]
     if not colored:
         return mesh
     middles: Array = mesh.points[mesh.faces].mean(1)
-    which = np.stack([part_distance(middles, part) for part in colored], -1).argmin(-1)
+    which = np.stack([primitive_distance(middles, part) for part in colored], -1).argmin(-1)
     palette, number = np.unique([part["color"] for part in colored], axis=0, return_inverse=True)
     color = number.reshape(-1)[which]
     pairs, corners = np.unique(mesh.faces * len(palette) + color[:, None], return_inverse=True)

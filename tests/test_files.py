@@ -1,0 +1,66 @@
+"""Files appear whole or not at all, and a failure is explained."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from polarguide.errors import PolarguideError
+from polarguide.files import atomic, make_folder, read_file, write_text, write_whole
+
+
+def test_a_file_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_text(path, "ä")
+    assert path.read_bytes() == "ä".encode()
+    assert write_whole(path, b"123") == 3
+    assert read_file(path) == b"123"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no"), OSError(errno.ENOSPC, "full")])
+def test_a_failure_leaves_the_old_file(tmp_path: Path, error: BaseException) -> None:
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+
+    def fail() -> None:
+        with atomic(path) as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises((KeyboardInterrupt, ValueError, PolarguideError)):
+        fail()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_content_is_on_the_disk_before_it_takes_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    sync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (done.append("sync"), sync(handle))[1])
+    monkeypatch.setattr(os, "replace", lambda a, b: (done.append("replace"), replace(a, b))[1])
+    write_text(tmp_path / "a", "x")
+    assert done == ["sync", "replace", "sync"]
+
+
+def test_what_cannot_be_written_is_explained(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "none" / "a", tmp_path / "file" / "a"):
+        with pytest.raises(PolarguideError, match=r"expected to write this file, found .*Make room"):
+            write_text(path, "x")
+    with pytest.raises(PolarguideError, match="expected to write"):
+        make_folder(tmp_path / "file" / "folder")
+    make_folder(tmp_path / "one" / "two")
+    make_folder(tmp_path / "one" / "two")
+    assert (tmp_path / "one" / "two").is_dir()
+
+
+def test_pipes_are_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(PolarguideError, match="a pipe or device"):
+        read_file(tmp_path / "pipe")
