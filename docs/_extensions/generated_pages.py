@@ -19,6 +19,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
+from itertools import takewhile
 from pathlib import Path
 
 from sphinx.application import Sphinx
@@ -55,6 +56,7 @@ def exists(name: str) -> bool:
 def summary(name: str) -> str:
     """First sentence of a module's docstring, without a full stop; empty where it has none."""
     path = source_of(name)
+    path = path if path.exists() else path.with_suffix(".pyi")  # a compiled module
     text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) if path.exists() else None
     return " ".join((text or "").split("\n\n")[0].split()).rstrip(".")
 
@@ -162,17 +164,28 @@ def boxes(text: str) -> tuple[str, list[tuple[str, list[str]]]]:
     return "\n".join(above), found
 
 
-def entries(lines: list[str]) -> list[tuple[str, str]]:
-    """Options and what they do, from the lines of a box: names start at the left, what they do stands apart."""
+def entries(lines: list[str]) -> tuple[str, list[tuple[str, str]]]:
+    """What a box is about, if it says so above a rule (one paragraph); and its options with what they do.
+
+    Names start at the left, what they do stands apart.
+    """
+    rule = next((number for number, line in enumerate(lines) if line.strip() and not line.strip("─ ")), -1)
+    above = lines[: max(rule, 0)]
+    about = " ".join(line.strip() for line in takewhile(str.strip, above))
     found: list[tuple[str, str]] = []
-    for line in lines:
+    for line in lines[rule + 1 :]:
         if line[:1].strip():
             name, *text = re.split(r"\s{2,}", line.rstrip(), maxsplit=1)
             found.append((name, "".join(text)))
         elif found and line.strip():
-            name, text = found[-1]
-            found[-1] = name, f"{text} {line.strip()}".strip()
-    return found
+            name, what = found[-1]
+            found[-1] = name, f"{what} {line.strip()}".strip()
+    return about, found
+
+
+def plain(text: str) -> str:
+    """Text with reStructuredText's own characters escaped."""
+    return re.sub(r"([\\*|`_])", r"\\\1", text)
 
 
 def verb_section(verb: str, text: str) -> str:
@@ -183,10 +196,11 @@ def verb_section(verb: str, text: str) -> str:
     lines = [f"## `{verb}`", "", "```text", usage, "```", "", escaped(about), "", "```{eval-rst}"]
     lines += [f".. program:: {PACKAGE} {verb}", ""]
     for _, box in found:
-        for name, what in entries(box):
+        heading, options = entries(box)
+        lines += [f"*{plain(heading)}*", ""] if heading else []
+        for name, what in options:
             if name != "-h, --help":
-                what = re.sub(r"([\\*|`_])", r"\\\1", what)
-                lines += [f".. option:: {name}", "", f"   {what}", ""]
+                lines += [f".. option:: {name}", "", f"   {plain(what)}", ""]
     return "\n".join([*lines, "```", ""])
 
 

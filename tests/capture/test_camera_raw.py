@@ -14,7 +14,7 @@ from camera_files import ANGLES, behind, read_invalid, read_polar, smooth_light
 
 from polarguide.capture.filter import camera_raw
 from polarguide.capture.filter.camera_raw import read_camera_raw
-from polarguide.capture.filter.exif import turned
+from polarguide.capture.filter.exif import apply_orientation
 from polarguide.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -73,7 +73,7 @@ def test_orientation_turns_pixels_and_angles(tmp_path: Path) -> None:
     stored = smooth_light(64, 96)
     write_shots(tmp_path / "in", stored, orientation=6)
     prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
-    upright = np.stack([turned(plane, 6) for plane in stored])
+    upright = np.stack([apply_orientation(plane, 6) for plane in stored])
     upright[1:] *= -1
     error = np.abs(read_polar(tmp_path / "out", "cup") - behind(upright))[:, 2:-2, 2:-2]
     assert error.max() < 2e-3

@@ -54,7 +54,7 @@ def test_a_file_instead_of_a_folder(capture: TinyCapture) -> None:
 def test_a_folder_without_pictures(tmp_path: Path) -> None:
     fails(tmp_path, "found an empty folder", "I-00, I-45")
     (tmp_path / "images").mkdir()
-    fails(tmp_path, "found one that holds images", "I-00, I-45")
+    fails(tmp_path, "found a folder with images", "I-00, I-45")
     (tmp_path / "polar").mkdir()
     fails(tmp_path, "pictures of at least one view, found none")
 
@@ -97,10 +97,9 @@ def test_files_that_are_passed_over_are_reported_once(capture: TinyCapture) -> N
     scene = load_scene(capture.root)
     assert len(scene.views) == 9
     assert scene.warnings == (
-        "polar/ has pictures whose names do not end in _000, _045, _090 or _135 and that are not used "
+        "polar/ has pictures whose names do not end in _000, _045, _090 or _135, which are not used "
         "(preview.png, v000_180.png, v001_000_small.png).",
-        "gt/ has files that belong to no view and are not used (v000_gt.npz): "
-        "name a file there like its view.",
+        "gt/ has files without a view, which are not used (v000_gt.npz): name each file like its view.",
     )
 
 

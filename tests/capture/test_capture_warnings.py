@@ -87,7 +87,7 @@ def test_saturated_pictures(capture: TinyCapture) -> None:
 def test_bits_that_were_not_scaled(capture: TinyCapture, bits: int, factor: int) -> None:
     capture.rewrite(lambda linear: linear * (2**bits - 1) / 65535)
     (warning,) = warnings_of(capture)
-    assert f"they look like {bits}-bit data that were not scaled. Multiply the values by {factor}." in warning
+    assert f"they look like unscaled {bits}-bit data. Multiply the values by {factor}." in warning
 
 
 def test_full_scale_below_the_largest_code(capture: TinyCapture) -> None:

@@ -134,7 +134,11 @@ def test_intrinsics_of_another_shape_are_refused(capture: TinyCapture) -> None:
 def test_no_model(capture: TinyCapture) -> None:
     model_folder(capture).rename(capture.root / "model")
     fails(
-        capture.root, "sparse/0", "a COLMAP model", "found none there nor in sparse/", "structure from motion"
+        capture.root,
+        "sparse/0",
+        "a COLMAP model",
+        "found neither there nor in sparse/",
+        "structure from motion",
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from camera_files import COLOR, MONO, behind, busy_light, mosaic, smooth_light
 
-from polarguide.capture.sensor import DEMOSAIC_MODES, Picture, demosaic, sensor_pattern
+from polarguide.capture.sensor import DEMOSAIC_MODES, DemosaicedPicture, demosaic, sensor_pattern
 
 MODES = [
     ("half", "bilinear"),
@@ -21,7 +21,7 @@ MODES = [
 
 def developed(
     intensities: np.ndarray, *, color: bool, mode: str, interpolation: str, offset: tuple[int, int] = (0, 0)
-) -> Picture:
+) -> DemosaicedPicture:
     values = mosaic(intensities, COLOR if color else MONO, offset).astype(np.float32)
     pattern = sensor_pattern("IMX250MYR" if color else "IMX250MZR").shifted(*offset)
     x, y = pattern.cell_corner()

@@ -70,14 +70,12 @@ def test_values_that_are_not_finite(capture: TinyCapture, value: float) -> None:
 def test_cut_short(capture: TinyCapture, keep: int) -> None:
     path = capture.write_truth("v000", depth=np.random.default_rng(0).random((HEIGHT, WIDTH)))
     path.write_bytes(path.read_bytes()[:keep])
-    fails(
-        capture, "gt/v000.npz", "a NumPy .npz file", "damaged, cut short or of another kind", "Write it again"
-    )
+    fails(capture, "gt/v000.npz", "a NumPy .npz file", "a damaged, truncated or other file", "Write it again")
 
 
 def test_a_single_array_and_pickled_objects_are_refused(capture: TinyCapture) -> None:
     path = capture.write_truth("v000", depth=np.array([{"a": 1}], dtype=object))
-    fails(capture, "gt/v000.npz", "damaged, cut short or of another kind")
+    fails(capture, "gt/v000.npz", "a damaged, truncated or other file")
     with path.open("wb") as file:
         np.save(file, np.zeros((HEIGHT, WIDTH)))
-    fails(capture, "gt/v000.npz", "damaged, cut short or of another kind")
+    fails(capture, "gt/v000.npz", "a damaged, truncated or other file")

@@ -11,7 +11,7 @@ from camera_files import COLOR, MONO, pack, write_mosaic
 from polarguide.capture.sensor import (
     PACKINGS,
     RawFormat,
-    find_levels,
+    estimate_levels,
     packed_size,
     read_mosaic,
     sensor_pattern,
@@ -83,7 +83,7 @@ def test_patterns_and_their_offsets(sensor: str, rows: tuple[str, ...]) -> None:
 def test_full_scale(
     largest: int, used: int, container: int, bits: int | None, found: tuple[int, int]
 ) -> None:
-    levels = find_levels(largest, used, container, bits=bits, black=0.0, saturation=None)
+    levels = estimate_levels(largest, used, container, bits=bits, black=0.0, saturation=None)
     assert (levels.bits, levels.white) == found
     assert levels.saturation == levels.white
     values = np.array([[0, levels.white]], np.uint16)
@@ -94,13 +94,13 @@ def test_levels_out_of_order_are_refused() -> None:
     for changes in ({"black": 300.0}, {"saturation": 300}, {"black": 100.0, "saturation": 90}):
         asked = {"bits": 8, "black": 0.0, "saturation": None, **changes}
         with pytest.raises(PolarguideError, match="0 <= black level < saturation <= 255"):
-            find_levels(200, 255, 8, **asked)
+            estimate_levels(200, 255, 8, **asked)
     with pytest.raises(PolarguideError, match="values below 1024 for 10 bits, found 1025"):
-        find_levels(1025, 2047, 16, bits=10, black=0.0, saturation=None)
+        estimate_levels(1025, 2047, 16, bits=10, black=0.0, saturation=None)
 
 
 def test_saturated_and_dark_samples() -> None:
-    levels = find_levels(255, 255, 8, bits=None, black=10.0, saturation=250)
+    levels = estimate_levels(255, 255, 8, bits=None, black=10.0, saturation=250)
     values = np.full((4, 4), 100, np.uint8)
     values[0, 0], values[0, 1] = 250, 249
     values[2:, 2:] = 10  # a cell without light

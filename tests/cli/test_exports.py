@@ -155,7 +155,7 @@ def test_wrong_flags_are_refused(refused, trained: Path, tmp_path: Path) -> None
     assert "--resolution" in refused("export", trained, "--format", "mesh", "--resolution", 4)
     assert "--video" in refused("render", trained, "--video", tmp_path / "a.mp4")
     assert "--video" in refused("render", trained, "--path", "orbit", "--video", tmp_path / "a.gif")
-    assert "camera path" in refused("render", trained, "--path", "loop")
+    assert "Give orbit, spiral, interpolate" in refused("render", trained, "--path", "loop")
     assert "panorama" in refused("render", trained, "--environment", tmp_path / "none.exr")
     assert "--frames" in refused("render", trained, "--path", "orbit", "--frames", 0)
     assert not list(tmp_path.iterdir())

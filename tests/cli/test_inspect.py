@@ -90,7 +90,7 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
 def test_a_capture_with_poses_and_points_alone(demo_scene: Path, tmp_path: Path) -> None:
     record, _ = inspected(demo_scene, tmp_path / "out", "--normals", "points")
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
-    assert verdicts["angle_order"] == "n/a"  # its few small views leave too few sightings
+    assert verdicts["angle_order"] == "n/a"  # its few small views leave too few observations
     assert record["angles"]["sources"][0]["usable"] is False
     assert verdicts["coverage"] == "ok"
     assert record["scene"]["posed_views"] == 27

@@ -1,11 +1,13 @@
 """What the documentation says about the program is so: names, files, options, citations, spelling."""
 
 import ast
+import inspect
 import re
 from pathlib import Path
 
 import pytest
 
+import polarguide
 from polarguide.evaluation.table import METRICS
 from polarguide.recipes import ABLATIONS, RECIPES
 
@@ -84,6 +86,27 @@ def anchors(text):
 @pytest.mark.parametrize("code", list(python_blocks()))
 def test_python_compiles(code):
     ast.parse(code)
+
+
+def called(node):
+    """The public function or method that a call in an example reaches: ``pg.NAME(...)`` or ``run.NAME(...)``."""
+    place = node.func
+    if isinstance(place, ast.Attribute) and isinstance(place.value, ast.Name):
+        return {"pg": polarguide, "run": polarguide.Run}.get(place.value.id), place.attr
+    return None, ""
+
+
+def test_calls_in_examples_fit():
+    fitted = 0
+    for code in python_blocks():
+        for node in ast.walk(ast.parse(code.values[0])):
+            owner, name = called(node) if isinstance(node, ast.Call) else (None, "")
+            if owner is not None:
+                itself = [None] if owner is polarguide.Run else []
+                given = {keyword.arg: None for keyword in node.keywords}
+                inspect.signature(getattr(owner, name)).bind(*itself, *node.args, **given)
+                fitted += 1
+    assert fitted > 20
 
 
 def test_every_metric_is_defined():

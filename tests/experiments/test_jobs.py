@@ -13,11 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from polarguide.cli.compare import signals_as_interrupts
-from polarguide.cli.job_progress import JobReporter
 from polarguide.experiments.jobs import Job, last_line, run_jobs
 from polarguide.experiments.worker import Scoring
 from polarguide.progress import Advance, Reporter
+from polarguide.system import signals_as_interrupts
 
 # Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
 PROGRAM = """
@@ -186,14 +185,3 @@ def test_the_last_line_of_a_log(tmp_path: Path) -> None:
     assert last_line(log) == {"step": 19}
     log.write_text("nonsense\n")
     assert last_line(log) is None
-
-
-def test_the_display_shows_markup_in_names_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    reporter = JobReporter()
-    with reporter.track("all", 2) as everything, reporter.track("[red]cup[/]", 1) as one:
-        one(1, note="[bold]scoring[/]")
-        everything(1)
-        reporter.say("failed  [red]cup[/]: no [bold]space[/] left")
-    with reporter.track("again"):
-        pass
-    assert "failed  [red]cup[/]: no [bold]space[/] left" in capsys.readouterr().out

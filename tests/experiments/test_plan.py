@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from polarguide.cli.app import run
 from polarguide.errors import PolarguideError
+from polarguide.evaluation.evaluate import evaluate
 from polarguide.evaluation.sources import scoring_digest
 from polarguide.experiments import plan as plans
 from polarguide.experiments.ablate import ablated
@@ -20,6 +20,7 @@ from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan
 from polarguide.options import SceneOptions
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
 from polarguide.runs.folder import recipe_data
+from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
 
 SETTINGS = TrainSettings(40, 0)
@@ -111,7 +112,7 @@ def planned(trained: Path, demo_scene: Path, tmp_path: Path) -> PlannedRun:
 def test_how_far_a_run_is(planned: PlannedRun, tmp_path: Path) -> None:
     metrics, other = planned.folder / "metrics.json", dataclasses.replace(planned, folder=Path("none"))
     assert (planned.state(), other.state()) == ("trained", "new")
-    assert run(["eval", str(planned.folder), "--no-speed", "--threads", "1"]) == 0
+    evaluate(OpenedRun.open(planned.folder))
     assert planned.state() == "done"
     record = json.loads(metrics.read_text())
     assert (record["fps"], record["fps_layers"]) == (None, None)
@@ -147,36 +148,3 @@ def test_ablations_by_name() -> None:
         PolarguideError, match=r"base: expected a recipe with ablations: .*polarguide.*, found 3dgs"
     ):
         ablated("3dgs")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--recipes", "magic"], "recipe: expected one of"),
-        (["--recipes", "3dgs", "3dgs"], "recipes: expected every name once"),
-        (["--recipes", "3dgs", "--steps", "0"], "--steps: expected 1 or more"),
-        (["--recipes", "3dgs", "--seeds", "0"], "seeds: expected 1 or more"),
-        (["--recipes", "3dgs", "--threads", "0"], "threads: expected 1 or more"),
-        (["--recipes", "3dgs", "--jobs", "-1"], "jobs: expected"),
-        (["--recipes", "3dgs", "--report-views", "-1"], "report_views: expected"),
-        (["--recipes", "3dgs", "--refractive-index", "5"], "--refractive-index"),
-        (["--recipes", "3dgs", "--device", "cuda"], "--device cuda"),
-        (["--recipes", "3dgs", "--downscale", "0"], "downscale: expected"),
-    ],
-)
-def test_refusals(
-    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
-) -> None:
-    assert run(["compare", str(demo_scene), *arguments, "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert len(error.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_two_scenes_of_one_name_are_refused(
-    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["compare", str(demo_scene), str(demo_scene), "--recipes", "3dgs", "--downscale", "8"]
-    assert run([*command, "--out", str(tmp_path / "out")]) == 2
-    assert "expected scenes with names of their own, found demo twice" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from polarguide.cli.app import run
+from polarguide.evaluation.evaluate import evaluate
 from polarguide.experiments import compare as comparing
 from polarguide.experiments.collect import BESIDE_OTHERS, collect
 from polarguide.experiments.jobs import Job
@@ -19,6 +19,7 @@ from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan
 from polarguide.experiments.worker import Scoring, Training
 from polarguide.progress import Reporter
 from polarguide.recipes import recipe_named
+from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
 
 Planned = tuple[Comparison, list[SceneEntry], PlannedRun]
@@ -41,7 +42,7 @@ def planned(demo_scene: Path, tmp_path: Path) -> Planned:
 
 def score(folder: Path, **changes: Any) -> None:
     """Score a run and change its record."""
-    assert run(["eval", str(folder), "--no-speed", "--threads", "1"]) == 0
+    evaluate(OpenedRun.open(folder))
     path = folder / "metrics.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 

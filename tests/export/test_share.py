@@ -155,17 +155,17 @@ def test_records_are_close_to_what_they_stand_for(recipe: str) -> None:
     page = shading.page(state.gaussians, state.light)
     assert page is not None
     assert page.kind == KINDS[recipe]
-    data = records(state.gaussians, page.values).data
+    data = records(state.gaussians, page.values)
     seen = torch.sigmoid(state.gaussians["opacity_logits"].detach()) >= 1 / 255
     assert len(data) == int(seen.sum())
-    means = data[:, :12].copy().view("<f4")
+    means = data["mean"]
     kept = state.gaussians["means"].detach()[seen].numpy()
     order = [int(np.flatnonzero((kept == mean).all(axis=1))[0]) for mean in means]
     assert sorted(order) == list(range(len(kept))), "every visible Gaussian once"
-    opacity = data[:, 12:14].copy().view("<u2")[:, 0] / 65535
+    opacity = data["opacity"] / 65535
     expected = torch.sigmoid(state.gaussians["opacity_logits"].detach())[seen].numpy()[order]
     np.testing.assert_allclose(opacity, expected, atol=1e-5)
-    scales = data[:, 24:30].copy().view("<f2").astype(np.float32)
+    scales = data["scales"].astype(np.float32)
     np.testing.assert_allclose(
         np.exp(scales), state.gaussians["log_scales"].detach()[seen].exp().numpy()[order], rtol=2e-3
     )

@@ -165,5 +165,5 @@ def test_rows_stay_leaves_that_train_after_every_edit() -> None:
 
 def test_tensors_of_different_length_are_refused() -> None:
     uneven = {**tensors(), "side": torch.zeros(COUNT - 1, 2)}
-    with pytest.raises(PolarguideError, match="one row count"):
+    with pytest.raises(PolarguideError, match="as many in every tensor"):
         Gaussians(uneven, RATES)

@@ -10,7 +10,15 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.recipes import RECIPES
-from polarguide.shading.model import GBuffer, Parameter, Parameters, ShadingModel, base_colors, mirrored
+from polarguide.shading.model import (
+    GBuffer,
+    Light,
+    Parameter,
+    Parameters,
+    ShadingModel,
+    base_colors,
+    mirrored,
+)
 from polarguide.training.recipe import Stage, Weights
 from polarguide.vectors import unit
 
@@ -45,27 +53,23 @@ class SkyShading(ShadingModel):
     def layers(self) -> tuple[str, ...]:
         return ("final", "base", "specular", "diffuse", "strength", "normal", "depth", "alpha")
 
-    def sky(self, light: Mapping[str, Tensor], directions: Tensor) -> Tensor:
+    def sky(self, light: Light, directions: Tensor) -> Tensor:
         """Radiance [..., 3] from directions [..., 3]."""
         above = 0.5 - 0.5 * directions[..., 1:2]
         return torch.exp(torch.lerp(light["sky"][0], light["sky"][1], above))
 
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
-    ) -> list[Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
         gloss = torch.sigmoid(gaussians["gloss_logits"])[:, None]
-        return [base_colors(gaussians, center, sh_degree), gloss, gloss * gaussians["tint"]]
+        return [base_colors(gaussians, center, degree), gloss, gloss * gaussians["tint"]]
 
-    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         base, normal = splatted.color, splatted.normal
         rays = camera.world_rays(dtype=base.dtype, device=base.device)
         specular = splatted.further[..., 1:4] * self.sky(light, mirrored(rays, unit(normal, 1e-3)))
         strength = splatted.further[..., 0]
         return {"final": base + specular, "specular": specular, "diffuse": base, "strength": strength}
 
-    def colors(
-        self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
-    ) -> Tensor:
+    def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         gloss = torch.sigmoid(gaussians["gloss_logits"])[:, None] * gaussians["tint"]
         return self.diffuse_colors(gaussians, rays) + gloss * self.sky(light, mirrored(rays, normals))
 

@@ -190,10 +190,10 @@ COLMAP: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "an infinite place": ("images.bin", patched(44, "<d", float("inf")), "finite pose"),
     "a zero quaternion": ("images.bin", patched(12, "<d", 0.0), "finite pose"),
     "a negative focal length": ("cameras.bin", patched(32, "<dd", -80, -80), "positive focal"),
-    "no cameras": ("cameras.bin", lambda path: path.unlink(), "expected a COLMAP model .*none there"),
+    "no cameras": ("cameras.bin", lambda path: path.unlink(), "expected a COLMAP model .*neither there"),
     "no images": ("images.bin", lambda path: path.unlink(), "images.bin: expected this file of the COLMAP model"),
     "more than there should be": (
-        "cameras.bin", lambda path: path.write_bytes(path.read_bytes() + b"x"), "bytes where its counts ask for"
+        "cameras.bin", lambda path: path.write_bytes(path.read_bytes() + b"x"), "bytes where its counts require"
     ),
 }  # fmt: skip
 
@@ -212,7 +212,7 @@ TEXT: dict[str, tuple[str, str, str]] = {
     "two of a name": (
         "images.txt", "1 1 0 0 0 0 0 2 1 a/v000.png\n\n2 1 0 0 0 0 0 2 1 b/v000.jpg\n\n", "one image called v000"
     ),
-    "strangers": ("images.txt", "1 1 0 0 0 0 0 2 1 other.png\n\n", "expected images called like the views"),
+    "strangers": ("images.txt", "1 1 0 0 0 0 0 2 1 other.png\n\n", "expected images named like the views"),
     "a nan pose": ("images.txt", "1 nan 0 0 0 0 0 2 1 v000.png\n\n", "finite pose|refuses"),
     "an infinite place": ("images.txt", "1 1 0 0 0 inf 0 2 1 v000.png\n\n", "finite pose|refuses"),
 }  # fmt: skip

@@ -239,7 +239,7 @@ def test_polanalyser_agrees_on_pisr(tmp_path: Path) -> None:
 
 def test_colmap_poses_and_sfm_may_be_asked_for_instead(tmp_path: Path) -> None:
     write_nersp(tmp_path / "in")
-    with pytest.raises(PolarguideError, match="none there nor in sparse"):
+    with pytest.raises(PolarguideError, match="neither there nor in sparse"):
         prepare_scene(tmp_path / "in", tmp_path / "out", PrepareSettings(poses=str(tmp_path)))
     with pytest.raises(PolarguideError, match=r"views registered|COLMAP"):
         prepare_scene(tmp_path / "in", tmp_path / "out", PrepareSettings(poses="sfm"))

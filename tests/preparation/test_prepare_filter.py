@@ -13,8 +13,8 @@ import pytest
 from camera_files import ANGLES, behind, busy_light, read_invalid, read_polar, smooth_light, write_shots
 from tiny_capture import encode_srgb, write_picture
 
-from polarguide.capture.filter import find_shifts, orientation
-from polarguide.capture.filter.exif import turned
+from polarguide.capture.filter import estimate_shifts, orientation
+from polarguide.capture.filter.exif import apply_orientation
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 
@@ -64,7 +64,7 @@ def test_unpolarized_light_leaves_the_transfer_undecided(tmp_path: Path, suffix:
     prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, transfer="auto"))
     found = summary(tmp_path / "out")
     assert found["transfer"] == transfer
-    assert any("does not decide" in note for note in found["notes"])
+    assert any("do not decide" in note for note in found["notes"])
 
 
 def with_orientation(path: Path, code: int) -> None:
@@ -81,7 +81,7 @@ def test_exif_turns_pixels_and_angles(tmp_path: Path, code: int) -> None:
     stored = smooth_light(96, 128)
     # Light as displayed: pixels turn, and with them the frame that S1 and S2 refer to.
     quarter, mirrored = code in (5, 6, 7, 8), code in (2, 4, 5, 7)
-    upright = np.stack([turned(plane, code) for plane in stored])
+    upright = np.stack([apply_orientation(plane, code) for plane in stored])
     upright[1:] *= -1.0 if quarter else 1.0
     upright[2] *= -1.0 if mirrored else 1.0
     write_shots(tmp_path / "in", "v", behind(stored), suffix=".jpg", bits=8)
@@ -106,7 +106,7 @@ def test_small_shifts_are_found_corrected_and_reported(tmp_path: Path) -> None:
     light = behind(busy_light(96, 128, 3) * np.array([1, 0.25, 0.25])[:, None, None, None])
     shifts = [(0.0, 0.0), (1.6, -0.7), (-0.4, 2.3), (0.0, 0.0)]
     shaken = np.stack([moved(shot, *shift) for shot, shift in zip(light, shifts, strict=True)])
-    found = find_shifts(shaken.astype(np.float32))
+    found = estimate_shifts(shaken.astype(np.float32))
     np.testing.assert_allclose([(s.x, s.y) for s in found], shifts, atol=0.2)
     write_shots(tmp_path / "in", "v", shaken)
     prepare_scene(tmp_path / "in", tmp_path / "on", replace(PLAIN, align=True))

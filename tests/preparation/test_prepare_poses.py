@@ -190,7 +190,7 @@ def test_masks_have_to_fit(tmp_path: Path) -> None:
     write_shots(tmp_path / "in", "v0", behind(smooth_light()))
     settings = replace(FILTER, masks=str(tmp_path / "masks"), poses="none")
     write_picture(tmp_path / "masks" / "other.png", np.ones((4, 4)), bits=8)
-    with pytest.raises(PolarguideError, match="expected masks called like the views"):
+    with pytest.raises(PolarguideError, match="expected masks named like the views"):
         prepare_scene(tmp_path / "in", tmp_path / "out", settings)
     write_picture(tmp_path / "masks" / "v0.png", np.ones((4, 4)), bits=8)
     with pytest.raises(PolarguideError, match=r"v0\.png: expected the size of the picture"):

@@ -166,7 +166,7 @@ def test_filter_shots(tmp_path: Path, case: str) -> None:
 @pytest.mark.parametrize(
     ("camera", "line", "message"),
     [
-        ("PINHOLE 64 48 80 82 32 24", None, "images called like the views"),
+        ("PINHOLE 64 48 80 82 32 24", None, "images named like the views"),
         (
             "PINHOLE 64 40 80 82 32 24",
             "1 1 0 0 0 0 0 2 1 v000.png",

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from plugins import install
-from polarguide.export.environment import needs_radiance
 from torch import Tensor
 
 from polarguide.capture import Scene
@@ -23,6 +22,7 @@ from polarguide.export.share import BAKED, share_page
 from polarguide.gaussians.ply import read_ply
 from polarguide.raster import choose_backend
 from polarguide.recipes import ablations_of, recipe_named
+from polarguide.rendering.relight import needs_radiance
 from polarguide.runs.folder import load_checkpoint, recipe_data, save_checkpoint
 from polarguide.runs.point_cloud import write_run_ply
 from polarguide.scene_frame import scene_frame

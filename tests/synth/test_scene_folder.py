@@ -62,7 +62,7 @@ def test_the_folder_is_read_like_a_capture(scene: Path) -> None:
     assert [view.name for view in found.views] == ["v000", "v001", "v002", "v003"]
     assert found.test_names == ("v000",)
     assert found.refractive_index == 1.5
-    assert not [text for text in found.warnings if "belong to no view" in text]
+    assert not [text for text in found.warnings if "without a view" in text]
     assert len(found.points) > 20
     (view,) = found.test_views
     ground_truth = view.ground_truth

@@ -1,4 +1,4 @@
-"""Capture: files -> Scene. Views with four polarizer angles, COLMAP models, ground truth."""
+"""Read a scene folder: views with four polarizer angles, a COLMAP model, ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Averages over K x K pixel boxes; rows and columns that do not fill a box are cut."""
+"""Downscaling with a box filter of K x K pixels; incomplete boxes at the right and bottom are dropped."""
 
 from __future__ import annotations
 

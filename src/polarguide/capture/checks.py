@@ -1,7 +1,7 @@
-"""What the pictures themselves say about the capture: full scale, exposure, encoding, order of the files.
+"""Check a capture by its pictures: full scale, exposure, encoding, order of the files.
 
-Each view is measured once, while its pictures are in memory (``measure``); the findings of all views become a
-few sentences (``exposure_warnings``, ``polarization_warnings``).
+Each view is measured once, while its pictures are in memory (``measure``); ``exposure_warnings`` and
+``polarization_warnings`` turn the measurements of all views into warnings.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polarguide.capture.view import FULL_CODE, listed
 
 TOP_SHARE = 0.02
-"""Share of the code range, counted from its top, whose histogram ``full_scale`` looks at."""
+"""Share of the code range, from its top, in the histogram for ``full_scale``."""
 _FULL_SHARE = 0.002
 _DARK = 0.01
 _BLOWN_SHARE = 0.1
@@ -32,13 +32,13 @@ _DECODED_CURVATURE = 0.2
 
 @dataclass(frozen=True)
 class Measures:
-    """What is measured on one view.
+    """Measurements of one view.
 
     Attributes:
         bright: 99th percentile of the linear intensities, in [0, 1].
         residuals: median of |difference of the two pair sums| / S0 for the three ways to pair the pictures:
             (0, 90 | 45, 135), (0, 45 | 90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
-        sums: for the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
+        sums: of the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
             ((I45 - I135) / S0)^2: number of pixels, sums of q, r, q q, q r. Linear data have slope 0 whatever
             the gains of the four pictures; a concave encoding bends it down, a convex one up.
     """
@@ -105,7 +105,7 @@ def full_scale(histogram: NDArray[np.int64], full: int) -> int | None:
 def exposure_warnings(
     names: Sequence[str], measures: Sequence[Measures], blown: Sequence[float], largest: int, full: int
 ) -> list[str]:
-    """Sentences about dark and saturated pictures.
+    """Warnings about dark and saturated pictures.
 
     Args:
         names: view names.
@@ -118,8 +118,8 @@ def exposure_warnings(
     if full == FULL_CODE and 0 < largest < 4096:
         bits = 10 if largest < 1024 else 12
         return [
-            f"The pictures are 16-bit files, yet no value exceeds {largest}: they look like {bits}-bit data "
-            f"that were not scaled. Multiply the values by {2 ** (16 - bits)}."
+            f"The pictures are 16-bit files, yet no value exceeds {largest}: they look like unscaled {bits}-bit "
+            f"data. Multiply the values by {2 ** (16 - bits)}."
         ]
     dark = [name for name, found in zip(names, measures, strict=True) if found.bright < _DARK]
     if dark:
@@ -137,7 +137,7 @@ def exposure_warnings(
 
 
 def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], transfer: str) -> list[str]:
-    """Sentences about the order of the files and their encoding."""
+    """Warnings about the order of the files and their encoding."""
     off = {name: m.residuals for name, m in zip(names, measures, strict=True) if _is_off(m.residuals)}
     warnings = []
     swapped = False
@@ -154,7 +154,7 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
             f"{len(names)} views ({listed(list(off))}); a sound capture stays under {_RESIDUAL:.0%}. {hint}."
         )
     slope = curvature(measures)
-    if swapped or slope is None:  # with the wrong pairs the slope means nothing
+    if swapped or slope is None:  # the slope is meaningless with wrong pairs
         return warnings
     if transfer == "linear" and slope < _ENCODED_CURVATURE:
         warnings.append(
@@ -170,7 +170,7 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
 
 
 def curvature(measures: Sequence[Measures]) -> float | None:
-    """Slope of the regression described in ``Measures``, over all views; None if too little is polarized."""
+    """Slope of the regression described in ``Measures``, over all views; None if too few pixels are polarized."""
     count, q, r, qq, qr = np.sum([found.sums for found in measures], axis=0)
     if count < 1000:
         return None
@@ -181,6 +181,6 @@ def curvature(measures: Sequence[Measures]) -> float | None:
 
 
 def _is_off(residuals: tuple[float, float, float]) -> bool:
-    """Far from zero, or clearly beaten by another pairing."""
+    """Whether the residual of the named pairing is large, or much larger than that of another pairing."""
     right, *others = residuals
     return right > _RESIDUAL or (right > 0.4 * _RESIDUAL and min(others) < 0.25 * right)

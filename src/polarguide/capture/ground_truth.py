@@ -1,4 +1,4 @@
-"""Ground-truth files ``gt/<view>.npz`` -> GroundTruth."""
+"""Read ground-truth files, ``gt/<view>.npz``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
     """Read one ground-truth file.
 
     Args:
-        path: where ``data`` came from, for messages.
+        path: of the file, for messages.
         data: the whole file, NumPy's .npz with any of the arrays ``normal``, ``depth``, ``mask``,
             ``specular`` and ``diffuse``; others are ignored.
         size: height and width of the pictures as stored.
@@ -57,7 +57,7 @@ def _read_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
         raise PolarguideError(
             path,
             expected="a NumPy .npz file with normal, depth, mask, specular or diffuse",
-            found="one that is damaged, cut short or of another kind",
+            found="a damaged, truncated or other file",
             remedy="Write it again with numpy.savez_compressed, or remove it.",
         ) from error
 
@@ -77,5 +77,5 @@ def _check(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) ->
             f"{path} ({name})",
             expected="finite numbers",
             found=f"{broken} of {array.size} values that are NaN or infinite",
-            remedy="Write zeros where nothing is known and leave those pixels out of the mask.",
+            remedy="Write zeros where the value is unknown and exclude those pixels from the mask.",
         )

@@ -1,4 +1,4 @@
-"""Where the files of a capture lie: our own folder layout, and one folder per polarizer angle."""
+"""Find the files of a capture, in our own layout or in one folder per polarizer angle."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Layout:
 
     Attributes:
         root: the folder.
-        pictures: view name -> angle in degrees -> file. Angles may be missing; ``require_complete`` checks.
-        masks, invalid, truth: view name -> file, for the views that have one.
-        warnings: files that were passed over.
+        pictures: view name -> angle in degrees -> file. Angles may be missing; ``select_views`` checks.
+        masks, invalid, ground_truth: view name -> file, for the views that have one.
+        warnings: about files that are not used.
     """
 
     root: Path
@@ -44,10 +44,10 @@ class Layout:
 
 
 def find_layout(root: Path) -> Layout:
-    """Look for the files of a capture.
+    """Find the files of a capture.
 
     Raises:
-        PolarguideError: there is no such folder, it has neither layout, or two files claim one place.
+        PolarguideError: there is no such folder, it has neither layout, or two files have the same view and angle.
     """
     if not root.is_dir():
         raise PolarguideError(
@@ -63,7 +63,7 @@ def find_layout(root: Path) -> Layout:
     elif folders:
         pictures = pictures_of_folders(root, folders)
     else:
-        raise PolarguideError(root, expected="a capture folder", found=contents(root), remedy=_HINT)
+        raise PolarguideError(root, expected="a capture folder", found=describe_contents(root), remedy=_HINT)
     if not pictures:
         raise PolarguideError(root, expected="pictures of at least one view", found="none", remedy=_HINT)
     sides: dict[str, dict[str, Path]] = {}
@@ -72,8 +72,8 @@ def find_layout(root: Path) -> Layout:
         strangers = sorted(path.name for stem, path in files.items() if stem not in pictures)
         if strangers:
             warnings.append(
-                f"{folder}/ has files that belong to no view and are not used ({listed(strangers)}): "
-                "name a file there like its view."
+                f"{folder}/ has files without a view, which are not used ({listed(strangers)}): "
+                "name each file like its view."
             )
         sides[folder] = files
     without = sorted(pictures.keys() - sides["masks"].keys())
@@ -125,7 +125,7 @@ def _require_complete(layout: Layout, names: list[str]) -> None:
 
 
 def _sibling(layout: Layout, have: dict[int, Path], angle: int) -> Path:
-    """Where the picture at ``angle`` would lie, judged by another angle of the view."""
+    """The expected path of the picture at ``angle``, given another angle of the view."""
     path = next(iter(have.values()))
     if path.parent == layout.root / "polar":
         return path.with_name(f"{path.stem[:-3]}{angle:03d}{path.suffix}")
@@ -145,8 +145,8 @@ def _read_flat(folder: Path, warnings: list[str]) -> dict[str, dict[int, Path]]:
             pictures.setdefault(match["view"], {})[int(match["angle"])] = path
     if strangers:
         warnings.append(
-            f"polar/ has pictures whose names do not end in _000, _045, _090 or _135 and "
-            f"that are not used ({listed(strangers)})."
+            f"polar/ has pictures whose names do not end in _000, _045, _090 or _135, which "
+            f"are not used ({listed(strangers)})."
         )
     return pictures
 
@@ -206,12 +206,13 @@ def index_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
                 folder,
                 expected=f"one file called {path.stem}",
                 found=f"{files[path.stem].name} and {path.name}",
-                remedy="Remove the one that is not meant.",
+                remedy="Remove one of them.",
             )
         files[path.stem] = path
     return files
 
 
-def contents(root: Path) -> str:
+def describe_contents(root: Path) -> str:
+    """What a folder holds, for messages."""
     names = sorted(path.name for path in root.iterdir())
-    return f"one that holds {listed(names)}" if names else "an empty folder"
+    return f"a folder with {listed(names)}" if names else "an empty folder"

@@ -56,8 +56,8 @@ def load_scene(
 
     Two layouts are read: ``polar/<view>_000|_045|_090|_135.<suffix>``, and one folder per angle (``I-00``,
     ``I-45``, ``I-90``, ``I-135``; also ``0``, ``045``, ``I_90``, ...) with equally named pictures. Pictures
-    are PNG, TIFF or JPEG with 8 or 16 bits, undistorted. Beside them lie a COLMAP model in ``sparse/0`` or
-    ``sparse`` (the image's name without suffix is the view) and, if wanted, ``masks/<view>.png``,
+    are PNG, TIFF or JPEG with 8 or 16 bits, undistorted. Required is a COLMAP model in ``sparse/0`` or
+    ``sparse`` (the image's name without suffix is the view); optional are ``masks/<view>.png``,
     ``invalid/<view>.png``, ``gt/<view>.npz``, ``split.json`` and ``scene.json``.
 
     Args:
@@ -69,10 +69,10 @@ def load_scene(
         reporter: receives the progress.
 
     Returns:
-        The scene; ``Scene.warnings`` says what looks wrong without preventing its use.
+        The scene; ``Scene.warnings`` lists possible faults that do not prevent its use.
 
     Raises:
-        PolarguideError: something in the capture cannot be used; the message names the file and the remedy.
+        PolarguideError: a file of the capture cannot be used; the message names it and the remedy.
     """
     root = Path(path)
     _check_downscale(downscale)
@@ -86,7 +86,7 @@ def load_scene(
     tests = held_out(root / "split.json", files.read_if_there(root / "split.json"), layout.names)
     index = refractive_index_of(root / "scene.json", files.read_if_there(root / "scene.json"))
     for name in names:
-        model.camera(name)  # a missing pose is to be found before the pictures are read
+        model.camera(name)  # find missing poses before the pictures are read
 
     stored = read_views(layout, names, model, downscale=downscale, transfer=transfer, reporter=reporter)
     for item in stored.data:

@@ -1,4 +1,4 @@
-"""The records a capture becomes: a view with its four polarizer angles, and the scene of all views."""
+"""The data types of a capture: a view with four polarizer angles, and the scene of all views."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FULL_CODE = 65535
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """What is known exactly about a view, where the capture brings it. Any field may be None.
+    """Ground truth of a view. Any field may be None.
 
     Attributes:
         normal: unit surface normals in the world, zero where there is no surface, [H, W, 3] float32.
@@ -38,7 +38,7 @@ class GroundTruth:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One position of the camera: four pictures behind a polarizer, and what is known about their pixels.
+    """One camera pose with four pictures behind a polarizer, and masks of their pixels.
 
     Attributes:
         name: name of the view, unique in its scene.
@@ -46,12 +46,12 @@ class View:
         codes: linear intensities behind the analyzer at 0, 45, 90 and 135 degrees, coded as
             round(65535 * intensity), [4, H, W, 3] uint16, RGB. Kept coded because big captures do not fit
             into memory as floats.
-        invalid: pixels the capture itself declares unusable (``invalid/<view>.png``), [H, W] bool; all False
-            where it declares nothing. Metrics leave out these pixels and no others.
-        saturated: pixels found to carry no polarization information: one angle at full scale in any channel,
-            or all four black; [H, W] bool. For priors and losses.
+        invalid: pixels that the capture marks as unusable (``invalid/<view>.png``), [H, W] bool. Metrics exclude these
+            pixels and no others.
+        saturated: pixels without polarization information: one angle at full scale in any channel, or all four
+            black; [H, W] bool. Priors and losses exclude them.
         mask: the user's foreground mask (``masks/<view>.png``), [H, W] bool, or None.
-        truth: ground truth, or None.
+        ground_truth: or None.
     """
 
     name: str
@@ -63,7 +63,7 @@ class View:
     ground_truth: GroundTruth | None = None
 
     def to(self, device: torch.device) -> View:
-        """The view with its pictures and masks on a device; itself where it is there already. Truth stays behind."""
+        """The view on a device, without its ground truth; the view itself if it is already there."""
         if self.codes.device == device:
             return self
         codes, invalid, saturated = (t.to(device) for t in (self.codes, self.invalid, self.saturated))
@@ -81,7 +81,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A capture as read: posed views, sparse points, and where it came from.
+    """A capture: posed views, sparse points and their origin.
 
     Attributes:
         root: the folder that was read.
@@ -92,9 +92,9 @@ class Scene:
         point_colors: their colors as the COLMAP model gives them (display-encoded), [M, 3] uint8.
         refractive_index: the one index that ``scene.json`` gives, or None if it gives none or several.
         downscale: side of the pixel boxes that were averaged; 1 is full size.
-        transfer: "linear" or "srgb": how the files were taken to be encoded. The views are always linear.
+        transfer: the assumed encoding of the files, "linear" or "srgb". The views are always linear.
         digest: SHA-256 over the names and contents of all files that were read, as hexadecimal digits.
-        warnings: what looks wrong without preventing the use of the scene, one plain sentence or two each.
+        warnings: about possible faults that do not prevent the use of the scene.
     """
 
     root: Path
@@ -111,7 +111,7 @@ class Scene:
 
     @property
     def train_views(self) -> tuple[View, ...]:
-        """The views to learn from, sorted by name."""
+        """The training views, sorted by name."""
         return tuple(view for view in self.views if view.name not in self.test_names)
 
     @property
@@ -143,6 +143,6 @@ def unknown_view(where: object, name: str, names: list[str]) -> PolarguideError:
 
 
 def listed(names: list[str], limit: int = 4) -> str:
-    """The first few names, and how many more there are: for messages."""
+    """The first few names and the number of further ones, for messages."""
     rest = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,4 +1,4 @@
-"""The files of one view -> its pixels, before the full scale of the whole capture is known."""
+"""Read the files of one view."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from polarguide.errors import PolarguideError
 
 
 class Files:
-    """Reads files and keeps the SHA-256 of each: the provenance of what is made from them."""
+    """Reads files and records the SHA-256 of each."""
 
     def __init__(self) -> None:
         self.digests: dict[Path, str] = {}
@@ -41,15 +41,15 @@ class Files:
 
 @dataclass(frozen=True, eq=False)
 class ViewData:
-    """One view as read.
+    """The pixels of one view, before the full scale of the whole capture is known.
 
     Attributes:
-        name, codes, invalid, mask, truth: as in ``View``, arrays instead of tensors.
+        name, codes, invalid, mask, ground_truth: as in ``View``, with arrays instead of tensors.
         size: width and height of the pictures as stored.
         peak: largest stored value over angles, channels and the pixels of a box, [H, W].
         black: whether some pixel of the box is 0 in all angles and channels, [H, W].
         histogram: ``checks.top_histogram`` of the stored values.
-        digests: SHA-256 of every file that was read.
+        digests: SHA-256 of every file read.
     """
 
     name: str
@@ -68,7 +68,7 @@ class ViewData:
         return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
 
     def view(self, camera: Camera, scale: int | None) -> View:
-        """The finished view."""
+        """The view with its camera and its saturated pixels."""
         return View(
             name=self.name,
             camera=camera,
@@ -136,7 +136,7 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
     """Check that a picture has the size and depth of the first one of its view.
 
     Raises:
-        PolarguideError: it has not.
+        PolarguideError: size or depth differs.
     """
     if (picture.shape, picture.dtype) != (first.shape, first.dtype):
         raise PolarguideError(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import inspect
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, get_type_hints
 
 import tyro
 from rich.console import Console
@@ -49,10 +48,10 @@ def function_of(verb: str) -> Callable[..., Any]:
 def options_of(function: Callable[..., Any]) -> list[str]:
     """Names of all parameters, those in dataclasses included."""
     names = []
-    for parameter in inspect.signature(function).parameters.values():
-        shared = parameter.default
-        known = dataclasses.is_dataclass(shared)
-        names += [field.name for field in dataclasses.fields(shared)] if known else [parameter.name]
+    for name, kind in get_type_hints(function).items():
+        names += (
+            [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else [name]
+        )
     return names
 
 

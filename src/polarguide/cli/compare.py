@@ -19,12 +19,15 @@ if TYPE_CHECKING:
     from polarguide.experiments.results import Results
 
 
-def compared_settings(steps: int = 5000, refractive_index: float = 1.5) -> TrainSettings:
-    """Those settings of a training that a comparison has one value of; their texts are those of ``train``."""
-    return TrainSettings(steps=steps, seed=0, refractive_index=refractive_index)
+def compared_settings(
+    steps: int = TrainSettings.steps, refractive_index: float = TrainSettings.refractive_index
+) -> TrainSettings:
+    return TrainSettings(steps=steps, refractive_index=refractive_index)
 
 
-compared_settings.__doc__ = TrainSettings.__doc__
+compared_settings.__doc__ = (
+    TrainSettings.__doc__
+)  # of these options; the seeds are counted, the others are fixed
 Scenes = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE ...")]
 Settings = Annotated[TrainSettings, tyro.conf.arg(name="", constructor=compared_settings)]
 Options = Annotated[CompareOptions, tyro.conf.arg(name="")]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
 TRAINED_BY = ("training/trainer.py", "capture/reader.py", "raster/backends.py", "recipes/__init__.py")
-"""What trains, and where its scene, backend and shading come from: with all that they import, they decide the result."""
+"""What trains, and what makes its scene, backend and shading: with all that they import, they decide the result."""
 SCORED_BY = ("evaluation/evaluate.py",)
 """What decides, beside that, the numbers of a finished training."""
 DATA = "recipes"

@@ -22,7 +22,7 @@ def ablate(
     *,
     only: Sequence[str] = (),
     reference: Sequence[str | Recipe] = (),
-    settings: TrainSettings = TrainSettings(5000, 0),
+    settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,
 ) -> Results:

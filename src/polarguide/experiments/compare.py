@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from polarguide.errors import PolarguideError
@@ -32,7 +33,7 @@ def compare(
     recipes: Sequence[str | Recipe],
     out: str | os.PathLike[str],
     *,
-    settings: TrainSettings = TrainSettings(5000, 0),
+    settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,
 ) -> Results:
@@ -59,7 +60,7 @@ def compare(
     comparison = Comparison(
         scenes=tuple(Path(scene) for scene in scenes),
         recipes=_checked_recipes(recipes),
-        settings=settings,
+        settings=replace(settings, views_per_step=settings.views_per_step or 1),  # a run is one process
         options=options,
         out=Path(out),
     )

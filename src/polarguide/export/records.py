@@ -19,10 +19,8 @@ these values its records have; they are as long as the last of them needs.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,91 +33,79 @@ from polarguide.raster.interface import MINIMUM_ALPHA
 from polarguide.shading.model import Parameters
 
 TEXEL = 16
-Bytes = NDArray[np.uint8]
-
-
-class Slot(NamedTuple):
-    """Where a value lies in a record: its first byte; for harmonics also that of their scale."""
-
-    at: int
-    form: str
-    scale_at: int = 0
-
-
+HARMONICS = ("harmonics", "own_harmonics")
 SLOTS = {
-    "share": Slot(14, "u16"),
-    "color": Slot(32, "f16"),
-    "harmonics": Slot(48, "steps", scale_at=30),
-    "features": Slot(48, "i16"),
-    "own_color": Slot(96, "f16"),
-    "own_harmonics": Slot(112, "steps", scale_at=102),
+    "mean": (0, "3<f4"),
+    "opacity": (12, "<u2"),
+    "share": (14, "<u2"),
+    "rotation": (16, "4<i2"),
+    "scales": (24, "3<f2"),
+    "harmonics_scale": (30, "<f2"),
+    "color": (32, "3<f2"),
+    "axis": (38, "3<i2"),
+    "side": (44, "<u2"),
+    "features": (48, "4<i2"),
+    "harmonics": (48, "45i1"),
+    "own_color": (96, "3<f2"),
+    "own_harmonics_scale": (102, "<f2"),
+    "own_harmonics": (112, "45i1"),
 }
-"""What a shading model can put into records, by name."""
-
-
-@dataclass(frozen=True, eq=False)
-class Records:
-    """Quantized Gaussians.
-
-    Attributes:
-        data: [N, 16 K] uint8, K texels each.
-    """
-
-    data: Bytes
-
-    @property
-    def texels(self) -> int:
-        """K."""
-        return self.data.shape[1] // TEXEL
-
-    def planes(self) -> bytes:
-        """The records byte by byte, first all first bytes: neighbors are alike, so that they compress well."""
-        return np.ascontiguousarray(self.data.T).tobytes()
+"""First byte and NumPy type of what a record can hold; a shading model gives ``share`` and what has a color."""
 
 
 @torch.no_grad()
-def records(gaussians: Parameters, values: Mapping[str, Tensor]) -> Records:
+def records(gaussians: Parameters, values: Mapping[str, Tensor]) -> NDArray[Any]:
     """Quantize Gaussians; those too faint to be drawn at all are left out.
 
     Args:
         gaussians: the Gaussians. values: of the shading model, [N, ...] by the names of ``SLOTS``.
 
     Returns:
-        In the order of a curve that fills space, so that neighbors in it are alike.
+        [K] records of whole texels, with named fields; in the order of a curve that fills space, so that neighbors
+        in it are alike.
     """
     opacity = torch.sigmoid(gaussians["opacity_logits"])
     kept = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]
     kept = kept[torch.from_numpy(curve_order(gaussians["means"][kept].numpy()))]
     axis, side = _axes(gaussians, kept)
-    parts = [
-        (0, gaussians["means"][kept].numpy().astype("<f4")),
-        (12, _fraction(opacity[kept], 65535, "<u2")),
-        (16, _fraction(normalize(gaussians["quaternions"][kept], dim=-1), 32767, "<i2")),
-        (24, gaussians["log_scales"][kept].numpy().astype("<f2")),
-        (38, _fraction(axis, 32767, "<i2")),
-        (44, side.numpy().astype("<u2")),
-    ]
-    for name, value in values.items():
-        slot, chosen = SLOTS[name], value[kept]
-        if slot.form == "steps":
-            steps, scale = harmonics_steps(chosen)
-            parts += [(slot.at, steps), (slot.scale_at, scale)]
-        elif slot.form == "f16":
-            parts.append((slot.at, chosen.clamp(-6e4, 6e4).numpy().astype("<f2")))
-        else:
-            full, kind = (65535, "<u2") if slot.form == "u16" else (32767, "<i2")
-            parts.append((slot.at, _fraction(chosen, full, kind)))
-    return _joined(parts, len(kept))
+    fields = {
+        "mean": gaussians["means"][kept],
+        "opacity": opacity[kept],
+        "rotation": normalize(gaussians["quaternions"][kept], dim=-1),
+        "scales": gaussians["log_scales"][kept],
+        "axis": axis,
+        **{name: value[kept] for name, value in values.items()},
+    }
+    harmonics = {name: harmonics_steps(fields.pop(name)) for name in HARMONICS if name in fields}
+    data = np.zeros(
+        len(kept), record_type([*fields, "side", *harmonics, *(f"{name}_scale" for name in harmonics)])
+    )
+    data["side"] = side.numpy()
+    for name, value in fields.items():
+        data[name] = _quantized(value, data.dtype[name].base)
+    for name, (steps, scale) in harmonics.items():
+        data[name], data[f"{name}_scale"] = steps, scale
+    return data
 
 
-def _joined(parts: list[tuple[int, NDArray[Any]]], count: int) -> Records:
-    """Records of arrays [N, ...] that begin at certain bytes."""
-    sizes = [values.dtype.itemsize * math.prod(values.shape[1:]) for _, values in parts]
-    texels = -(-max(at + size for (at, _), size in zip(parts, sizes, strict=True)) // TEXEL)
-    data = np.zeros((count, TEXEL * texels), dtype=np.uint8)
-    for (at, values), size in zip(parts, sizes, strict=True):
-        data[:, at : at + size] = np.ascontiguousarray(values).view(np.uint8).reshape(count, size)
-    return Records(data)
+def record_type(names: Sequence[str]) -> np.dtype[Any]:
+    """The type of a record with some of ``SLOTS``, as many texels long as these need."""
+    offsets, formats = zip(*(SLOTS[name] for name in names), strict=True)
+    end = max(at + np.dtype(form).itemsize for at, form in zip(offsets, formats, strict=True))
+    size = -(-end // TEXEL) * TEXEL
+    return np.dtype({"names": names, "offsets": offsets, "formats": formats, "itemsize": size})
+
+
+def _quantized(values: Tensor, kind: np.dtype[Any]) -> NDArray[Any]:
+    """Values in [0, 1] or [-1, 1] as whole numbers up to the type's largest; floats as they are, within its range."""
+    if kind.kind == "f":
+        return values.clamp(-6e4, 6e4).numpy() if kind.itemsize == 2 else values.numpy()
+    return np.rint(values.numpy().astype(np.float64) * np.iinfo(kind).max)
+
+
+def planes(data: NDArray[Any]) -> bytes:
+    """Records byte by byte, first all first bytes: neighbors are alike, so that they compress well."""
+    return np.ascontiguousarray(data.view(np.uint8).reshape(len(data), data.itemsize).T).tobytes()
 
 
 def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]]:
@@ -140,11 +126,6 @@ def _axes(gaussians: Parameters, kept: Tensor) -> tuple[Tensor, Tensor]:
         return axes, torch.zeros(len(kept))
     along = (axes * outward[kept]).sum(dim=1)
     return torch.where(along < 0, -1.0, 1.0)[:, None] * axes, (along != 0).float()
-
-
-def _fraction(values: Tensor, full: int, kind: str) -> NDArray[np.generic]:
-    """Values in [0, 1] or [-1, 1] as whole numbers up to ``full``."""
-    return np.rint(values.detach().numpy().astype(np.float64) * full).astype(kind)
 
 
 def curve_order(means: NDArray[np.float32]) -> NDArray[np.int64]:

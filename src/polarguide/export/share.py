@@ -15,17 +15,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from polarguide import __version__
 from polarguide.camera import Camera
 from polarguide.export.page_light import light_numbers, network_numbers, viridis
-from polarguide.export.records import records
+from polarguide.export.records import TEXEL, planes, records
 from polarguide.files import atomic
 from polarguide.gaussians.ply import refit_sh_to_display
 from polarguide.runs.point_cloud import gaussian_colors
 from polarguide.scene_frame import scene_frame
-from polarguide.shading.model import PLAIN_LAYERS, PageShading, Parameters, ShadingModel
+from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
 
 SCRIPTS = ("algebra.js", "sorter.js", "renderer.js", "navigation.js", "controls.js", "unpack.js", "main.js")
 SHADERS = {
@@ -47,7 +46,7 @@ BAKED = (
 
 def share_page(
     gaussians: Parameters,
-    light: Mapping[str, Tensor],
+    light: Light,
     shading: ShadingModel,
     cameras: Mapping[str, Camera],
     *,
@@ -75,8 +74,8 @@ def share_page(
     quantized = records(gaussians, page.values)
     scene: dict[str, Any] = {
         "kind": page.kind,
-        "texels": quantized.texels,
-        "count": len(quantized.data),
+        "texels": quantized.itemsize // TEXEL,
+        "count": len(quantized),
         "layers": [name for name in LAYERS if name in layers],
         "index": 1.5,
         "resolution": int(page.light[0].shape[1]) if page.light else 1,
@@ -105,12 +104,12 @@ def share_page(
         script=script,
         scene=_data(scene),
         shaders=_data({name: _page(file) for name, file in SHADERS.items()}),
-        records=_packed(quantized.planes()),
+        records=_packed(planes(quantized)),
         **{name: "" if values is None else _packed(values.tobytes()) for name, values in arrays.items()},
     )
 
 
-def baked_page(gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel) -> PageShading:
+def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> PageShading:
     """The page of a model for which there are no shaders: linear harmonics of its Gaussians' own colors, and a note."""
     count = len(gaussians["means"])
     dc, rest = refit_sh_to_display(

@@ -11,7 +11,7 @@ import numpy as np
 
 from polarguide import __version__
 from polarguide.capture.calibration import Calibration, oriented
-from polarguide.capture.layout import contents
+from polarguide.capture.layout import describe_contents
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, write_view
@@ -68,7 +68,7 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
         raise PolarguideError(
             out,
             expected="a new folder",
-            found="a file" if not out.is_dir() else contents(out),
+            found="a file" if not out.is_dir() else describe_contents(out),
             remedy="Give another --fix; nothing was written.",
         )
     partial = out.with_name(f".{out.name}.partial")

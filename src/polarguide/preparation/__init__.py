@@ -1,1 +1,1 @@
-"""Camera files -> a scene folder: what ``polarguide prepare`` does."""
+"""Prepare a scene folder from camera files (``polarguide prepare``)."""

@@ -1,4 +1,4 @@
-"""A folder of shots through a filter turned by hand or motor, four a view."""
+"""Picture source: four shots per view through a rotating polarizing filter."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from polarguide.capture.calibration import (
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.filter import (
     Shift,
-    aligned,
+    align_shots,
     decide_transfer,
-    decoded,
-    find_shifts,
+    estimate_shifts,
     find_shots,
     is_camera_raw,
+    linear_intensities,
     read_shots,
 )
-from polarguide.capture.filter.exif import turned, turned_angles
-from polarguide.capture.filter.shots import require_all
+from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
+from polarguide.capture.filter.shots import require_four_shots
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings, white_gains
-from polarguide.preparation.source import Developed
+from polarguide.preparation.source import DevelopedView
 from polarguide.progress import Advance
 
 _JUDGED_VIEWS = 8
@@ -48,7 +48,7 @@ class FilterSource:
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
         self._settings = settings
         shots = find_shots(root)
-        require_all(root, shots)
+        require_four_shots(root, shots)
         self._files = dict(sorted(shots.items()))
         self._raw = [path for path in self.paths if is_camera_raw(path)]
         white = white_gains(settings.white_balance)
@@ -57,7 +57,7 @@ class FilterSource:
                 "--white-balance",
                 expected="none for pictures; none or three gains for camera raw",
                 found=settings.white_balance,
-                remedy="Leave it out.",
+                remedy="Omit it.",
             )
         self._white = white
         if self._raw and settings.transfer == "srgb":
@@ -65,7 +65,7 @@ class FilterSource:
                 "--transfer",
                 expected="auto or linear for camera raw, which is developed without tone curve",
                 found="srgb",
-                remedy="Leave it out.",
+                remedy="Omit it.",
             )
 
     @property
@@ -104,15 +104,15 @@ class FilterSource:
             notes += [UNIDENTIFIED] if asked.gains == "auto" else []
         return {"transfer": transfer, "scale": scale / asked.calibration.peak, "notes": notes}
 
-    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
+    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the four shots: validity, transfer, shifts, gains, the sense of the angles, then the turn."""
         asked = self._settings
         shots = read_shots(self._files[view], self._white)
-        linear, bad = decoded(shots.pictures, measured["transfer"]), shots.clipped | shots.dark
+        linear, bad = linear_intensities(shots.pictures, measured["transfer"]), shots.clipped | shots.dark
         shifts, notes = [Shift(0.0, 0.0, True)] * 4, []
         if asked.align:
-            shifts = find_shifts(linear)
-            linear, bad = aligned(linear, bad, shifts)
+            shifts = estimate_shifts(linear)
+            linear, bad = align_shots(linear, bad, shifts)
             notes = _shift_notes(view, shifts)
         invalid = np.asarray(bad.any(axis=0))
         ratio = pair_ratio(linear.mean(axis=3), ~invalid)
@@ -122,18 +122,18 @@ class FilterSource:
             gains = found or UNIT_GAINS
             if found is None:
                 said = (
-                    "is too dark to tell"
+                    "is too dark to measure"
                     if ratio is None
                     else f"is off by {ratio - 1:+.1%}, too much for gains"
                 )
                 notes.append(f"{view}: (I0 + I90)/(I45 + I135) {said}; not corrected.")
         factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
         linear = oriented(linear * factors[:, None, None, None], asked.calibration)
-        upright = _upright(linear, shots.orientation)
+        upright = _apply_orientation(linear, shots.orientation)
         height, width = upright.shape[1:3]
-        return Developed(
+        return DevelopedView(
             intensities=upright,
-            invalid=np.ascontiguousarray(turned(invalid, shots.orientation)),
+            invalid=np.ascontiguousarray(apply_orientation(invalid, shots.orientation)),
             geometry=Geometry((width, height), (0, 0), 1, (width, height)),
             record={
                 "orientation": shots.orientation,
@@ -149,18 +149,18 @@ class FilterSource:
         )
 
 
-def _upright(linear: NDArray[np.float32], code: int) -> NDArray[np.float32]:
-    """Turn the pixels as EXIF says, and the angles with the camera's frame."""
-    pictures = np.stack([turned(picture, code) for picture in linear])
-    return np.ascontiguousarray(oriented(pictures, turned_angles(code)))
+def _apply_orientation(linear: NDArray[np.float32], code: int) -> NDArray[np.float32]:
+    """Apply the EXIF orientation to the pixels, and the same rotation to the angles."""
+    pictures = np.stack([apply_orientation(picture, code) for picture in linear])
+    return np.ascontiguousarray(oriented(pictures, orientation_calibration(code)))
 
 
 def _shift_notes(view: str, shifts: list[Shift]) -> list[str]:
-    """At most one line for the shots that were moved, and one for those whose shift cannot be trusted."""
+    """Notes about shots that were shifted, and about shots without a reliable estimate."""
     named = list(zip(ANGLES, shifts, strict=True))
     moved = [f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})" for angle, shift in named if shift.corrected]
     doubtful = [str(angle) for angle, shift in named if not shift.trusted]
     notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
     if doubtful:
-        notes.append(f"{view}: no trustworthy shift of the shots at {', '.join(doubtful)}; used as they are.")
+        notes.append(f"{view}: no reliable shift of the shots at {', '.join(doubtful)}; used as they are.")
     return notes

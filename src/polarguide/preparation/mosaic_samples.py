@@ -1,4 +1,4 @@
-"""Light at some places of raw mosaics, for what holds for a whole capture: gains and white balance."""
+"""Sample raw mosaics, to estimate gains and white balance of a whole capture."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from polarguide.capture.view import ANGLES
 _BLOCKS = 1024
 
 
-def blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
-    """Some blocks of a mosaic, spread over it, [N, size, size]."""
+def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
+    """A regular subset of a mosaic's blocks, [N, size, size]."""
     rows, columns = values.shape[0] // size, values.shape[1] // size
     grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
     found = grid.swapaxes(1, 2).reshape(-1, size, size)
     return found[:: max(1, len(found) // _BLOCKS)].copy()
 
 
-def sampled(
+def block_intensities(
     samples: list[NDArray[Any]], levels: Levels, floor: NDArray[np.float32] | None, pattern: Pattern
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Light at the centers of blocks: by angle [4, N], by color [3, N], and those that can be used [N].
+    """Intensities at the centers of blocks: by angle [4, N], by color [3, N], and whether each is usable [N].
 
     Samples of different angles lie beside one another; weights that interpolate all of them to the center of a
     block of two periods keep gradients of the picture out of the ratio of the pair sums.
 
     Args:
-        samples: ``blocks`` of two periods from each mosaic.
+        samples: ``sample_blocks`` of two periods from each mosaic.
         levels: of the capture.
-        floor: ``blocks`` of the dark frame, or None.
+        floor: ``sample_blocks`` of the dark frame, or None.
         pattern: of the mosaics.
     """
     values = np.concatenate(samples)

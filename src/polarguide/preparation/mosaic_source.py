@@ -1,4 +1,4 @@
-"""A folder of raw mosaics, one file a view."""
+"""Picture source: raw mosaics of a polarization sensor, one file per view."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_gains, oriented, pair_ratio
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.datasets import Dataset, fitted_mask
+from polarguide.capture.datasets import Dataset, resized_mask
 from polarguide.capture.layout import index_files
 from polarguide.capture.sensor import (
     DEMOSAIC_MODES,
@@ -22,16 +22,16 @@ from polarguide.capture.sensor import (
     Levels,
     RawFormat,
     demosaic,
-    find_levels,
+    estimate_levels,
     read_mosaic,
     sensor_pattern,
     unusable_samples,
 )
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
-from polarguide.preparation.mosaic_samples import blocks, gray_world, sampled
+from polarguide.preparation.mosaic_samples import block_intensities, gray_world, sample_blocks
 from polarguide.preparation.settings import PrepareSettings, white_gains
-from polarguide.preparation.source import Developed
+from polarguide.preparation.source import DevelopedView
 from polarguide.progress import Advance
 
 _SMALLEST = 16
@@ -41,12 +41,12 @@ class MosaicSource:
     """Raw mosaics of a division-of-focal-plane sensor."""
 
     def __init__(self, root: Path, settings: PrepareSettings, dataset: Dataset | None = None) -> None:
-        """Look for the files.
+        """Find the files.
 
         Args:
             root: the folder of mosaics.
-            settings: what to do.
-            dataset: what else is known of them, where they belong to a published dataset.
+            settings: of the preparation.
+            dataset: the published dataset of the mosaics, if they belong to one.
 
         Raises:
             PolarguideError: the sensor is not named, or a setting does not fit it.
@@ -79,7 +79,7 @@ class MosaicSource:
                 "--white-balance",
                 expected="none for a monochrome sensor",
                 found=settings.white_balance,
-                remedy="Leave it out.",
+                remedy="Omit it.",
             )
 
     @property
@@ -104,18 +104,18 @@ class MosaicSource:
             self._require_alike(path, values, shape)
             container = self._container(path, values)
             largest, used = max(largest, int(values.max())), used | int(np.bitwise_or.reduce(values, None))
-            samples.append(blocks(self._cut(values), 2 * self._pattern.period))
+            samples.append(sample_blocks(self._cut(values), 2 * self._pattern.period))
             advance(count)
         assert shape is not None
         asked = self._settings
-        levels = find_levels(
+        levels = estimate_levels(
             largest, used, container, bits=asked.bits, black=asked.black_level, saturation=asked.saturation
         )
         if self._dataset is not None:
             levels = replace(levels, gamma=self._dataset.gamma)
         dark = self._dark(shape[0])
-        floor = None if dark is None else blocks(dark, 2 * self._pattern.period)
-        angles, colors, usable = sampled(samples, levels, floor, self._pattern)
+        floor = None if dark is None else sample_blocks(dark, 2 * self._pattern.period)
+        angles, colors, usable = block_intensities(samples, levels, floor, self._pattern)
         ratio = pair_ratio(angles, usable)
         gains, notes = self._gains(ratio)
         notes += [] if self._dataset is None else self._dataset.notes
@@ -136,7 +136,7 @@ class MosaicSource:
             "notes": notes,
         }
 
-    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
+    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read one mosaic: validity, levels, gains, then demosaicing, then the sense of the angles."""
         path = self._files[view]
         stored = read_mosaic(path, self._raw)
@@ -152,7 +152,7 @@ class MosaicSource:
         )  # fmt: skip
         intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), asked.calibration)
         height, width = picture.invalid.shape
-        return Developed(
+        return DevelopedView(
             intensities=intensities,
             invalid=picture.invalid,
             geometry=Geometry(
@@ -171,7 +171,7 @@ class MosaicSource:
 
     def _mask(self, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """The object mask, resized where it was made for another resolution of the same picture."""
-        return None if self._dataset is None else fitted_mask(self._dataset, view, size)
+        return None if self._dataset is None else resized_mask(self._dataset, view, size)
 
     def _container(self, path: Path, values: NDArray[Any]) -> int:
         """Bits that a pixel takes in the file."""
@@ -196,7 +196,7 @@ class MosaicSource:
             )
 
     def _cut(self, values: NDArray[Any]) -> NDArray[Any]:
-        """From the first whole cell on, whole cells only."""
+        """Crop to whole cells."""
         values = values[self._crop[1] :, self._crop[0] :]
         return np.ascontiguousarray(values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2])
 
@@ -215,7 +215,7 @@ class MosaicSource:
         return self._cut(dark).astype(np.float32)
 
     def _gains(self, ratio: float | None) -> tuple[tuple[float, float, float, float], list[str]]:
-        """Gains of the angles, and what to say about them."""
+        """Gains of the angles, and notes about them."""
         asked = self._settings
         if asked.calibration.gains is not None:
             return asked.calibration.gains, []
@@ -232,7 +232,7 @@ class MosaicSource:
         return gains, [f"{said}; corrected. {UNIDENTIFIED}"]
 
     def _sample_gains(self, shape: tuple[int, ...], measured: dict[str, Any]) -> NDArray[np.float32]:
-        """What every sample is multiplied by, [H, W]."""
+        """The factor of every sample, [H, W]."""
         pattern = self._pattern
         of_angle = dict(zip(ANGLES, measured["gains"], strict=True))
         gains = np.vectorize(lambda angle: measured["scale"] / of_angle[angle])(pattern.angles)

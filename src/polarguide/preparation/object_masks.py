@@ -1,4 +1,4 @@
-"""Object masks that the user brings beside the pictures."""
+"""Object masks from a folder of the user."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
-from polarguide.preparation.source import Developed, Source
+from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 
 class MaskedSource:
-    """A source whose views get the masks of a folder; white (half of a mask's maximum or more) is the object."""
+    """A source with object masks from a folder; the object is where a mask has at least half of its maximum."""
 
     def __init__(self, pictures: Source, folder: Path) -> None:
-        """Find the masks, called like the views.
+        """Find the masks, named like the views.
 
         Args:
             pictures: the source without them.
             folder: with one picture for each view that has a mask.
 
         Raises:
-            PolarguideError: there is no such folder, or none of its pictures is called like a view.
+            PolarguideError: there is no such folder, or none of its pictures is named like a view.
         """
         if not folder.is_dir():
             raise PolarguideError(
                 "--masks",
-                expected="a folder of masks called like the views",
-                found=f"{folder}, which is no folder",
+                expected="a folder of masks named like the views",
+                found=f"{folder}, which is not a folder",
                 remedy="Give the folder that holds <view>.png.",
             )
         found = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in SUFFIXES}
@@ -44,9 +44,9 @@ class MaskedSource:
         if not self._masks:
             raise PolarguideError(
                 folder,
-                expected=f"masks called like the views ({listed(pictures.views, 3)})",
+                expected=f"masks named like the views ({listed(pictures.views, 3)})",
                 found=listed(sorted(found), 3) or "no picture",
-                remedy="Rename them; views without a mask are taken whole.",
+                remedy="Rename them; views without a mask are used whole.",
             )
         self._pictures = pictures
 
@@ -71,17 +71,15 @@ class MaskedSource:
         return [*self._pictures.paths, *self._masks.values()]
 
     def measure(self, advance: Advance) -> dict[str, Any]:
-        """As of the source; and which views have no mask."""
+        """Measure the source, and note views without a mask."""
         measured = self._pictures.measure(advance)
         bare = [view for view in self.views if view not in self._masks]
         if bare:
-            note = (
-                f"{len(bare)} of {len(self.views)} views have no mask and are taken whole ({listed(bare)})."
-            )
+            note = f"{len(bare)} of {len(self.views)} views have no mask and are used whole ({listed(bare)})."
             measured["notes"] = [*measured["notes"], note]
         return measured
 
-    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
+    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read one view, with its mask.
 
         Raises:
@@ -92,8 +90,8 @@ class MaskedSource:
         return done if path is None else replace(done, mask=_fitted(path, done))
 
 
-def _fitted(path: Path, view: Developed) -> NDArray[np.bool_]:
-    """A mask at the size of the developed picture: where half of a pixel or more is object."""
+def _fitted(path: Path, view: DevelopedView) -> NDArray[np.bool_]:
+    """A mask at the size of the developed picture: True where at least half of a pixel is object."""
     mask = decode_mask(path, read_file(path), any_value=False)
     geometry = view.geometry
     size = (mask.shape[1], mask.shape[0])
@@ -105,7 +103,7 @@ def _fitted(path: Path, view: Developed) -> NDArray[np.bool_]:
             path,
             expected=f"the size of the picture, {width}x{height}, or of the file, {stored[0]}x{stored[1]}",
             found=f"{size[0]}x{size[1]}",
-            remedy="Draw the mask on one of them.",
+            remedy="Make the mask at one of these sizes.",
         )
     (left, top), (width, height), step = geometry.crop, geometry.size, geometry.step
     cut = mask[top : top + height * step, left : left + width * step].astype(np.float32)

@@ -16,9 +16,9 @@ from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
 from polarguide.preparation.folder import SFM, SceneFolder
+from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
-from polarguide.preparation.sources import given_poses, open_source, origin_of_poses
 from polarguide.preparation.working_folder import PHOTOGRAPHS, Workshop
 from polarguide.progress import Reporter
 
@@ -76,7 +76,7 @@ def prepare_scene(
             found=f"--poses {settings.poses}",
             remedy="Leave them out: the cameras come with the poses.",
         )
-    poses = given_poses(root, pictures, settings.poses)
+    poses = known_poses(root, pictures, settings.poses)
     folder = SceneFolder(target, _request(root, pictures, settings, poses))
     if folder.finished:
         reporter.say(f"{target} is complete already; nothing to do.")

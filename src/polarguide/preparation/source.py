@@ -1,4 +1,4 @@
-"""What a source of pictures offers, whatever its format."""
+"""The interface of picture sources of all formats."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from polarguide.progress import Advance
 
 
 @dataclass(frozen=True, eq=False)
-class Developed:
-    """One view.
+class DevelopedView:
+    """The developed picture of one view.
 
     Attributes:
         intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees.
-        invalid: pixels that used a sample without meaning, [H, W].
-        geometry: where it lies in the stored picture.
-        mask: the object, [H, W], where the source brings one.
-        record: what was found, for ``scene.json``.
-        notes: sentences for the user.
+        invalid: pixels that depend on an unusable sample, [H, W].
+        geometry: crop and scale relative to the stored picture.
+        mask: object mask, [H, W], or None.
+        record: measurements for ``scene.json``.
+        notes: messages for the user.
     """
 
     intensities: NDArray[np.float32]
@@ -37,7 +37,7 @@ class Developed:
 
 
 class Source(Protocol):
-    """Pictures of one format."""
+    """The pictures of one capture."""
 
     @property
     def kind(self) -> str:
@@ -45,7 +45,7 @@ class Source(Protocol):
 
     @property
     def cameras(self) -> Mapping[str, PosedCamera] | None:
-        """Cameras by view name, where the source brings poses."""
+        """Cameras by view name, if the source has poses, else None."""
 
     @property
     def views(self) -> list[str]:
@@ -56,7 +56,7 @@ class Source(Protocol):
         """All files that are read."""
 
     def measure(self, advance: Advance) -> dict[str, Any]:
-        """Find out what holds for the whole capture, as JSON types; ``notes`` are sentences for the user."""
+        """Measure what is common to the whole capture, as JSON types; ``notes`` are messages for the user."""
 
-    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
+    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read one view."""

@@ -1,4 +1,4 @@
-"""A published dataset whose files are Stokes vectors: the four intensities are made from them."""
+"""Picture source: Stokes vectors of a published dataset, converted to four intensities."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import oriented
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.datasets import Dataset, fitted_mask
+from polarguide.capture.datasets import Dataset, resized_mask
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import four_intensities
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import Developed
+from polarguide.preparation.source import DevelopedView
 from polarguide.progress import Advance
 
 PAIR_SUMS = (
@@ -27,10 +27,10 @@ _SAMPLES = 20_000
 
 
 class StokesSource:
-    """Stokes vectors, in any unit and without a full scale."""
+    """Stokes vectors in any unit, without a full scale."""
 
     def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
-        """Take a dataset that has ``light``; the sense of its angles counts where the settings name none."""
+        """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
         self.kind = dataset.name
         self.cameras = dataset.cameras
         self._dataset = dataset
@@ -48,7 +48,7 @@ class StokesSource:
         return self._dataset.paths
 
     def measure(self, advance: Advance) -> dict[str, Any]:
-        """One scale for the whole capture, and what it costs; every file is read once.
+        """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
 
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
         else twice this one does, and what exceeds it clips.
@@ -97,8 +97,8 @@ class StokesSource:
             "notes": notes,
         }
 
-    def develop(self, view: str, measured: dict[str, Any]) -> Developed:
-        """Read one view: scale, four intensities, the sense of the angles."""
+    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+        """Read one view, scale it, form the four intensities and correct the sense of the angles."""
         stokes, clipped = self._stokes(view)
         finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
         scaled = np.where(finite[..., None], stokes, 0) * np.float32(measured["scale"])
@@ -106,9 +106,9 @@ class StokesSource:
         # Rounding of the scale may leave the largest intensity a hair above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
-        turned = oriented(np.clip(intensities, 0.0, 1.0), self._calibration)
-        return Developed(
-            intensities=turned,
+        rotated = oriented(np.clip(intensities, 0.0, 1.0), self._calibration)
+        return DevelopedView(
+            intensities=rotated,
             invalid=clipped | ~finite,
             geometry=Geometry((width, height), (0, 0), 1, (width, height)),
             record={
@@ -116,10 +116,10 @@ class StokesSource:
                 "negative_share": round(float((intensities < 0).mean()), 6),
                 "invalid_share": round(float((clipped | ~finite).mean()), 6),
             },
-            mask=fitted_mask(self._dataset, view, (height, width)),
+            mask=resized_mask(self._dataset, view, (height, width)),
         )
 
     def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        assert self._dataset.light is not None
-        light = self._dataset.light(view)
-        return light.stokes, light.clipped
+        assert self._dataset.read_stokes is not None
+        image = self._dataset.read_stokes(view)
+        return image.stokes, image.clipped

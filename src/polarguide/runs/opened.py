@@ -38,6 +38,10 @@ class Model(Protocol):
     @property
     def device(self) -> torch.device: ...
 
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers that it renders, in the order of ``LAYERS``."""
+
     def __len__(self) -> int:
         """How many primitives (Gaussians) it has."""
 
@@ -62,6 +66,11 @@ class GaussianModel:
     def light(self) -> dict[str, Tensor]:
         """Parameters of the learned light by name; empty for a recipe without."""
         return self.state.light
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers that it renders, in the order of ``LAYERS``."""
+        return tuple(name for name in LAYERS if name in self.shading.layers)
 
     def __len__(self) -> int:
         return len(self.state.gaussians)
@@ -183,12 +192,10 @@ class OpenedRun:
         """Cameras of the scene's views by name; reads the scene."""
         return {view.name: view.camera for view in self.scene.views}
 
-    @cached_property
+    @property
     def layers(self) -> tuple[str, ...]:
         """Names of the layers that this run renders, in the order of ``LAYERS``."""
-        small = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(3).double(), torch.zeros(3).double())
-        found = self.model.render(small, depth=True)
-        return tuple(name for name in LAYERS if getattr(found, name) is not None)
+        return self.model.layers
 
     def result(self, camera: Camera | str, *, normals: bool = True, depth: bool = True) -> RenderResult:
         """Everything that can be rendered, as one typed record on the run's device.

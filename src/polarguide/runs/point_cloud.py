@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from polarguide.color import srgb_encode
+from polarguide.files import atomic
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display, write_ply
-from polarguide.color import srgb_encode
-from polarguide.shading.model import Parameters, ShadingModel
-from polarguide.files import atomic
+from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.training.state import TrainingState
 
 
 @torch.no_grad()
-def gaussian_colors(
-    gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel, directions: Tensor
-) -> Tensor:
+def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> Tensor:
     """Linear colors of every Gaussian toward viewing directions, reflections included.
 
     Args:
@@ -39,9 +36,7 @@ def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor
     return torch.stack([srgb_encode(color.clamp(0, 1)) for color in linear], dim=1)
 
 
-def _toward(
-    gaussians: Parameters, light: Mapping[str, Tensor], shading: ShadingModel, directions: Tensor
-) -> list[Tensor]:
+def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> list[Tensor]:
     """``gaussian_colors`` direction by direction: K of [N, 3]."""
     means = gaussians["means"]
     center = means.new_zeros(3)

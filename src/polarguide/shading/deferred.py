@@ -17,6 +17,7 @@ from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
     GBuffer,
+    Light,
     PageShading,
     Parameter,
     Parameters,
@@ -141,17 +142,15 @@ class DeferredShading(ShadingModel):
         s, p = reflectances_from_cosine(cosine, self.refractive_index)
         return strength * (0.5 * (s + p)) * light, base
 
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
-    ) -> list[Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
         """Base color [N, 3], strength [N, 1] and, with ``local``, the Gaussians' own light [N, 3]."""
-        channels = [base_colors(gaussians, center, sh_degree), self.strength(gaussians)[:, None]]
+        channels = [base_colors(gaussians, center, degree), self.strength(gaussians)[:, None]]
         if self.local:
             directions = mirrored_directions(gaussians["means"], center, normals)
-            channels.append(local_light(gaussians, directions, sh_degree))
+            channels.append(local_light(gaussians, directions, degree))
         return channels
 
-    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], and ``strength`` [H, W]."""
         features, texels = splatted.features, light["texels"]
         strength = features[..., 6]
@@ -172,9 +171,7 @@ class DeferredShading(ShadingModel):
             layers = reflect_reference(splatted.color, splatted.normal, strength, texels, camera, self, local)
         return {**layers, "strength": strength}
 
-    def colors(
-        self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
-    ) -> Tensor:
+    def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Colors [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
         directions = mirrored(rays, normals).contiguous()
         seen = self.radiance(cubemap_lookup(light["texels"], directions))
@@ -189,7 +186,7 @@ class DeferredShading(ShadingModel):
         """Linear harmonics of the base color, and ``strength`` [N]."""
         return {**super().fields(gaussians), "strength": self.strength(gaussians)}
 
-    def page(self, gaussians: Parameters, light: Mapping[str, Tensor]) -> PageShading | None:
+    def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
         """Harmonics, strength and texels."""
         values = {**harmonic_values(gaussians), "share": self.strength(gaussians)}
         if self.local:

@@ -27,6 +27,7 @@ from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
     GBuffer,
+    Light,
     PageShading,
     Parameter,
     Parameters,
@@ -123,9 +124,7 @@ class DirectionalShading(ShadingModel):
         values["mlp_bias_2"] = torch.full((3,), math.log(self.first_light))
         return values
 
-    def radiance(
-        self, light: Mapping[str, Tensor], directions: Tensor, roughness: Tensor, features: Tensor
-    ) -> Tensor:
+    def radiance(self, light: Light, directions: Tensor, roughness: Tensor, features: Tensor) -> Tensor:
         """Specular radiance [P, 3], in (0, e^5].
 
         Args:
@@ -145,14 +144,12 @@ class DirectionalShading(ShadingModel):
         out = torch.addmm(light["mlp_bias_2"], hidden, light["mlp_weight_2"])
         return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
-    ) -> list[Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
         """Albedo [N, 3]; then roughness and feature together, [N, 5]. No harmonics are read."""
         roughness = torch.sigmoid(gaussians["roughness_logits"])[:, None]
         return [albedo_of(gaussians), torch.cat((roughness, torch.tanh(gaussians["features"])), dim=1)]
 
-    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the color that was splatted is albedo."""
         albedo, normal, further, alpha = splatted.color, splatted.normal, splatted.further, splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
@@ -166,9 +163,7 @@ class DirectionalShading(ShadingModel):
         specular = radiance * (alpha > MINIMUM_ALPHA)[..., None]
         return {"final": albedo + specular, "specular": specular, "diffuse": albedo}
 
-    def colors(
-        self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
-    ) -> Tensor:
+    def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Each Gaussian shaded alone, at its own normal, roughness and feature: linear colors [N, 3].
 
         Args:
@@ -189,7 +184,7 @@ class DirectionalShading(ShadingModel):
             "feature": torch.tanh(gaussians["features"]),
         }
 
-    def page(self, gaussians: Parameters, light: Mapping[str, Tensor]) -> PageShading | None:
+    def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
         """Albedo, roughness, features; the grid's levels and the MLP."""
         fields = self.fields(gaussians)
         layers = range(3)

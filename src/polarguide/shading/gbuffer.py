@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from types import MappingProxyType
 
 import torch
-from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
-from polarguide.shading.model import PLAIN, GBuffer, Parameters, ShadingModel
+from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
 
 COLOR_CHANNELS = (0, 1, 2)
-NO_LIGHT: Mapping[str, Tensor] = MappingProxyType({})
+NO_LIGHT: Light = MappingProxyType({})
 
 
 def render(
@@ -25,7 +23,7 @@ def render(
     *,
     sh_degree: int = 3,
     shading: ShadingModel = PLAIN,
-    light: Mapping[str, Tensor] = NO_LIGHT,
+    light: Light = NO_LIGHT,
     normals: bool = True,
     depth: bool = False,
     statistic: ScreenStatistic | None = None,

@@ -26,6 +26,9 @@ from polarguide.vectors import dot
 MAXIMUM_LOG_LIGHT = 5.0
 PLAIN_LAYERS = ("final", "normal", "depth", "alpha")
 
+Light = Mapping[str, Tensor]
+"""The learned light of a shading model: its parameters by name."""
+
 Model = TypeVar("Model", bound="ShadingModel")
 
 
@@ -119,7 +122,7 @@ class ShadingModel(ABC):
     """How a recipe shades: what it learns, what it splats, and how it makes the picture of it.
 
     Subclasses are frozen dataclasses. Their fields are part of the recipe and are recorded in a run's folder; the
-    refractive index is the run's own, see ``bind``. ``light`` is the learned light: its parameters by name.
+    refractive index is the run's own, see ``bind``.
 
     Attributes:
         refractive_index: of all surfaces.
@@ -193,17 +196,15 @@ class ShadingModel(ABC):
         return "specular" in self.layers
 
     @abstractmethod
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
-    ) -> list[Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
         """Per Gaussian: colors [N, 3], then what is blended behind color and normal, each [N, C].
 
         Args:
-            normals: [N, 3] unit, world axes. center: [3] of the camera. sh_degree: of the base color, 0 to 3.
+            normals: [N, 3] unit, world axes. center: [3] of the camera. degree: of the base color's harmonics, 0 to 3.
         """
 
     @abstractmethod
-    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """Layers of a picture by their names in ``RenderResult``; ``final`` at least."""
 
     def predicted_stokes(self, result: RenderResult, camera: Camera) -> Tensor:
@@ -236,9 +237,7 @@ class ShadingModel(ABC):
         return ""
 
     @abstractmethod
-    def colors(
-        self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
-    ) -> Tensor:
+    def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Linear colors [N, 3] of Gaussians shaded one by one, along unit rays [N, 3] at facing normals [N, 3]."""
 
     def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
@@ -249,7 +248,7 @@ class ShadingModel(ABC):
         """What a PLY of the Gaussians keeps besides display colors, [N, ...] by name: linear harmonics."""
         return {"linear_dc": gaussians["sh_dc"], "linear_rest": gaussians["sh_rest"].flatten(1)}
 
-    def page(self, gaussians: Parameters, light: Mapping[str, Tensor]) -> PageShading | None:
+    def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
         """What an exported page needs; None where it has no shaders for the model (colors are then baked)."""
         return None
 
@@ -265,23 +264,19 @@ class PlainShading(ShadingModel):
         """Without reflection there is one color."""
         return PLAIN_LAYERS
 
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, sh_degree: int
-    ) -> list[Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
         """Base color [N, 3]."""
-        return [base_colors(gaussians, center, sh_degree)]
+        return [base_colors(gaussians, center, degree)]
 
-    def shade(self, splatted: GBuffer, light: Mapping[str, Tensor], camera: Camera) -> dict[str, Tensor]:
+    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final`` [H, W, 3]."""
         return {"final": splatted.color}
 
-    def colors(
-        self, gaussians: Parameters, light: Mapping[str, Tensor], rays: Tensor, normals: Tensor
-    ) -> Tensor:
+    def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Base colors [N, 3]; see ``ShadingModel``."""
         return self.diffuse_colors(gaussians, rays)
 
-    def page(self, gaussians: Parameters, light: Mapping[str, Tensor]) -> PageShading | None:
+    def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
         """Harmonics alone."""
         return PageShading("plain", harmonic_values(gaussians))
 

@@ -14,22 +14,16 @@ from polarguide import _native
 class _Reflect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        features: Tensor,
-        rays: Tensor,
-        texels: Tensor,
-        fresnel: bool,
-        local: bool,
-        refractive_index: float,
+        ctx: Any, features: Tensor, rays: Tensor, texels: Tensor, fresnel: bool, local: bool, ior: float
     ) -> tuple[Tensor, ...]:
         features, rays, texels = (t.detach().contiguous() for t in (features, rays, texels))
         directions, seen = torch.empty_like(rays), torch.empty_like(rays)
         layers = tuple(torch.empty_like(rays) for _ in range(4))
         _native.reflect_directions(features, rays, directions)
         _native.cubemap_forward(texels, directions, seen)
-        _native.reflect_layers(features, rays, seen, fresnel, local, refractive_index, *layers)
+        _native.reflect_layers(features, rays, seen, fresnel, local, ior, *layers)
         ctx.save_for_backward(features, rays, texels, directions, seen)
-        ctx.model = (fresnel, local, refractive_index)
+        ctx.model = (fresnel, local, ior)
         ctx.set_materialize_grads(False)
         return layers
 
@@ -37,7 +31,7 @@ class _Reflect(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         features, rays, texels, directions, seen = ctx.saved_tensors
-        fresnel, local, refractive_index = ctx.model
+        fresnel, local, ior = ctx.model
         final, specular, diffuse, reflection = (None if g is None else g.contiguous() for g in grads)
         to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
         _native.reflect_backward_layers(
@@ -46,7 +40,7 @@ class _Reflect(torch.autograd.Function):
             seen,
             fresnel,
             local,
-            refractive_index,
+            ior,
             final,
             specular,
             diffuse,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +14,7 @@ from polarguide.raster.interface import Rasterize
 from polarguide.rendering.relight import RELIT_RESOLUTION, turned_cubemap
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import render
-from polarguide.shading.model import PLAIN, Parameters, ShadingModel
+from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.trainer import Trainer
 
@@ -30,7 +30,7 @@ class Shown:
     """
 
     gaussians: Gaussians
-    light: Mapping[str, Tensor]
+    light: Light
     shading: ShadingModel
     rasterize: Rasterize
     sh_degree: int
@@ -66,7 +66,7 @@ class Shown:
             depth=depth,
         ).to("cpu")
 
-    def _turned(self, turn: Tensor) -> Mapping[str, Tensor]:
+    def _turned(self, turn: Tensor) -> Light:
         cubemap = self.shading.radiance_cubemap
         if cubemap is None:
             return self.light

@@ -1,10 +1,10 @@
-"""COLMAP models: the only room that knows pycolmap."""
+"""COLMAP models and COLMAP itself: the only package that imports pycolmap."""
 
 import contextlib
 import importlib
 
 from polarguide.system import sigterm_kept
 
-# It prints a stack trace at SIGTERM, where a process that is asked to end should just end.
+# pycolmap prints a stack trace at SIGTERM, where a process should just end.
 with contextlib.suppress(ImportError), sigterm_kept():
     importlib.import_module("pycolmap")

@@ -1,7 +1,7 @@
-"""Whether the binary files of a COLMAP model are complete, judged by their structure.
+"""Check the structure of a COLMAP model's binary files.
 
-COLMAP reads a file that was cut short without a word and keeps whatever was in memory, and counts in a damaged
-file can keep it busy for ever. Walking the files first gives one clear answer.
+COLMAP reads truncated files without an error and keeps whatever was in memory, and counts in a damaged file can keep it
+busy forever. Parsing the structure first gives a clear error.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _LONGEST_NAME = 4096
 
 
 def check_model_files(folder: Path, kind: str) -> None:
-    """Check the files of a model, of suffix ``kind``; those that are not there and text files are passed over.
+    """Check the files of a model, of suffix ``kind``; missing files and text files are skipped.
 
     Raises:
-        PolarguideError: a file is cut short, damaged, or has bytes after its end.
+        PolarguideError: a file is truncated, damaged, or has trailing bytes.
     """
     walkers: dict[str, Callable[[bytes], int]] = {"cameras": _cameras, "images": _images, "points3D": _points}
     for name, walk in walkers.items():
@@ -35,7 +35,7 @@ def check_model_files(folder: Path, kind: str) -> None:
             try:
                 end = walk(data)
                 if end != len(data):
-                    found = f"{len(data)} bytes where its counts ask for {end}"
+                    found = f"{len(data)} bytes where its counts require {end}"
             except (struct.error, ValueError) as error:
                 found = f"a damaged one ({error})" if data else "an empty file"
         if found is not None:

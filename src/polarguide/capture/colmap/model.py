@@ -1,4 +1,4 @@
-"""COLMAP models -> cameras and points. The only file that knows pycolmap's types."""
+"""Read COLMAP models: cameras and points."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class ColmapModel:
         return _camera_of(self.folder, images[0], self._cameras[images[0].camera_id])
 
     def observations(self, views: Sequence[str]) -> Tensor:
-        """Which of the views each point was triangulated from, [M, V] bool; all False where no tracks are stored."""
+        """Which of the views observe each point, [M, V] bool; all False where no tracks are stored."""
         columns = {view: column for column, view in enumerate(views)}
         by_id = {
             image.image_id: columns[view]
@@ -138,7 +138,7 @@ def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: s
 
 
 def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
-    """A warning about posed images that are no view of the capture, or nothing."""
+    """A warning about posed images without a view in the capture, if there are any."""
     unused = sorted(set(model.names) - set(names))
     if not unused:
         return []
@@ -150,8 +150,8 @@ def find_model(root: Path, *, itself: bool = True, points: bool = True) -> tuple
 
     Args:
         root: where to look.
-        itself: whether the files may lie in ``root`` or ``root/0``.
-        points: whether the file of points has to be there.
+        itself: whether the files may be in ``root`` or ``root/0``.
+        points: whether the file of points is required.
 
     Raises:
         PolarguideError: there is none, or a file of it is missing.
@@ -172,7 +172,7 @@ def find_model(root: Path, *, itself: bool = True, points: bool = True) -> tuple
     raise PolarguideError(
         root if itself else root / "sparse" / "0",
         expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
-        found="none there nor in sparse/",
+        found="neither there nor in sparse/",
         remedy="Run structure from motion on the pictures, or copy the model there.",
     )
 
@@ -183,7 +183,7 @@ def load_model(folder: Path, kind: str) -> Any:
     Raises:
         PolarguideError: pycolmap refuses it.
     """
-    import pycolmap  # here, so that a machine which only trains on packed scenes can do without
+    import pycolmap  # here, because importing it is slow
 
     model = pycolmap.Reconstruction()
     check_model_files(folder, kind)
@@ -194,7 +194,7 @@ def load_model(folder: Path, kind: str) -> Any:
         raise PolarguideError(
             folder,
             expected="a readable COLMAP model",
-            found=f"one that pycolmap refuses ({str(error).strip().splitlines()[0]})",
+            found=f"a model that pycolmap refuses ({str(error).strip().splitlines()[0]})",
             remedy="Export the model again; text files need two lines per image.",
         ) from error
     return model

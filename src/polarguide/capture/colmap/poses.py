@@ -1,4 +1,4 @@
-"""A COLMAP model for the developed pictures: matched by name, scaled, and undistorted with one map for all angles."""
+"""The COLMAP model of the developed pictures: matched by name, scaled and undistorted."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class Poses:
 
         Args:
             model: pycolmap's ``Reconstruction``.
-            where: where it came from, for messages.
+            where: origin of the model, for messages.
             views: view names of the capture.
             files: the files it was read from.
 
         Raises:
-            PolarguideError: none of its images is a view, two images claim one, or a pose or camera has
-                broken numbers.
+            PolarguideError: none of its images is a view, two images belong to one view, or a pose or camera
+                is invalid.
         """
         self.folder = where
         self.files = tuple(files)
@@ -44,7 +44,7 @@ class Poses:
         if not self.views:
             raise PolarguideError(
                 self.folder,
-                expected=f"images called like the views ({listed(views, 3)}), with any suffix",
+                expected=f"images named like the views ({listed(views, 3)}), with any suffix",
                 found=listed(sorted(images), 3) or "no posed image",
                 remedy="Rename the images in the model or the pictures; names are matched without folder and suffix.",
             )
@@ -55,7 +55,7 @@ class Poses:
                     self.folder,
                     expected=f"one image called {view}",
                     found=", ".join(sorted(image.name for image in images[view])),
-                    remedy="Keep the one that is meant.",
+                    remedy="Keep one of them.",
                 )
             self._require_numbers(view)
         self._warps: dict[Key, Undistortion] = {}
@@ -74,18 +74,18 @@ class Poses:
 
     @classmethod
     def of_cameras(cls, cameras: Mapping[str, PosedCamera], where: Path, views: list[str]) -> Poses:
-        """A model without points from cameras by view name; ``where`` they came from is for messages."""
+        """A model without points from cameras by view name; ``where`` names their origin in messages."""
         with tempfile.TemporaryDirectory() as made:
             write_cameras(Path(made), cameras)
             return cls(load_model(Path(made), ".bin"), where, views)
 
     @property
     def points(self) -> int:
-        """How many 3D points the model has."""
+        """Number of 3D points of the model."""
         return len(self._model.points3D)
 
     def developed(self, geometries: Mapping[str, Geometry]) -> dict[str, PosedCamera]:
-        """Cameras of the developed pictures, distortion and all, by view.
+        """Cameras of the developed pictures, including distortion, by view.
 
         Raises:
             PolarguideError: as in ``warp``.
@@ -106,7 +106,7 @@ class Poses:
         return found
 
     def warp(self, view: str, geometry: Geometry) -> Undistortion:
-        """What the view's picture has to go through.
+        """The undistortion of a view's picture.
 
         Raises:
             PolarguideError: the camera is neither of the stored nor the developed size, nor a resized one.
@@ -145,7 +145,7 @@ class Poses:
         model.write_binary(str(folder))
 
     def _move_points(self, image: Any, before: Any, warp: Undistortion) -> None:
-        """Observed points go where their pixels went."""
+        """Undistort the observations of an image."""
         places = np.array([point.xy for point in image.points2D])
         rays = np.nan_to_num(before.cam_from_img(places))
         moved = warp.target.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
@@ -168,5 +168,5 @@ class Poses:
 
 
 def _pose(image: Any) -> Any:
-    """World to camera, whatever the version of pycolmap."""
+    """World-to-camera pose, for old and new versions of pycolmap."""
     return image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world

@@ -50,19 +50,17 @@ def reconstruct(
 ) -> Path:
     """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
 
-    Where there is ``folder/masks/<view>.png``, only its white parts are looked at.
-
-    Features and matches are kept in a database, so that a run that was stopped does not repeat them. The
-    largest model wins.
+    With a mask ``folder/masks/<view>.png``, features come from its white parts only. Features and matches are kept
+    in a database, so that an interrupted run does not repeat them. The largest model is used.
 
     Args:
-        folder: with the pictures; the database and the model are written there.
+        folder: holds the pictures; the database and the model are written there.
         sizes: width and height of every picture, by view.
         matching: "exhaustive", or "sequential" for views taken in the order of their names.
-        seed: of all random draws.
-        reporter: for progress and what was registered.
+        seed: of the random numbers.
+        reporter: for progress and messages.
         intrinsics: model and parameters of all pictures, where they are known.
-        refine: whether known ones may change.
+        refine: whether to refine known intrinsics.
 
     Returns:
         The folder of the model, with one camera for pictures of one size: of the model given, or SIMPLE_RADIAL.
@@ -126,6 +124,6 @@ def _map(
 
     found: dict[int, Any] = run_step(
         lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
-        seed, reporter, "placing cameras", count, lambda: placed[0] + 2 if placed[0] else 0,
+        seed, reporter, "registering images", count, lambda: placed[0] + 2 if placed[0] else 0,
     )  # fmt: skip
     return found

@@ -1,4 +1,4 @@
-"""Pictures of one camera -> those of a pinhole camera: intrinsics scaled to the picture, distortion taken out."""
+"""Undistort the pictures of a COLMAP camera, and scale its intrinsics to the pictures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from polarguide.errors import PolarguideError
 
 @dataclass(frozen=True)
 class Geometry:
-    """How a developed picture lies in the stored one: developed = (stored - crop) / step, in pixels from the corner.
+    """Crop and scale of a developed picture: developed = (stored - crop) / step, in pixels from the corner.
 
     Attributes:
         stored: width and height of the stored picture, as displayed.
@@ -40,14 +40,14 @@ class Geometry:
 
     @classmethod
     def of(cls, record: dict[str, Any]) -> Geometry:
-        """What ``record`` made."""
+        """The inverse of ``record``."""
         stored, crop, size = ((int(x), int(y)) for x, y in (record[n] for n in ("stored", "crop", "size")))
         return cls(stored, crop, int(record["step"]), size)
 
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """How a picture becomes that of a pinhole camera.
+    """The map from a picture to that of a pinhole camera.
 
     Attributes:
         source: the camera of the developed picture, as pycolmap's.
@@ -60,13 +60,13 @@ class Undistortion:
     moves: bool
 
     def record(self) -> dict[str, Any] | None:
-        """The camera that was taken out, or None."""
+        """The distorted camera model, or None without distortion."""
         if not self.moves:
             return None
         return {"model": self.source.model_name, "parameters": [float(value) for value in self.source.params]}
 
     def apply_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Resample an object mask [H, W]; what lies beyond the picture is no object."""
+        """Resample an object mask [H, W]; pixels outside the picture are background."""
         if not self.moves:
             return mask
         x, y = self._map
@@ -75,7 +75,7 @@ class Undistortion:
     def apply(
         self, intensities: NDArray[np.float32], invalid: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Resample intensities [4, H, W, 3] with one map; a pixel is invalid if it uses one, or none inside."""
+        """Resample intensities [4, H, W, 3] with one map; pixels that use invalid or outside pixels become invalid."""
         if not self.moves:
             return intensities, invalid
         x, y = self._map
@@ -92,7 +92,7 @@ class Undistortion:
 
     @functools.cached_property
     def _map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where the pixels of the target lie in the source, in OpenCV's pixels."""
+        """Source coordinates of the target's pixels, in OpenCV's convention."""
         rows, columns = np.mgrid[: self.target.height, : self.target.width]
         places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)  # COLMAP's pixel centers
         rays = self.target.cam_from_img(places)
@@ -129,7 +129,7 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
 
 
 def undistortion(camera: Any) -> Undistortion:
-    """What pictures of a COLMAP camera have to go through."""
+    """The undistortion of pictures of a COLMAP camera."""
     straight = camera.model_name in PINHOLES and all(
         camera.params[i] == 0 for i in camera.extra_params_idxs()
     )

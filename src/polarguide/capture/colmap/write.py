@@ -1,4 +1,4 @@
-"""A camera with a pose on its way into a COLMAP model, and writing such a model without points."""
+"""Write a COLMAP model of posed cameras without points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MODELS = {
 
 @dataclass(frozen=True, eq=False)
 class PosedCamera:
-    """Intrinsics and pose of one picture, in COLMAP's terms.
+    """Intrinsics and pose of one picture, in COLMAP's conventions.
 
     Attributes:
         width, height: picture size in pixels.
@@ -42,7 +42,7 @@ class PosedCamera:
 
     @property
     def intrinsics(self) -> tuple[Any, ...]:
-        """What pictures of one camera have in common."""
+        """Model, size and parameters: equal for pictures of one camera."""
         return (self.model, self.width, self.height, *self.parameters)
 
     @property

@@ -1,8 +1,8 @@
-"""Published datasets of polarization pictures: their layouts, their cameras, their sense of angles."""
+"""Published polarization datasets: layouts, cameras, and the sense of their angles."""
 
 from pathlib import Path
 
-from polarguide.capture.datasets.dataset import Dataset, Light, fitted_mask
+from polarguide.capture.datasets.dataset import Dataset, StokesImage, resized_mask
 from polarguide.capture.datasets.gnerp import is_gnerp, open_gnerp
 from polarguide.capture.datasets.neisf import is_neisf, open_neisf
 from polarguide.capture.datasets.nersp import is_nersp, open_nersp
@@ -17,7 +17,7 @@ DATASETS = {
     "neisf": is_neisf,
     "gnerp": is_gnerp,
 }
-"""Names, and what tells whether a folder has the layout."""
+"""Names, and functions that tell whether a folder has the layout."""
 
 
 def detect_dataset(root: Path) -> str | None:
@@ -31,14 +31,22 @@ def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
     Args:
         root: the folder.
         name: a key of ``DATASETS``.
-        transfer: encoding of GNeRP's pictures; of no meaning for the others.
+        transfer: encoding of GNeRP's pictures; ignored for the others.
 
     Raises:
-        PolarguideError: a file is missing, or the cameras make no sense.
+        PolarguideError: a file is missing, or the cameras are invalid.
     """
     if name == "gnerp":
         return open_gnerp(root, transfer=transfer)
     return {"pandora": open_pandora, "pisr": open_pisr, "nersp": open_nersp, "neisf": open_neisf}[name](root)
 
 
-__all__ = ["DATASETS", "PISR_SENSOR", "Dataset", "Light", "detect_dataset", "fitted_mask", "open_dataset"]
+__all__ = [
+    "DATASETS",
+    "PISR_SENSOR",
+    "Dataset",
+    "StokesImage",
+    "detect_dataset",
+    "open_dataset",
+    "resized_mask",
+]

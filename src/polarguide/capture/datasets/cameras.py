@@ -1,4 +1,4 @@
-"""Camera files of published datasets -> cameras as COLMAP knows them."""
+"""Convert the camera files of published datasets to COLMAP's conventions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.formats.arrays import numbers, read_arrays
+from polarguide.capture.formats.arrays import finite_numbers, read_arrays
 from polarguide.errors import PolarguideError
 
 _LARGEST_SKEW = 1e-3
@@ -29,7 +29,7 @@ def read_projections(path: Path) -> dict[int, tuple[Matrix, Matrix, Matrix]]:
         Number -> K [3, 3] with K[2, 2] = 1, world-to-camera rotation [3, 3] and translation [3].
 
     Raises:
-        PolarguideError: the file has none, or a matrix that no camera has.
+        PolarguideError: the file has no camera, or a matrix is not that of a camera.
     """
     arrays = read_arrays(path)
     found = {}
@@ -40,16 +40,16 @@ def read_projections(path: Path) -> dict[int, tuple[Matrix, Matrix, Matrix]]:
         number = int(match[1])
         scale_key = f"scale_mat_{number}"
         if scale_key not in arrays:
-            raise missing(path, scale_key, arrays)
-        world = numbers(f"{path} ({key})", arrays[key], _SQUARE)
-        scale = numbers(f"{path} ({scale_key})", arrays[scale_key], ((4, 4),))
-        found[number] = decomposed(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
+            raise missing_entry(path, scale_key, arrays)
+        world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
+        scale = finite_numbers(f"{path} ({scale_key})", arrays[scale_key], ((4, 4),))
+        found[number] = decompose_projection(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
     if not found:
-        raise missing(path, "world_mat_<i>", arrays)
+        raise missing_entry(path, "world_mat_<i>", arrays)
     return found
 
 
-def decomposed(where: object, projection: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     """K, R and t of a 3x4 matrix s K [R | t] of any scale s.
 
     Raises:
@@ -73,7 +73,7 @@ def decomposed(where: object, projection: Matrix) -> tuple[Matrix, Matrix, Matri
 
 
 def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
-    """K, if it is one of a camera with square-cornered pixels.
+    """K, checked to be an intrinsic matrix without skew.
 
     Raises:
         PolarguideError: focal lengths are not positive, or the skew is not small.
@@ -91,7 +91,7 @@ def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
 
 
 def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
-    """Rotation and translation of a rigid [3 or 4, 4] matrix; a rotation off by rounding is put right.
+    """Rotation and translation of a rigid [3 or 4, 4] matrix; rounding errors of the rotation are removed.
 
     Raises:
         PolarguideError: it is not rigid.
@@ -108,20 +108,22 @@ def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
     return u @ vt, matrix[:3, 3]
 
 
-def pinhole(size: tuple[int, int], inner: Matrix, rotation: Matrix, translation: Matrix) -> PosedCamera:
+def pinhole_camera(
+    size: tuple[int, int], inner: Matrix, rotation: Matrix, translation: Matrix
+) -> PosedCamera:
     """A camera without distortion; ``inner`` counts pixels as COLMAP does."""
     parameters = (inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2])
     return PosedCamera(*size, "PINHOLE", tuple(float(p) for p in parameters), rotation, translation)
 
 
-def distorted(
+def distorted_camera(
     where: object,
     size: tuple[int, int],
     inner: Matrix,
     coefficients: Any,
     pose: tuple[Matrix, Matrix],
 ) -> PosedCamera:
-    """A camera of OpenCV's calibration, with 4, 5 or 8 distortion coefficients.
+    """A camera calibrated with OpenCV, with 4, 5 or 8 distortion coefficients.
 
     OpenCV counts from the center of the top-left pixel, COLMAP from its corner: the principal point moves by half.
 
@@ -129,13 +131,13 @@ def distorted(
         PolarguideError: there are other coefficients.
     """
     flat = np.ravel(np.asarray(coefficients))
-    k = numbers(where, flat, ((4,), (5,), (8,)))
+    k = finite_numbers(where, flat, ((4,), (5,), (8,)))
     padded = [*k, *[0.0] * (8 - len(k))]
     parameters = (inner[0, 0], inner[1, 1], inner[0, 2] + 0.5, inner[1, 2] + 0.5, *padded)
     return PosedCamera(*size, "FULL_OPENCV", tuple(float(p) for p in parameters), *pose)
 
 
-def missing(path: Path, key: str, found: Mapping[str, object]) -> PolarguideError:
+def missing_entry(path: Path, key: str, found: Mapping[str, object]) -> PolarguideError:
     """The error that a file lacks an entry."""
     names = sorted(found)
     shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

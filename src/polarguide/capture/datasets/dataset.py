@@ -1,4 +1,4 @@
-"""What a published dataset offers once its layout is understood."""
+"""The common interface of published datasets."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from polarguide.errors import PolarguideError
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
-    """The light of one view.
+class StokesImage:
+    """The Stokes vectors of one view.
 
     Attributes:
-        stokes: [3, H, W, 3] float32, in the sense of angles that the dataset has.
-        clipped: pixels that the dataset's own pictures had at full scale, [H, W].
+        stokes: [3, H, W, 3] float32, in the dataset's own sense of angles.
+        clipped: pixels at full scale in the dataset's pictures, [H, W].
     """
 
     stokes: NDArray[np.float32]
@@ -39,19 +39,19 @@ class Dataset:
         views: view names, sorted.
         paths: all files that are read.
         cameras: view -> camera.
-        light: reads the light of a view; None where ``mosaics`` holds raw files instead.
-        mask: reads the object mask of a view, [H, W]; None where it has none.
-        sense: how its angles count as displayed, "ccw" or "cw".
+        read_stokes: reads the Stokes vectors of a view; None if ``mosaics`` holds raw files instead.
+        mask: reads the object mask of a view, [H, W]; None if it has none.
+        sense: direction in which angles increase as displayed, "ccw" or "cw".
         mosaics: folder of raw mosaics, or None.
-        gamma: exponent that the stored values of mosaics were raised to.
-        notes: what the user should know.
+        gamma: exponent of the mosaics' stored values: stored = linear ^ gamma.
+        notes: messages for the user.
     """
 
     name: str
     views: list[str]
     paths: list[Path]
     cameras: Mapping[str, PosedCamera]
-    light: Callable[[str], Light] | None
+    read_stokes: Callable[[str], StokesImage] | None
     mask: Callable[[str], NDArray[np.bool_] | None]
     sense: Sense = "ccw"
     mosaics: Path | None = None
@@ -60,7 +60,7 @@ class Dataset:
 
 
 def require_files(files: Mapping[str, Path], kind: str) -> None:
-    """Check that files are there.
+    """Check that files exist.
 
     Raises:
         PolarguideError: one is missing.
@@ -84,7 +84,7 @@ def cameras_of_views(
         path: the camera file, for messages.
         numbers: view -> number of its camera.
         cameras: by number.
-        entry: what an entry of the file is called, up to its number.
+        entry: name of an entry of the file, without its number.
 
     Raises:
         PolarguideError: a view has none.
@@ -101,11 +101,11 @@ def cameras_of_views(
     return {view: cameras[number] for view, number in numbers.items()}
 
 
-def same_shape(path: Path, found: tuple[int, ...], first: tuple[int, ...], like: Path) -> None:
+def require_same_shape(path: Path, found: tuple[int, ...], first: tuple[int, ...], like: Path) -> None:
     """Check that a file has the size of another one of its view.
 
     Raises:
-        PolarguideError: it has not.
+        PolarguideError: the sizes differ.
     """
     if found[:2] != first[:2]:
         raise PolarguideError(
@@ -116,12 +116,12 @@ def same_shape(path: Path, found: tuple[int, ...], first: tuple[int, ...], like:
         )
 
 
-def numbered(stems: set[str]) -> dict[str, int]:
-    """View -> number, for the stems that are one."""
+def numbered_views(stems: set[str]) -> dict[str, int]:
+    """View -> number, for the stems that are numbers."""
     return {stem: int(stem) for stem in sorted(stems) if stem.isascii() and stem.isdigit() and len(stem) < 7}
 
 
-def size_of_first(pictures: Mapping[str, Path], folder: Path) -> tuple[int, int]:
+def first_picture_size(pictures: Mapping[str, Path], folder: Path) -> tuple[int, int]:
     """Width and height of the first picture, which the intrinsics belong to.
 
     Raises:
@@ -139,7 +139,7 @@ def size_of_first(pictures: Mapping[str, Path], folder: Path) -> tuple[int, int]
     return width, height
 
 
-def fitted_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
     """The object mask of a view at a picture size (height, width), or None where it has none.
 
     A mask of another resolution is resized: where half of a pixel or more is object.

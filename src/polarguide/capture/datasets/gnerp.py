@@ -15,18 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.datasets.cameras import checked_intrinsics, checked_pose, missing, pinhole
+from polarguide.capture.datasets.cameras import (
+    checked_intrinsics,
+    checked_pose,
+    missing_entry,
+    pinhole_camera,
+)
 from polarguide.capture.datasets.dataset import (
     Dataset,
-    Light,
+    StokesImage,
     cameras_of_views,
-    numbered,
+    first_picture_size,
+    numbered_views,
     require_files,
-    same_shape,
-    size_of_first,
+    require_same_shape,
 )
-from polarguide.capture.formats.arrays import numbers as finite
-from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.formats.arrays import finite_numbers, read_array
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_picture, linear_codes, read_file
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import FULL_CODE
@@ -42,31 +46,33 @@ def is_gnerp(root: Path) -> bool:
 
 
 def open_gnerp(root: Path, *, transfer: str) -> Dataset:
-    """Look for the files.
+    """Find the files and read the cameras.
 
     Args:
         root: the folder.
         transfer: how the pictures are encoded: "linear", "srgb", or "auto", which takes "srgb".
 
     Raises:
-        PolarguideError: one is missing, or the cameras make no sense.
+        PolarguideError: one is missing, or the cameras are invalid.
     """
     transfer = "srgb" if transfer == "auto" else transfer
     pictures = index_files(root / "images", SUFFIXES)
-    numbers = numbered(set(pictures))
+    numbers = numbered_views(set(pictures))
     angles, degrees = ({view: root / part / f"{view}.npy" for view in numbers} for part in ("aop", "dop"))
     require_files(angles, "AoP")
     require_files(degrees, "DoP")
     masks = index_files(root / "masks", SUFFIXES)
     cameras_file = root / "cameras.json"
-    size = size_of_first({view: pictures[view] for view in numbers}, root / "images") if numbers else (1, 1)
+    size = (
+        first_picture_size({view: pictures[view] for view in numbers}, root / "images") if numbers else (1, 1)
+    )
 
-    def light(view: str) -> Light:
+    def read_stokes(view: str) -> StokesImage:
         stored = decode_picture(pictures[view], read_file(pictures[view]))
         aop, dop = (_plane(files[view], stored.shape, pictures[view]) for files in (angles, degrees))
         s0 = 2 * linear_codes(stored, transfer).astype(np.float32) / np.float32(FULL_CODE)
         stokes = [s0, s0 * (dop * np.cos(2 * aop))[..., None], s0 * (dop * np.sin(2 * aop))[..., None]]
-        return Light(np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2)))
+        return StokesImage(np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2)))
 
     def mask(view: str) -> NDArray[np.bool_] | None:
         path = masks.get(view)
@@ -78,7 +84,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
         views=sorted(numbers),
         paths=[*used, *masks.values(), cameras_file],
         cameras=cameras_of_views(cameras_file, numbers, _cameras(cameras_file, size), "w2c_mat_"),
-        light=light,
+        read_stokes=read_stokes,
         mask=mask,
         notes=(
             "AoP and DoP have one channel and are shared by R, G and B.",
@@ -101,7 +107,7 @@ def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32
             found=f"an array {'x'.join(map(str, plane.shape))} of {plane.dtype}",
             remedy="Take the file from the dataset as it was published.",
         )
-    same_shape(path, plane.shape, shape, like)
+    require_same_shape(path, plane.shape, shape, like)
     return np.asarray(plane, np.float32)
 
 
@@ -115,11 +121,11 @@ def _cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
             continue
         inner_key = f"intrinsic_{match[1]}" if f"intrinsic_{match[1]}" in content else "intrinsic"
         if inner_key not in content:
-            raise missing(path, inner_key, content)
+            raise missing_entry(path, inner_key, content)
         where = f"{path} ({inner_key})"
-        inner = finite(where, content[inner_key], ((3, 3), *_SHAPES))[:3, :3]
-        pose = checked_pose(f"{path} ({key})", finite(f"{path} ({key})", value, _SHAPES))
-        cameras[int(match[1])] = pinhole(size, checked_intrinsics(where, inner), *pose)
+        inner = finite_numbers(where, content[inner_key], ((3, 3), *_SHAPES))[:3, :3]
+        pose = checked_pose(f"{path} ({key})", finite_numbers(f"{path} ({key})", value, _SHAPES))
+        cameras[int(match[1])] = pinhole_camera(size, checked_intrinsics(where, inner), *pose)
     if not cameras:
-        raise missing(path, "w2c_mat_<i>", content)
+        raise missing_entry(path, "w2c_mat_<i>", content)
     return cameras

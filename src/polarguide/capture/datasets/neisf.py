@@ -14,10 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.datasets.cameras import checked_pose, pinhole
-from polarguide.capture.datasets.dataset import Dataset, Light, cameras_of_views, require_files, same_shape
-from polarguide.capture.formats.arrays import numbers as finite
-from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.datasets.cameras import checked_pose, pinhole_camera
+from polarguide.capture.datasets.dataset import (
+    Dataset,
+    StokesImage,
+    cameras_of_views,
+    require_files,
+    require_same_shape,
+)
+from polarguide.capture.formats.arrays import finite_numbers, read_array
 from polarguide.capture.formats.pictures import decode_mask, read_file
 from polarguide.capture.formats.radiance import read_radiance
 from polarguide.capture.layout import index_files
@@ -33,10 +38,10 @@ def is_neisf(root: Path) -> bool:
 
 
 def open_neisf(root: Path) -> Dataset:
-    """Look for the files.
+    """Find the files and read the cameras.
 
     Raises:
-        PolarguideError: one is missing, or the cameras make no sense.
+        PolarguideError: one is missing, or the cameras are invalid.
     """
     matches = [_STEM.fullmatch(stem) for part in _PARTS for stem in index_files(root / part, (".exr",))]
     numbers = {match[0]: int(match[1]) for match in matches if match is not None}
@@ -46,11 +51,11 @@ def open_neisf(root: Path) -> Dataset:
     masks = index_files(root / "masks", (".png",))
     cameras_file = root / "poses_bounds.npy"
 
-    def light(view: str) -> Light:
+    def read_stokes(view: str) -> StokesImage:
         planes = [read_radiance(path) for path in files[view]]
         for path, plane in zip(files[view], planes, strict=True):
-            same_shape(path, plane.shape, planes[0].shape, files[view][0])
-        return Light(np.stack(planes), np.zeros(planes[0].shape[:2], bool))
+            require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
+        return StokesImage(np.stack(planes), np.zeros(planes[0].shape[:2], bool))
 
     def mask(view: str) -> NDArray[np.bool_] | None:
         path = masks.get(view)
@@ -61,7 +66,7 @@ def open_neisf(root: Path) -> Dataset:
         views=sorted(numbers),
         paths=[*(p for paths in files.values() for p in paths), *masks.values(), cameras_file],
         cameras=cameras_of_views(cameras_file, numbers, _cameras(cameras_file), "row "),
-        light=light,
+        read_stokes=read_stokes,
         mask=mask,
         notes=(
             "The sense of NeISF's angles is not stated by its release: taken as counter-clockwise (--sense cw if not).",
@@ -82,7 +87,7 @@ def _cameras(path: Path) -> dict[int, PosedCamera]:
     cameras = {}
     for index, row in enumerate(rows):
         where = f"{path} (row {index})"
-        down, right, back, center, inner = finite(where, row[:15], ((15,),)).reshape(3, 5).T
+        down, right, back, center, inner = finite_numbers(where, row[:15], ((15,),)).reshape(3, 5).T
         height, width, focal = inner
         if not (1 <= height <= 1e5 and 1 <= width <= 1e5 and focal > 0):
             raise PolarguideError(
@@ -96,5 +101,7 @@ def _cameras(path: Path) -> dict[int, PosedCamera]:
         )  # OpenCV's: right, down, forward
         rotation, _ = checked_pose(where, axes)
         middle = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        cameras[index + 1] = pinhole((round(width), round(height)), middle, rotation, -rotation @ center)
+        cameras[index + 1] = pinhole_camera(
+            (round(width), round(height)), middle, rotation, -rotation @ center
+        )
     return cameras

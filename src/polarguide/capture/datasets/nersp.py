@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.datasets.cameras import pinhole, read_projections
+from polarguide.capture.datasets.cameras import pinhole_camera, read_projections
 from polarguide.capture.datasets.dataset import (
     Dataset,
-    Light,
+    StokesImage,
     cameras_of_views,
-    numbered,
+    first_picture_size,
+    numbered_views,
     require_files,
-    same_shape,
-    size_of_first,
+    require_same_shape,
 )
 from polarguide.capture.formats.pictures import SUFFIXES, decode_stored, read_file
 from polarguide.capture.formats.radiance import read_radiance
@@ -34,26 +34,26 @@ def is_nersp(root: Path) -> bool:
 
 
 def open_nersp(root: Path) -> Dataset:
-    """Look for the files.
+    """Find the files and read the cameras.
 
     Raises:
-        PolarguideError: one is missing, or the cameras make no sense.
+        PolarguideError: one is missing, or the cameras are invalid.
     """
     cameras_file = root / "cameras.npz"
-    numbers = numbered({stem for part in _PARTS for stem in index_files(root / part, (".npy",))})
+    numbers = numbered_views({stem for part in _PARTS for stem in index_files(root / part, (".npy",))})
     files = {view: [root / part / f"{view}.npy" for part in _PARTS] for view in numbers}
     for index, part in enumerate(_PARTS):
         require_files({view: paths[index] for view, paths in files.items()}, part)
     pictures = index_files(root / "image", SUFFIXES)
     maps = index_files(root / "input_azimuth_maps", (".png",))
-    size = size_of_first(pictures, root / "image") if numbers else (1, 1)
-    found = {i: pinhole(size, *camera) for i, camera in read_projections(cameras_file).items()}
+    size = first_picture_size(pictures, root / "image") if numbers else (1, 1)
+    found = {i: pinhole_camera(size, *camera) for i, camera in read_projections(cameras_file).items()}
 
-    def light(view: str) -> Light:
+    def read_stokes(view: str) -> StokesImage:
         planes = [read_radiance(path) for path in files[view]]
         for path, plane in zip(files[view], planes, strict=True):
-            same_shape(path, plane.shape, planes[0].shape, files[view][0])
-        return Light(np.stack(planes) / np.float32(2), np.zeros(planes[0].shape[:2], bool))
+            require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
+        return StokesImage(np.stack(planes) / np.float32(2), np.zeros(planes[0].shape[:2], bool))
 
     def mask(view: str) -> NDArray[np.bool_] | None:
         path = maps.get(view)
@@ -67,7 +67,7 @@ def open_nersp(root: Path) -> Dataset:
         views=sorted(numbers),
         paths=[*(p for paths in files.values() for p in paths), *maps.values(), cameras_file],
         cameras=cameras_of_views(cameras_file, numbers, found, "world_mat_"),
-        light=light,
+        read_stokes=read_stokes,
         mask=mask,
         sense="cw",
     )

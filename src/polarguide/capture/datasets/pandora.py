@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.datasets.cameras import pinhole, read_projections
+from polarguide.capture.datasets.cameras import pinhole_camera, read_projections
 from polarguide.capture.datasets.dataset import (
     Dataset,
-    Light,
+    StokesImage,
     cameras_of_views,
+    first_picture_size,
     require_files,
-    same_shape,
-    size_of_first,
+    require_same_shape,
 )
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
 from polarguide.capture.formats.radiance import read_radiance
@@ -36,10 +36,10 @@ def is_pandora(root: Path) -> bool:
 
 
 def open_pandora(root: Path) -> Dataset:
-    """Look for the files.
+    """Find the files and read the cameras.
 
     Raises:
-        PolarguideError: one is missing, or the cameras make no sense.
+        PolarguideError: one is missing, or the cameras are invalid.
     """
     folder, cameras_file = root / "images_stokes", root / "cameras.npz"
     matches = [_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
@@ -50,16 +50,16 @@ def open_pandora(root: Path) -> Dataset:
     masks = index_files(root / "mask", SUFFIXES)
     pictures = index_files(root / "images", SUFFIXES)
     first = 0 if any(int(view) == 0 for view in views) else 1
-    size = size_of_first(pictures, root / "images") if views else (1, 1)
-    found = {i: pinhole(size, *camera) for i, camera in read_projections(cameras_file).items()}
+    size = first_picture_size(pictures, root / "images") if views else (1, 1)
+    found = {i: pinhole_camera(size, *camera) for i, camera in read_projections(cameras_file).items()}
     numbers = {view: int(view) - first for view in views}
 
-    def light(view: str) -> Light:
+    def read_stokes(view: str) -> StokesImage:
         total, plus1, plus2 = (read_radiance(path) for path in files[view])
         for path, other in zip(files[view][1:], (plus1, plus2), strict=True):
-            same_shape(path, other.shape, total.shape, files[view][0])
+            require_same_shape(path, other.shape, total.shape, files[view][0])
         stokes = np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)
-        return Light(stokes, np.zeros(total.shape[:2], bool))
+        return StokesImage(stokes, np.zeros(total.shape[:2], bool))
 
     def mask(view: str) -> NDArray[np.bool_] | None:
         path = masks.get(view)
@@ -70,7 +70,7 @@ def open_pandora(root: Path) -> Dataset:
         views=views,
         paths=[*(p for paths in files.values() for p in paths), *masks.values(), cameras_file],
         cameras=cameras_of_views(cameras_file, numbers, found, "world_mat_"),
-        light=light,
+        read_stokes=read_stokes,
         mask=mask,
         notes=(f"Files count from {first}, cameras from 0.",),
     )

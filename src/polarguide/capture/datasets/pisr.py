@@ -14,10 +14,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.datasets.cameras import checked_intrinsics, distorted, missing, read_projections
-from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, numbered
-from polarguide.capture.formats.arrays import numbers as finite
-from polarguide.capture.formats.arrays import read_arrays
+from polarguide.capture.datasets.cameras import (
+    checked_intrinsics,
+    distorted_camera,
+    missing_entry,
+    read_projections,
+)
+from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, numbered_views
+from polarguide.capture.formats.arrays import finite_numbers, read_arrays
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
 from polarguide.capture.layout import index_files
 from polarguide.errors import PolarguideError
@@ -34,24 +38,26 @@ def is_pisr(root: Path) -> bool:
 
 
 def open_pisr(root: Path) -> Dataset:
-    """Look for the files.
+    """Find the files and read the cameras.
 
     Raises:
-        PolarguideError: one is missing, or the cameras make no sense.
+        PolarguideError: one is missing, or the cameras are invalid.
     """
     files = index_files(root / "raw", (".npy",))
-    numbers = numbered(set(files))
+    numbers = numbered_views(set(files))
     cameras_file = next((root / name for name in _CAMERAS if (root / name).exists()), root / _CAMERAS[0])
     inner_file = root / "intrinsics.npz"
     intrinsics = read_arrays(inner_file)
     for key in ("camera_matrix", "dist_coeffs"):
         if key not in intrinsics:
-            raise missing(inner_file, key, intrinsics)
+            raise missing_entry(inner_file, key, intrinsics)
     where = f"{inner_file} (camera_matrix)"
-    inner = checked_intrinsics(where, finite(where, intrinsics["camera_matrix"], ((3, 3),)))
+    inner = checked_intrinsics(where, finite_numbers(where, intrinsics["camera_matrix"], ((3, 3),)))
     coefficients = intrinsics["dist_coeffs"]
     cameras = {
-        number: distorted(f"{inner_file} (dist_coeffs)", SIZE, inner, coefficients, (rotation, translation))
+        number: distorted_camera(
+            f"{inner_file} (dist_coeffs)", SIZE, inner, coefficients, (rotation, translation)
+        )
         for number, (_, rotation, translation) in read_projections(cameras_file).items()
     }
     masks = index_files(root / "mask", SUFFIXES)
@@ -71,7 +77,7 @@ def open_pisr(root: Path) -> Dataset:
         views=sorted(numbers),
         paths=[*files.values(), *masks.values(), inner_file, cameras_file, *_gamma_files(root)],
         cameras=cameras_of_views(cameras_file, numbers, cameras, "world_mat_"),
-        light=None,
+        read_stokes=None,
         mask=mask,
         mosaics=root / "raw",
         gamma=gamma,

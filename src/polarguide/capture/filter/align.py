@@ -1,4 +1,4 @@
-"""Small shifts between the four shots of a view: estimated, and taken back."""
+"""Estimate and correct small shifts between the four shots of a view."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 SMALLEST = 0.2
-"""Shifts under this many pixels are left alone: resampling would cost more sharpness than they do, and polarization
-misleads the estimate by about as much."""
+"""Shifts below this many pixels are not corrected: resampling would blur more, and polarization causes errors of the
+estimate of this size."""
 LARGEST_SHARE = 0.05
-"""Shifts above this share of the picture's width are no shake; they are reported, not corrected."""
+"""Shifts above this share of the picture's width are reported but not corrected."""
 
 _BETTER = 0.95
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
@@ -21,7 +21,7 @@ _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
 
 @dataclass(frozen=True)
 class Shift:
-    """Where the content of a shot lies relative to the first, in pixels right and down; whether it was trusted."""
+    """Shift of a shot relative to the first, in pixels right and down, and whether the estimate is reliable."""
 
     x: float
     y: float
@@ -29,12 +29,12 @@ class Shift:
 
     @property
     def corrected(self) -> bool:
-        """Whether it is large enough to be taken back, and trusted."""
+        """Whether the shift is corrected: reliable and large enough."""
         return self.trusted and max(abs(self.x), abs(self.y)) >= SMALLEST
 
 
-def find_shifts(linear: NDArray[np.float32]) -> list[Shift]:
-    """Shifts of the four shots against the first.
+def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
+    """Estimate the shifts of the four shots relative to the first.
 
     Phase correlation of the logarithms' fine detail finds a start (brightness and polarization change slowly
     across a surface, edges stay); maximizing the enhanced correlation coefficient refines it to a fraction of
@@ -49,14 +49,14 @@ def find_shifts(linear: NDArray[np.float32]) -> list[Shift]:
     if not any(shift.corrected for shift in shifts):
         return shifts
     whole = np.zeros(linear.shape[:3], bool)
-    after = _disagreement(*aligned(linear, whole, shifts))
+    after = _disagreement(*align_shots(linear, whole, shifts))
     if after < _BETTER * _disagreement(linear, whole):
         return shifts
     return [shifts[0], *(replace(shift, trusted=False) for shift in shifts[1:])]
 
 
 def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
-    """Mean |I0 + I90 - I45 - I135|, common gains taken out, relative to the light."""
+    """Mean |I0 + I90 - I45 - I135| relative to S0, after removing a common gain."""
     i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad.any(axis=0)]
     first, second = i0 + i90, i45 + i135
     if not second.sum() > 0:
@@ -64,10 +64,10 @@ def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
     return float(np.abs(first - second * (first.sum() / second.sum())).sum() / first.sum())
 
 
-def aligned(
+def align_shots(
     linear: NDArray[np.float32], clipped: NDArray[np.bool_], shifts: list[Shift]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Take the shifts back.
+    """Shift the shots back.
 
     Args:
         linear: [4, H, W, 3] linear intensities.

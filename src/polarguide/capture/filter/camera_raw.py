@@ -1,8 +1,8 @@
-"""Camera raw files -> linear pictures, every shot in the same way.
+"""Develop camera raw files to linear pictures, with the same processing for every shot.
 
-LibRaw (package rawpy) develops them with everything off that looks at the picture: no automatic brightness, white
-level or white balance, no gamma, no color matrix. What is left is the same for every shot: black level, fixed
-gains, a linear scale and demosaicing.
+LibRaw (package rawpy) runs without any step that depends on the picture: no automatic brightness, white level or white
+balance, no gamma, no color matrix. The remaining steps are the same for every shot: black level, fixed gains, a linear
+scale and demosaicing.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ except ImportError:
 
 
 def is_camera_raw(path: Path) -> bool:
-    """Whether a file is one, by its suffix."""
+    """Whether a file is a camera raw file, by its suffix."""
     return path.suffix.lower() in CAMERA_RAW
 
 
@@ -65,7 +65,7 @@ def read_camera_raw(
             if raw.sizes.raw_width * raw.sizes.raw_height > LARGEST_PIXELS:
                 raise ValueError(f"{raw.sizes.raw_width}x{raw.sizes.raw_height} pixels")
             flip = int(raw.sizes.flip)  # before user_flip takes its place
-            pixels = np.asarray(raw.postprocess(**development(gains)))
+            pixels = np.asarray(raw.postprocess(**libraw_parameters(gains)))
     except Exception as error:  # LibRaw's errors have a class each; damaged files raise others, too
         said = _words(error)
         raise PolarguideError(
@@ -85,13 +85,13 @@ def read_camera_raw(
 
 
 def _words(error: Exception) -> str:
-    """What LibRaw says, whose messages are bytes, in one line."""
+    """LibRaw's error message, which may be bytes, as one line."""
     said = error.args[0] if error.args else ""
     text = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
     return (text.strip().splitlines() or [type(error).__name__])[0]
 
 
-def development(gains: tuple[float, float, float]) -> dict[str, Any]:
+def libraw_parameters(gains: tuple[float, float, float]) -> dict[str, Any]:
     """LibRaw's settings, by the names of ``rawpy.Params``."""
     red, green, blue = (gain / min(gains) for gain in gains)
     settings: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The EXIF orientation of JPEG, TIFF and PNG files, and what it does to pixels and polarizer angles."""
+"""The EXIF orientation of JPEG, TIFF and PNG files, and its effect on pixels and polarizer angles."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def orientation(data: bytes) -> int:
     return value if 1 <= value <= 8 else 1
 
 
-def turned(pixels: NDArray[Any], code: int) -> NDArray[Any]:
-    """Pixels [H, W, ...] as they are to be displayed."""
+def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
+    """Pixels [H, W, ...] rotated or mirrored for display, given the orientation tag."""
     if code in (5, 7):
         pixels = pixels.swapaxes(0, 1)
         return np.rot90(pixels, 2) if code == 7 else pixels
@@ -40,8 +40,8 @@ def turned(pixels: NDArray[Any], code: int) -> NDArray[Any]:
     return np.rot90(pixels, {1: 0, 3: 2, 6: -1, 8: 1}[code])
 
 
-def turned_angles(code: int) -> Calibration:
-    """What becomes of polarizer angles when the stored picture is turned with the camera's frame."""
+def orientation_calibration(code: int) -> Calibration:
+    """The change of polarizer angles when the stored picture is rotated or mirrored for display."""
     return Calibration(sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in _QUARTER else 0.0)
 
 

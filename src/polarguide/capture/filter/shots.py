@@ -1,4 +1,4 @@
-"""Which files are the four shots of a view, and reading them."""
+"""Find and read the four shots of a view."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
     after ``_``, ``-``, a point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``.
 
     Returns:
-        Nothing where neither is found. Angles may be missing; ``require_all`` checks.
+        Nothing where neither is found. Angles may be missing; ``require_four_shots`` checks.
 
     Raises:
-        PolarguideError: two files claim one place, or a folder is missing.
+        PolarguideError: two files have the same view and angle, or a folder is missing.
     """
     folders = angle_folders(root)
     if folders:
@@ -69,17 +69,17 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
                 root,
                 expected=f"one picture of {match['view']} at {angle} degrees",
                 found=f"{of_view[angle].name} and {path.name}",
-                remedy="Remove the one that is not meant.",
+                remedy="Remove one of them.",
             )
         of_view[angle] = path
     return shots
 
 
-def require_all(root: Path, shots: dict[str, dict[int, Path]]) -> None:
+def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
     """Check that every view has its four shots.
 
     Raises:
-        PolarguideError: one has not.
+        PolarguideError: a shot is missing.
     """
     for view, files in sorted(shots.items()):
         missing = [str(angle) for angle in ANGLES if angle not in files]

@@ -1,1 +1,1 @@
-"""Files of pictures and arrays: strict decoding with limits on size."""
+"""Decode files of pictures and arrays, with strict checks and limits on size."""

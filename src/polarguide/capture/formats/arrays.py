@@ -1,4 +1,4 @@
-"""NumPy files -> arrays: sizes are checked before anything is allocated, and nothing is unpickled."""
+"""Read NumPy files; sizes are checked before allocation, and nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from polarguide.capture.formats.pictures import read_file
 from polarguide.errors import PolarguideError
 
 _LARGEST_ARCHIVE = 1 << 26
-"""Bytes that an ``.npz`` file of cameras may unfold to."""
+"""Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
 
 
 def read_array(path: Path) -> NDArray[Any]:
     """The array in an ``.npy`` file.
 
     Raises:
-        PolarguideError: the file cannot be read, is cut short or no ``.npy`` file, or holds Python objects.
+        PolarguideError: the file cannot be read, is truncated or no ``.npy`` file, or holds Python objects.
     """
     data = read_file(path)
     try:
@@ -65,7 +65,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     )
 
 
-def numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
+def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
     """An array of finite numbers in one of the shapes, as float64.
 
     Raises:

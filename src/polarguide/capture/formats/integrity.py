@@ -1,7 +1,7 @@
-"""Whether a picture file is complete, judged by its structure.
+"""Check that a picture file is complete, by its structure.
 
-Decoders differ by version in what they do with a file cut short: some refuse, some return gray or stale rows
-for the part that is missing. Walking the file's own marks first gives one answer with every decoder.
+Decoders differ in their treatment of truncated files: some refuse them, some return gray or stale rows for the missing
+part. Parsing the structure first gives the same answer with every decoder.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def find_damage(data: bytes) -> str | None:
     return "a file that is none of these"
 
 
-def stated_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height that the head of a PNG, JPEG or TIFF file without damage states; None where it does not."""
+def declared_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in the header of an intact PNG, JPEG or TIFF file, or None."""
     if data.startswith(_PNG_SIGNATURE):
         return struct.unpack_from(">II", data, 16) if len(data) >= 24 else None
     if data.startswith(b"\xff\xd8"):

@@ -1,4 +1,4 @@
-"""Picture files -> arrays: strict decoding, three channels in RGB order, linear 16-bit codes."""
+"""Decode picture files: three channels in RGB order, linear 16-bit codes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.integrity import find_damage, stated_size
+from polarguide.capture.formats.integrity import declared_size, find_damage
 from polarguide.capture.view import FULL_CODE
 from polarguide.color import srgb_decode_array
 from polarguide.errors import PolarguideError
@@ -91,7 +91,7 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
         PolarguideError: the file is damaged, cut short, or of another kind.
     """
     damage = find_damage(data)
-    size = None if damage is not None else stated_size(data)
+    size = None if damage is not None else declared_size(data)
     if size is not None and size[0] * size[1] > LARGEST_PIXELS:
         damage = f"one of {size[0]}x{size[1]} pixels, more than any camera takes"
     pixels = None

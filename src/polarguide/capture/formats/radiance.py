@@ -1,4 +1,4 @@
-"""Files of linear radiance (.hdr, .exr, .npy) -> float pictures of three channels."""
+"""Read linear radiance (.hdr, .exr, .npy) as float pictures of three channels."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _read_hdr(path: Path) -> NDArray[Any]:
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
-    """OpenCV's reading of a picture file, without its own words on what is wrong."""
+    """Decode a picture file with OpenCV, without its messages."""
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

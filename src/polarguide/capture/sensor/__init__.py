@@ -1,9 +1,9 @@
-"""Division-of-focal-plane polarization sensors: raw mosaics -> intensities behind four polarizer angles."""
+"""Division-of-focal-plane polarization sensors: from raw mosaics to intensities behind four polarizer angles."""
 
-from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, INTERPOLATIONS, Picture, demosaic
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, INTERPOLATIONS, DemosaicedPicture, demosaic
 from polarguide.capture.sensor.packing import PACKINGS, packed_size, unpack
 from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
-from polarguide.capture.sensor.radiometry import Levels, find_levels, unusable_samples
+from polarguide.capture.sensor.radiometry import Levels, estimate_levels, unusable_samples
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 
 __all__ = [
@@ -12,12 +12,12 @@ __all__ = [
     "PACKINGS",
     "RAW_SUFFIXES",
     "SENSORS",
+    "DemosaicedPicture",
     "Levels",
     "Pattern",
-    "Picture",
     "RawFormat",
     "demosaic",
-    "find_levels",
+    "estimate_levels",
     "packed_size",
     "read_mosaic",
     "sensor_pattern",

@@ -1,4 +1,4 @@
-"""Mosaics -> intensities behind four polarizer angles, at a half, a quarter or all of the sensor's resolution."""
+"""Demosaic polarization mosaics, at full, half or quarter resolution."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class DemosaicedPicture:
     """Demosaiced intensities.
 
     Attributes:
@@ -41,7 +41,7 @@ class Picture:
 
 def demosaic(
     values: Array, bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True
-) -> Picture:
+) -> DemosaicedPicture:
     """Demosaic one mosaic.
 
     ``half``: each 2x2 polarizer cell is one pixel; the cells of a color sensor form a Bayer picture per angle.
@@ -73,7 +73,7 @@ def demosaic(
     cells = _cells(values, bad, pattern, interpolation)
     if mode == "full":
         return _full(cells, pattern, interpolation)
-    plain = _in_order(cells, pattern)
+    plain = _half_size(cells, pattern)
     return _registered(plain, _full(cells, pattern, interpolation), interpolation) if registered else plain
 
 
@@ -101,18 +101,18 @@ def _cells(values: Array, bad: Mask, pattern: Pattern, interpolation: str) -> _C
             wrong[row, column] = np.any(uses, axis=0)
         else:
             colors[row, column] = guided_color(sample, bayer)
-            wrong[row, column] = _grown(mask, GUIDED_RADIUS)
+            wrong[row, column] = _dilated(mask, GUIDED_RADIUS)
     return _Cells(colors, wrong)
 
 
-def _in_order(cells: _Cells, pattern: Pattern) -> Picture:
+def _half_size(cells: _Cells, pattern: Pattern) -> DemosaicedPicture:
     """Half size: the samples of a cell, by angle."""
     angles = {int(pattern.angles[place]): place for place in cells.colors}
     stack = np.stack([cells.colors[angles[angle]] for angle in ANGLES])
-    return Picture(_three(stack), np.any(list(cells.bad.values()), axis=0))
+    return DemosaicedPicture(_with_three_channels(stack), np.any(list(cells.bad.values()), axis=0))
 
 
-def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Picture:
+def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> DemosaicedPicture:
     """Full size: each channel is the mosaic of a monochrome polarization sensor."""
     height, width, channels = cells.colors[0, 0].shape
     mosaic = np.empty((2 * height, 2 * width, channels), np.float32)
@@ -130,11 +130,11 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Picture:
     if interpolation == "bilinear":
         invalid = np.any([used_by_bilinear(bad, places == angle) for angle in ANGLES], axis=0)
     else:
-        invalid = _grown(bad, GUIDED_RADIUS)
-    return Picture(_three(np.stack(planes, axis=-1)), np.asarray(invalid))
+        invalid = _dilated(bad, GUIDED_RADIUS)
+    return DemosaicedPicture(_with_three_channels(np.stack(planes, axis=-1)), np.asarray(invalid))
 
 
-def _registered(plain: Picture, full: Picture, interpolation: str) -> Picture:
+def _registered(plain: DemosaicedPicture, full: DemosaicedPicture, interpolation: str) -> DemosaicedPicture:
     """Half size, all angles at the centers of the cells."""
     angles, height, width, channels = plain.intensities.shape
     cells = full.intensities.reshape(angles, height, 2, width, 2, channels)
@@ -142,10 +142,10 @@ def _registered(plain: Picture, full: Picture, interpolation: str) -> Picture:
     if interpolation == "bilinear":
         centered += (plain.intensities.sum(axis=0) - centered.sum(axis=0)) / np.float32(4)
     invalid = full.invalid.reshape(height, 2, width, 2).any(axis=(1, 3))
-    return Picture(centered, np.asarray(plain.invalid | invalid))
+    return DemosaicedPicture(centered, np.asarray(plain.invalid | invalid))
 
 
-def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> Picture:
+def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> DemosaicedPicture:
     """Quarter size: means over the samples of one angle and color in each 4x4 pixels."""
     repeat = 4 // pattern.period
     angles = np.tile(pattern.angles, (repeat, repeat))
@@ -158,7 +158,9 @@ def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> Picture:
             chosen = angles == angle if colors is None else (angles == angle) & (colors == channel)
             samples = [blocks[:, row, :, column] for row, column in np.argwhere(chosen)]
             picture[index, ..., channel] = np.mean(samples, axis=0, dtype=np.float32)
-    return Picture(_three(picture), np.asarray(bad.reshape(rows, 4, columns, 4).any(axis=(1, 3))))
+    return DemosaicedPicture(
+        _with_three_channels(picture), np.asarray(bad.reshape(rows, 4, columns, 4).any(axis=(1, 3)))
+    )
 
 
 def _tiled(pattern: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64]:
@@ -166,10 +168,10 @@ def _tiled(pattern: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int
     return np.tile(pattern, (-(-shape[0] // height), -(-shape[1] // width)))[: shape[0], : shape[1]]
 
 
-def _three(picture: Array) -> Array:
+def _with_three_channels(picture: Array) -> Array:
     return np.repeat(picture, 3, axis=-1) if picture.shape[-1] == 1 else picture
 
 
-def _grown(mask: Mask, radius: int) -> Mask:
+def _dilated(mask: Mask, radius: int) -> Mask:
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)

@@ -1,4 +1,4 @@
-"""Interpolation of sparse samples: bilinear, and guided by edges, color differences and total intensity.
+"""Interpolate sparse samples: bilinear, or guided by edges, color differences and total intensity.
 
 ``guided_color`` interpolates green along the weaker gradient with a second-difference correction (after Hamilton
 and Adams, US patent 5,629,734, expired; half of their correction, which overshoots less) and then the differences

@@ -1,4 +1,4 @@
-"""Packed pixels: 10p and 12p of GenICam's Pixel Format Naming Convention, 12Packed of GigE Vision."""
+"""Unpack packed pixels: 10p and 12p of GenICam's Pixel Format Naming Convention, 12Packed of GigE Vision."""
 
 from __future__ import annotations
 

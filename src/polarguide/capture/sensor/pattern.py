@@ -1,4 +1,4 @@
-"""Which polarizer and which color filter lies over each pixel of a sensor."""
+"""The pattern of polarizers and color filters of a sensor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _CELL = np.array([[90, 45], [135, 0]])
 _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry a polarizer cell
 
 SENSORS = {"IMX250MYR": True, "IMX264MYR": True, "IMX250MZR": False}
-"""Sony sensors by name, and whether they see color."""
+"""Sony sensors by name, and whether they are color sensors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Pattern:
         return x, y
 
     def rows(self) -> list[str]:
-        """The pattern in words, one string a row: "R90 R45 G90 G45", ..."""
+        """The pattern as text, one string per row: "R90 R45 G90 G45", ..."""
         names = self.angles.astype(str).astype(object)
         if self.colors is not None:
             names = np.array(list("RGB"), dtype=object)[self.colors] + names

@@ -1,4 +1,4 @@
-"""Sensor values -> linear intensities in [0, 1], and which of them mean nothing."""
+"""Radiometric levels: from sensor values to linear intensities, and the detection of unusable samples."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Levels:
         white: the value that becomes linear 1.
         saturation: the value from which a sample counts as saturated.
         black: the value without light.
-        gamma: stored values are the light to the power of this number.
+        gamma: exponent of the stored values: stored = linear ^ gamma.
     """
 
     bits: int
@@ -43,10 +43,10 @@ class Levels:
         return np.asarray(np.copysign(np.abs(shown) ** np.float32(1 / self.gamma), shown))
 
 
-def find_levels(
+def estimate_levels(
     largest: int, used: int, container: int, *, bits: int | None, black: float, saturation: int | None
 ) -> Levels:
-    """Full scale of a capture.
+    """Estimate the full scale of a capture.
 
     Without ``bits``: 8 in 8-bit files; in 16-bit files 12 if no value exceeds 4095 (the sensors' converters
     have 12 bits), else 16. Values whose low bits are never used (12 bits shifted to the top of 16) end at the

@@ -1,4 +1,4 @@
-"""Files with a raw mosaic -> sensor values."""
+"""Read raw mosaics."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RAW_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".raw")
 
 @dataclass(frozen=True)
 class RawFormat:
-    """What a packed file does not say itself: its size and packing. Other files need none of it."""
+    """Size and packing of a packed file, which does not contain them. Other files do not need them."""
 
     width: int | None = None
     height: int | None = None

@@ -6,7 +6,7 @@
   const tiles = element("tiles");
   const state = { index: 0, layer: "final", scale: 1, x: 0, y: 0, groundTruth: false };
   const MOST = 32, STEP = 1.25, PAN = 0.1;
-  /* What the tile of the ground truth shows beside maps of errors, to see where an error is. */
+  /* The layer in the ground-truth tile beside error maps. */
   const BESIDE = { error: "final", normal_error: "normal" };
 
   /* Zoom: one scale and one offset for all pictures. The offset is in widths and heights of a tile, so that tiles of
@@ -114,7 +114,7 @@
     let drag = null;
     tiles.addEventListener("wheel", (event) => {
       const frame = event.target.closest(".window");
-      if (!frame || (state.scale === 1 && event.deltaY > 0)) return; /* nothing to zoom out of: scroll the page */
+      if (!frame || (state.scale === 1 && event.deltaY > 0)) return; /* at full size: scroll the page */
       event.preventDefault();
       const box = frame.getBoundingClientRect();
       const factor = Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0018));

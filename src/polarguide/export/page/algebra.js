@@ -1,4 +1,4 @@
-// Vectors are arrays of 3; matrices arrays of 9, row by row.
+// Vectors are arrays of 3; matrices arrays of 9, row-major.
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const add = (a, b, factor = 1) => [a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]];
 const scaled = (a, factor) => [factor * a[0], factor * a[1], factor * a[2]];

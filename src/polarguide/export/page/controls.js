@@ -1,4 +1,4 @@
-/** Mouse, touch and keyboard on the picture. `moved` is called after every change of the view. */
+/** Mouse, touch and keyboard controls of the picture. `moved` is called after every change of the camera. */
 function listen(canvas, navigation, moved, press) {
   const fingers = new Map();
   canvas.addEventListener("pointerdown", (event) => {

@@ -1,4 +1,4 @@
-// In the order that shade.frag counts them.
+// In the order of the indices in shade.frag.
 const LAYERS = ["final", "diffuse", "specular", "base", "strength", "normal"];
 const byId = (id) => document.getElementById(id);
 
@@ -10,7 +10,7 @@ class Page {
     this.looks = { layer: 0, turn: 0, gain: 1, exposure: 1 };
     this.compare = 0.5;
     this.comparing = false;
-    this.coarse = 1; // pixels of the screen a drawn pixel covers while moving
+    this.coarse = 1; // screen pixels per rendered pixel while the camera moves
     this.moving = 0;
     this.sorted = "";
     this.waiting = null;
@@ -113,7 +113,7 @@ class Page {
     return true;
   }
 
-  /** Something moves: draw coarsely until it rests. */
+  /** Render at low resolution while the camera moves. */
   move() {
     this.moving = performance.now();
     this.redraw();
@@ -143,7 +143,7 @@ class Page {
     else if (spent < 25) this.coarse = Math.max(1, this.coarse / 1.15);
   }
 
-  /** Sort, blend and shade for a camera; the canvas takes its size. */
+  /** Sort, blend and shade for a camera; the canvas gets its size. */
   async draw(camera) {
     this.drawing = true;
     const pose = String([camera.rotation.slice(6), camera.translation[2]]);
@@ -163,7 +163,7 @@ class Page {
     }
   }
 
-  /** Layers at a photograph's pose and size, as the addresses of PNG pictures. */
+  /** Layers at a photograph's pose and size, as data URLs of PNG pictures. */
   async pictures(view, layers) {
     const place = this.scene.cameras.findIndex((camera) => camera.name === view);
     if (place < 0 || !layers.every((name) => this.scene.layers.includes(name))) throw new Error("no such view or layer");
@@ -193,7 +193,7 @@ async function main() {
   const canvas = byId("picture"), renderer = new Renderer(canvas, scene, shaders, arrays);
   canvas.addEventListener("webglcontextlost", (event) => {
     event.preventDefault();
-    say("The browser has taken the graphics memory back. Load the page again.");
+    say("The WebGL context was lost. Reload the page.");
   });
   window.polarguide = new Page(scene, renderer, new Orders(meansOf(words, scene.count, scene.texels)));
   await window.polarguide.redraw();

@@ -1,11 +1,11 @@
-/** Where the reader stands: a pose with the lens of a photograph, moved about a pivot. */
+/** The camera: a pose with the intrinsics of a photograph, orbiting a pivot. */
 class Navigation {
   constructor(scene) {
     this.scene = scene;
     this.stand(scene.cameras[scene.first]);
   }
 
-  /** Stand where a photograph was taken. */
+  /** Move to the pose of a photograph. */
   stand(camera) {
     this.lens = camera;
     this.rotation = camera.rotation;
@@ -14,7 +14,7 @@ class Navigation {
     this.pivot = add(this.eye, this.rotation.slice(6), Math.max(ahead, 0.1 * this.scene.distance));
   }
 
-  /** Turn about the pivot by angles around the upward and the rightward axis. */
+  /** Orbit the pivot by angles about the up axis and the right axis. */
   orbit(around, over) {
     const right = this.rotation.slice(0, 3), up = this.scene.up;
     let turn = product(turning(up, around), turning(right, over));
@@ -31,7 +31,7 @@ class Navigation {
     this.eye = add(this.pivot, away, factor);
   }
 
-  /** Shift eye and pivot by a share of the picture's height. */
+  /** Pan camera and pivot by a share of the picture's height. */
   pan(right, down) {
     const far = Math.hypot(...add(this.eye, this.pivot, -1)) * this.lens.height / this.lens.fy;
     const shift = add(scaled(this.rotation.slice(0, 3), -right * far), this.rotation.slice(3, 6), -down * far);
@@ -39,7 +39,7 @@ class Navigation {
     this.pivot = add(this.pivot, shift);
   }
 
-  /** The camera for a picture of some size: the photograph's lens, its whole picture in it. */
+  /** The camera for a picture size: the photograph's intrinsics, scaled so that the whole photograph is visible. */
   camera(width, height) {
     const { lens, rotation } = this, factor = Math.min(width / lens.width, height / lens.height);
     return {

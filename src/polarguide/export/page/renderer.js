@@ -1,15 +1,15 @@
-/** What cannot be shown, in words for the reader. */
+/** An error whose message is shown to the user. */
 class Unable extends Error {}
 
-/** Draws a model: one splat of its layers into float targets, one shading pass. */
+/** Renders a model: one splatting pass into float targets, one shading pass. */
 class Renderer {
   constructor(canvas, scene, shaders, arrays) {
     this.canvas = canvas;
     this.scene = scene;
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false });
-    if (!gl) throw new Unable("This browser offers no WebGL 2.");
+    if (!gl) throw new Unable("This browser does not support WebGL 2.");
     if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float"))
-      throw new Unable("This graphics card cannot draw into float textures.");
+      throw new Unable("This GPU cannot render to float textures.");
     this.gl = gl;
     this.targetCount = { plain: 2, reflection: 3, local: 4, directional: 4 }[scene.kind];
     this.further = this.targetCount > 3;
@@ -38,8 +38,8 @@ class Renderer {
     this.nothing = gl.createVertexArray();
     this.shown = 0;
     this.blended = null;
-    this.derivedFor = null; // the eye
-    this.blendedFor = null; // the camera: other looks need only be shaded again
+    this.derivedFor = null; // the camera position
+    this.blendedFor = null; // the camera; other settings need only the shading pass
   }
 
   program(vertex, fragment) {
@@ -71,10 +71,10 @@ class Renderer {
     return texture;
   }
 
-  /** Numbers in a row as a texture, `width` texels of `channels` a line. */
+  /** A flat array as a texture of `width` texels with `channels` channels per row. */
   table(values, internal, format, type, channels, width = 4096) {
     const gl = this.gl, texture = this.texture(), height = Math.max(1, Math.ceil(values.length / channels / width));
-    if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Unable("The model is too large for this graphics card.");
+    if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Unable("The model is too large for this GPU.");
     const whole = new values.constructor(width * height * channels);
     whole.set(values);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
@@ -92,7 +92,7 @@ class Renderer {
     }
     gl.drawBuffers(textures.map((_, k) => gl.COLOR_ATTACHMENT0 + k));
     if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE && !gl.isContextLost())
-      throw new Unable("This graphics card cannot draw into several float textures.");
+      throw new Unable("This GPU cannot render to several float textures.");
     return { frame, textures, width, height };
   }
 
@@ -122,7 +122,7 @@ class Renderer {
     this.blendedFor = null;
   }
 
-  /** Blend the layers for a camera of the size of the picture. */
+  /** Splat the layers for a camera of the picture's size. */
   splat(camera) {
     const wanted = JSON.stringify(camera);
     if (wanted === this.blendedFor) return;
@@ -167,7 +167,7 @@ class Renderer {
     };
   }
 
-  /** Shade what was blended into the canvas. */
+  /** Shade the splatted layers into the canvas. */
   shade(camera, { layer, split, turn, gain, exposure }) {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -183,7 +183,7 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** Wait until the picture is drawn: reading a pixel does, where finish() does not. */
+  /** Wait until the picture is rendered: reading a pixel waits, unlike finish(). */
   wait() {
     this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
   }

@@ -1,4 +1,4 @@
-// Runs in a worker: the order of the Gaussians from the farthest to the nearest.
+// Runs in a worker: sorts the Gaussians back to front.
 function depthOrder(means, count, forward, offset) {
   const depth = new Float32Array(count), bits = new Uint32Array(depth.buffer);
   let order = new Uint32Array(count), other = new Uint32Array(count), shown = 0;
@@ -7,7 +7,7 @@ function depthOrder(means, count, forward, offset) {
     depth[i] = z;
     if (z > 0.01) order[shown++] = i;
   }
-  // A radix sort on the bits of positive floats, inverted: stable, in three passes.
+  // A stable radix sort in three passes on the inverted bits of positive floats.
   for (let shift = 0; shift < 32; shift += 11) {
     const begin = new Uint32Array(2049);
     for (let i = 0; i < shown; ++i) ++begin[((~bits[order[i]] >>> shift) & 2047) + 1];

@@ -1,4 +1,4 @@
-// From the page's data to arrays, and orders of the Gaussians from a worker.
+// Decode the page's data to arrays, and sort the Gaussians in a worker.
 async function unpacked(id) {
   const text = byId(id).textContent.trim();
   if (!text) return null;
@@ -8,7 +8,7 @@ async function unpacked(id) {
   return new Uint8Array(await new Response(whole).arrayBuffer());
 }
 
-/** The records from their planes: byte k of every Gaussian lies together. */
+/** Interleave the records, which are stored by byte position: byte k of all Gaussians first. */
 function records(planes, count, size) {
   const bytes = new Uint8Array(count * size);
   for (let k = 0; k < size; ++k) {
@@ -24,7 +24,7 @@ function meansOf(words, count, texels) {
   return means;
 }
 
-/** Asks for orders; one question at a time. */
+/** Requests sorted orders, one at a time. */
 class Orders {
   constructor(means) {
     this.asked = new Map();
@@ -39,7 +39,7 @@ class Orders {
       };
       this.worker.postMessage({ means });
     } catch {
-      this.worker = null; // a browser that allows no worker here: sorting holds up the page, but works
+      this.worker = null; // workers are not allowed here: sort in the main thread
     }
   }
 

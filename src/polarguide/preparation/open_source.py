@@ -1,4 +1,4 @@
-"""Which format a folder has, and where its poses come from."""
+"""Detect the format of a folder, and the origin of its poses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.filter import find_shots
-from polarguide.capture.layout import angle_folders, contents
+from polarguide.capture.layout import angle_folders, describe_contents
 from polarguide.errors import PolarguideError
 from polarguide.preparation.filter_source import FilterSource
 from polarguide.preparation.mosaic_source import MosaicSource
@@ -19,7 +19,7 @@ from polarguide.preparation.stokes_source import StokesSource
 
 
 def open_source(root: Path, settings: PrepareSettings) -> Source:
-    """The pictures in a folder, in the format asked for or found.
+    """Open the pictures in a folder, in the given or detected format.
 
     Raises:
         PolarguideError: there is no such folder, or nothing in it that can be read.
@@ -45,7 +45,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             expected="raw mosaics (PNG, TIFF, .npy, .raw) or four shots per view (folders 0, 45, 90, 135)"
             if kind in ("mosaic", "filter")
             else f"the files of a {kind} dataset",
-            found=contents(root),
+            found=describe_contents(root),
             remedy="See docs/formats.md for the layouts.",
         )
     return found if settings.masks is None else MaskedSource(found, settings.masks)
@@ -65,7 +65,7 @@ def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
 
 
 def origin_of_poses(pictures: Source, asked: str) -> str:
-    """Where poses come from: "dataset", "sfm", "none" or a path."""
+    """The origin of the poses: "dataset", "sfm", "none" or a path."""
     if asked == "auto":
         return "sfm" if pictures.cameras is None else "dataset"
     if asked == "dataset" and pictures.cameras is None:
@@ -73,13 +73,13 @@ def origin_of_poses(pictures: Source, asked: str) -> str:
             "--poses",
             expected=f"sfm, none or the path of a COLMAP model for the format {pictures.kind}",
             found="dataset",
-            remedy="Only published datasets bring poses of their own.",
+            remedy="Only published datasets contain poses.",
         )
     return asked
 
 
-def given_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
-    """Poses that are known before any picture is read."""
+def known_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
+    """The poses of a dataset or COLMAP model; None for other origins."""
     if origin in ("sfm", "none"):
         return None
     if origin == "dataset":

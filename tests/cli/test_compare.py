@@ -1,4 +1,4 @@
-"""A comparison from its first interruption to its last report."""
+"""``polarguide compare`` from its first interruption to its last report, and what it refuses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 
-pytestmark = pytest.mark.slow
 PATIENCE = 120.0
 FLAGS = ("--steps", "200", "--downscale", "8", "--jobs", "1", "--recipes", "3dgs-dr")
 
@@ -38,6 +37,7 @@ def planned_folders(scene: Path, out: Path) -> list[Path]:
     return [planned.folder for planned in plan_runs(question, scene_entries(question))]
 
 
+@pytest.mark.slow
 def test_interrupted_failed_and_finished(
     demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -72,7 +72,8 @@ def test_interrupted_failed_and_finished(
     assert run(command) == 2
     said = capsys.readouterr()
     assert "expected 2 finished runs, found that 1 failed (demo, 3dgs, seed 0: " in said.err
-    assert f"{second}/run.json: expected the configuration of a run" in said.err
+    assert f"{second}/run.json: expected " in said.err
+    assert len(said.err.splitlines()) == 1
     assert "done  demo, 3dgs-dr, seed 0" in said.out
     record = json.loads((out / "results.json").read_text())
     validate_results(record)
@@ -97,3 +98,36 @@ def test_interrupted_failed_and_finished(
     assert page.count("data:image/png") == 3 * 2  # the true and the rendered normals of three views
     assert page.count("data:image/jpeg") == 3 * (3 + 5)
     assert not list(out.glob(".*.tmp"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--recipes", "magic"], "recipe: expected one of"),
+        (["--recipes", "3dgs", "3dgs"], "--recipes: expected every name once"),
+        (["--recipes", "3dgs", "--steps", "0"], "--steps: expected 1 or more"),
+        (["--recipes", "3dgs", "--seeds", "0"], "--seeds: expected 1 or more"),
+        (["--recipes", "3dgs", "--threads", "0"], "--threads: expected 1 or more"),
+        (["--recipes", "3dgs", "--jobs", "-1"], "--jobs: expected"),
+        (["--recipes", "3dgs", "--report-views", "-1"], "--report-views: expected"),
+        (["--recipes", "3dgs", "--refractive-index", "5"], "--refractive-index"),
+        (["--recipes", "3dgs", "--device", "cuda"], "--device cuda"),
+        (["--recipes", "3dgs", "--downscale", "0"], "downscale: expected"),
+    ],
+)
+def test_refusals(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+) -> None:
+    assert run(["compare", str(demo_scene), *arguments, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_scenes_of_one_name_are_refused(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["compare", str(demo_scene), str(demo_scene), "--recipes", "3dgs", "--downscale", "8"]
+    assert run([*command, "--out", str(tmp_path / "out")]) == 2
+    assert "expected scenes with names of their own, found demo twice" in capsys.readouterr().err
