@@ -73,6 +73,7 @@ def test_interrupted_failed_and_finished(
     said = capsys.readouterr()
     assert "expected 2 finished runs, found that 1 failed (demo, 3dgs, seed 0: " in said.err
     assert f"{second}/run.json: expected " in said.err
+    assert len(said.err.splitlines()) == 1
     assert "done  demo, 3dgs-dr, seed 0" in said.out
     record = json.loads((out / "results.json").read_text())
     validate_results(record)
@@ -103,12 +104,12 @@ def test_interrupted_failed_and_finished(
     ("arguments", "said"),
     [
         (["--recipes", "magic"], "recipe: expected one of"),
-        (["--recipes", "3dgs", "3dgs"], "recipes: expected every name once"),
+        (["--recipes", "3dgs", "3dgs"], "--recipes: expected every name once"),
         (["--recipes", "3dgs", "--steps", "0"], "--steps: expected 1 or more"),
-        (["--recipes", "3dgs", "--seeds", "0"], "seeds: expected 1 or more"),
-        (["--recipes", "3dgs", "--threads", "0"], "threads: expected 1 or more"),
-        (["--recipes", "3dgs", "--jobs", "-1"], "jobs: expected"),
-        (["--recipes", "3dgs", "--report-views", "-1"], "report-views: expected"),
+        (["--recipes", "3dgs", "--seeds", "0"], "--seeds: expected 1 or more"),
+        (["--recipes", "3dgs", "--threads", "0"], "--threads: expected 1 or more"),
+        (["--recipes", "3dgs", "--jobs", "-1"], "--jobs: expected"),
+        (["--recipes", "3dgs", "--report-views", "-1"], "--report-views: expected"),
         (["--recipes", "3dgs", "--refractive-index", "5"], "--refractive-index"),
         (["--recipes", "3dgs", "--device", "cuda"], "--device cuda"),
         (["--recipes", "3dgs", "--downscale", "0"], "downscale: expected"),

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from polarguide.color import srgb_encode
+from polarguide.files import atomic
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display, write_ply
-from polarguide.color import srgb_encode
 from polarguide.shading.model import Light, Parameters, ShadingModel
-from polarguide.files import atomic
 from polarguide.training.state import TrainingState
 
 

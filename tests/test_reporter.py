@@ -1,4 +1,4 @@
-"""Reporters: silent by default."""
+"""Reporters are silent by default."""
 
 from __future__ import annotations
 

@@ -1,0 +1,77 @@
+"""Comparisons and ablations from Python: they print nothing, return their record, and keep a failure in it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+import polarguide
+from polarguide.errors import PolarguideError
+from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.plan import Comparison, plan_runs, scene_entries
+from polarguide.experiments.results import read_results
+from polarguide.progress import Reporter
+from polarguide.recipes import recipe_named
+from polarguide.training.settings import TrainSettings
+
+SETTINGS = TrainSettings(steps=20)
+OPTIONS = CompareOptions(downscale=8, jobs=1, report_views=1)
+
+
+class Messages(Reporter):
+    """Collects what is said."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+
+@pytest.mark.slow
+def test_a_comparison_and_an_ablation_share_runs(
+    demo_scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    messages = Messages()
+    results = polarguide.compare(
+        [demo_scene],
+        [recipe_named("3dgs-dr")],
+        tmp_path,
+        settings=SETTINGS,
+        options=OPTIONS,
+        reporter=messages,
+    )
+    assert messages.said == ["runs: 1, of them finished before: 0", "done  demo, 3dgs-dr, seed 0"]
+    assert read_results(tmp_path / "results.json") == results
+    (run,) = results["runs"]
+    assert (run["state"], run["error"]) == ("done", None)
+    assert results["table"][0]["cells"]["psnr"]["mean"] == run["metrics"]["psnr"]  # type: ignore[index]
+    assert (tmp_path / "report.html").exists()
+
+    # The run of an ablation cannot begin: its folder holds something else.
+    only = "3dgs-dr:consistent"
+    question = Comparison((demo_scene,), (recipe_named(only),), SETTINGS, OPTIONS, tmp_path)
+    (planned,) = plan_runs(question, scene_entries(question))
+    planned.folder.mkdir(parents=True)
+    (planned.folder / "run.json").write_text("[]")
+    results = polarguide.ablate(
+        [demo_scene], "3dgs-dr", tmp_path, only=["consistent"], settings=SETTINGS, options=OPTIONS
+    )
+    assert [(r["recipe"], r["state"]) for r in results["runs"]] == [("3dgs-dr", "done"), (only, "failed")]
+    assert "run.json" in str(results["runs"][1]["error"])
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_recipe_that_other_processes_do_not_know_is_refused(demo_scene: Path, tmp_path: Path) -> None:
+    changed = dataclasses.replace(recipe_named("3dgs"), ssim_weight=0.3)
+    with pytest.raises(PolarguideError, match="expected the registered recipe 3dgs, found one of this name"):
+        polarguide.compare([demo_scene], [changed], tmp_path / "out")
+    with pytest.raises(PolarguideError, match="recipe: expected one of"):
+        polarguide.compare([demo_scene], ["magic"], tmp_path / "out")
+    with pytest.raises(PolarguideError, match="compare: expected a scene, found none"):
+        polarguide.compare([], ["3dgs"], tmp_path / "out")
+    with pytest.raises(PolarguideError, match="compare: expected a recipe, found none"):
+        polarguide.compare([demo_scene], [], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
