@@ -138,6 +138,8 @@ def test_options_exist():
     words = set(parameters())
     unknown = {}
     for path in TEXTS:
+        if path.name == "CHANGELOG.md":  # it names options that are no more
+            continue
         for option in re.findall(r"(?<![\w-])--([a-z][a-z-]+)", text_of(path)):
             if option not in FOREIGN_OPTIONS and option.replace("-", "_") not in words:
                 unknown.setdefault(option, path.name)
