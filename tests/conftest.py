@@ -3,6 +3,7 @@
 The reason of a skip names what is missing and, behind an arrow, the command that brings it.
 """
 
+import contextlib
 import os
 import signal
 from collections import Counter
@@ -26,6 +27,12 @@ from polarguide.training.settings import TrainSettings
 torch.set_num_threads(1)
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as a shell starts what runs in its background
     signal.signal(signal.SIGINT, signal.default_int_handler)
+with contextlib.suppress(ImportError):  # a machine that runs the GPU's tests alone has none
+    import hypothesis
+
+    # An example's time says how busy the machine is.
+    hypothesis.settings.register_profile("untimed", hypothesis.settings(), deadline=None)
+    hypothesis.settings.load_profile("untimed")
 
 STEPS = 40
 SHORT = ("--downscale", "4", "--steps", str(STEPS), "--threads", "1")

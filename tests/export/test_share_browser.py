@@ -1,6 +1,6 @@
 """The page in a browser: what it draws against our rasterizer, every control pressed, and no request made.
 
-Needs Playwright (``pip install polarguide[browser]``) and a Chromium of the system.
+Needs a Chromium of the system; the extra ``test`` brings Playwright.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The viewer in a real browser: its picture at a photograph's pose against ``render``, and its controls.
 
-Needs Playwright (``pip install polarguide[browser]``) and a Chromium of the system.
+Needs a Chromium of the system; the extra ``test`` brings Playwright.
 """
 
 from __future__ import annotations
