@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import oriented
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.datasets import Dataset, resized_mask
-from polarguide.errors import PolarguideError
+from polarguide.capture.datasets.dataset import Dataset, not_as_published, resized_mask
 from polarguide.polarizer import four_intensities
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import DevelopedView
@@ -68,12 +67,8 @@ class StokesSource:
             advance(number)
         bright = float(np.percentile(np.concatenate(peaks), _BRIGHT))
         if not largest > 0:
-            raise PolarguideError(
-                self.paths[0],
-                expected="light in at least one view",
-                found="intensities that are all 0 or less",
-                remedy="Take the files from the dataset as they were published.",
-            )
+            found = "intensities that are all 0 or less"
+            raise not_as_published(self.paths[0], "light in at least one view", found)
         white = min(largest, _HEADROOM * bright) if bright > 0 else largest
         share = negative / max(1, 12 * count)
         notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}."]

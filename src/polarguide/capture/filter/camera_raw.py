@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.formats.arrays import array_kind
 from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
 from polarguide.errors import PolarguideError
 
@@ -78,7 +79,7 @@ def read_camera_raw(
         raise PolarguideError(
             path,
             expected="a camera raw file with three colors",
-            found=f"an array {'x'.join(map(str, pixels.shape))} of {pixels.dtype}",
+            found=array_kind(pixels),
             remedy="Develop it to 16-bit linear TIFF.",
         )
     return pixels, _EXIF_OF_FLIP.get(flip, 1)

@@ -9,6 +9,9 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from pathlib import Path
+
+from polarguide.errors import PolarguideError
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.
@@ -16,6 +19,11 @@ _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _TIFF_CODES = {1: "B", 3: "H", 4: "I"}
 _TIFF_STRIPS = ((273, 279), (324, 325))
+
+
+def damaged(path: Path, expected: str, found: str) -> PolarguideError:
+    """The error that a file cannot be decoded."""
+    return PolarguideError(path, expected=expected, found=found, remedy="Copy or export the file again.")
 
 
 def find_damage(data: bytes) -> str | None:

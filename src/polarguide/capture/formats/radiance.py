@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.formats.arrays import array_kind, read_array
+from polarguide.capture.formats.integrity import damaged
 from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
 from polarguide.errors import PolarguideError
 
-RADIANCE_SUFFIXES = (".hdr", ".exr", ".npy")
 _HDR_SIZE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
 
 openexr: ModuleType | None
@@ -48,12 +48,9 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3) or 0 in pixels.shape or pixels.dtype.kind != "f":
-        shape = "x".join(map(str, pixels.shape)) or "a single value"
+        expected = "a picture of floating-point numbers with one or three channels"
         raise PolarguideError(
-            path,
-            expected="a picture of floating-point numbers with one or three channels",
-            found=f"an array {shape} of {pixels.dtype}",
-            remedy="Export the file again.",
+            path, expected=expected, found=array_kind(pixels), remedy="Export the file again."
         )
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), dtype=np.float32)
@@ -71,12 +68,7 @@ def _read_hdr(path: Path) -> NDArray[Any]:
         if 0 < height * width <= min(LARGEST_PIXELS, 64 * len(data)):
             pixels = _decoded(data)
     if pixels is None or pixels.dtype != np.float32 or pixels.ndim != 3:
-        raise PolarguideError(
-            path,
-            expected="a complete Radiance HDR file",
-            found=found,
-            remedy="Copy or export the file again.",
-        )
+        raise damaged(path, "a complete Radiance HDR file", found)
     return pixels[..., 2::-1]
 
 
@@ -108,12 +100,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
         except Exception as error:  # the binding raises whatever C++ threw
             found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
     if pixels is None:
-        raise PolarguideError(
-            path,
-            expected="a complete OpenEXR file with channels R, G and B, or Y",
-            found=found,
-            remedy="Copy or export the file again.",
-        )
+        raise damaged(path, "a complete OpenEXR file with channels R, G and B, or Y", found)
     return pixels
 
 
