@@ -10,6 +10,7 @@ from pathlib import Path
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.view import ANGLES, listed, unknown_view
 from polarguide.errors import PolarguideError
+from polarguide.files import require_folder
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
@@ -49,13 +50,7 @@ def find_layout(root: Path) -> Layout:
     Raises:
         PolarguideError: there is no such folder, it has neither layout, or two files have the same view and angle.
     """
-    if not root.is_dir():
-        raise PolarguideError(
-            root,
-            expected="a capture folder",
-            found="a file" if root.exists() else "nothing",
-            remedy=_HINT,
-        )
+    require_folder(root, expected="a capture folder", remedy=_HINT)
     warnings: list[str] = []
     folders = angle_folders(root)
     if (root / "polar").is_dir():

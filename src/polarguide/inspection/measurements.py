@@ -41,13 +41,13 @@ class ViewMeasurements:
     saturated: float
     invalid: float
     dark: float
-    noise: float
-    noise_share: float
-    pair_ratio: float | None
-    sum_error: float
-    dolp: tuple[float, float]
-    polarized: float
-    above_limit: float
+    noise: float = 0.0
+    noise_share: float = 0.0
+    pair_ratio: float | None = None
+    sum_error: float = 0.0
+    dolp: tuple[float, float] = (0.0, 0.0)
+    polarized: float = 0.0
+    above_limit: float = 0.0
 
     def record(self) -> dict[str, Any]:
         """As plain JSON types."""
@@ -69,20 +69,7 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     noise = optics.intensity_noise(gray)
     bright = _quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
     saturated, invalid = (float(mask.float().mean()) for mask in (view.saturated, view.invalid))
-    nothing = ViewMeasurements(
-        view.name,
-        bright,
-        saturated,
-        invalid,
-        float(dark.float().mean()),
-        0.0,
-        0.0,
-        None,
-        0.0,
-        (0.0, 0.0),
-        0.0,
-        0.0,
-    )
+    nothing = ViewMeasurements(view.name, bright, saturated, invalid, float(dark.float().mean()))
     if share < 0.001:
         return nothing
     i0, i45, i90, i135 = (angle[good] for angle in gray)

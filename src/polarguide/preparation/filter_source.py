@@ -18,28 +18,21 @@ from polarguide.capture.calibration import (
     pair_ratio,
 )
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.filter import (
-    Shift,
-    align_shots,
-    decide_transfer,
-    estimate_shifts,
-    find_shots,
-    is_camera_raw,
-    linear_intensities,
-    read_shots,
-)
+from polarguide.capture.filter.align import Shift, align_shots, estimate_shifts
+from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
-from polarguide.capture.filter.shots import require_four_shots
+from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
+from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings, white_gains
-from polarguide.preparation.source import DevelopedView
+from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 _JUDGED_VIEWS = 8
 
 
-class FilterSource:
+class FilterSource(Source):
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
@@ -50,6 +43,8 @@ class FilterSource:
         shots = find_shots(root)
         require_four_shots(root, shots)
         self._files = dict(sorted(shots.items()))
+        self.views = list(self._files)
+        self.paths = [files[angle] for files in self._files.values() for angle in ANGLES]
         self._raw = [path for path in self.paths if is_camera_raw(path)]
         white = white_gains(settings.white_balance)
         if white is None or (white != (1.0, 1.0, 1.0) and len(self._raw) < len(self.paths)):
@@ -67,16 +62,6 @@ class FilterSource:
                 found="srgb",
                 remedy="Omit it.",
             )
-
-    @property
-    def views(self) -> list[str]:
-        """View names, sorted."""
-        return list(self._files)
-
-    @property
-    def paths(self) -> list[Path]:
-        """All files that are read."""
-        return [files[angle] for files in self._files.values() for angle in ANGLES]
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """The transfer of the capture, from a few views spread over it."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.datasets.dataset import Dataset, not_as_published, resized_mask
 from polarguide.polarizer import four_intensities
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import DevelopedView
+from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 PAIR_SUMS = (
@@ -25,26 +24,16 @@ _HEADROOM = 2.0
 _SAMPLES = 20_000
 
 
-class StokesSource:
+class StokesSource(Source):
     """Stokes vectors in any unit, without a full scale."""
 
     def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
         """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
-        self.kind = dataset.name
-        self.cameras = dataset.cameras
+        self.kind, self.cameras = dataset.name, dataset.cameras
+        self.views, self.paths = dataset.views, dataset.paths
         self._dataset = dataset
         asked = settings.calibration
         self._calibration = replace(asked, sense=asked.sense or dataset.sense)
-
-    @property
-    def views(self) -> list[str]:
-        """View names, sorted."""
-        return self._dataset.views
-
-    @property
-    def paths(self) -> list[Path]:
-        """All files that are read."""
-        return self._dataset.paths
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.

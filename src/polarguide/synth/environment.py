@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.errors import PolarguideError
+from polarguide.synth.makers import make
 from polarguide.synth.mesh import Array
 from polarguide.synth.noise import fractal_noise
 from polarguide.synth.textures import image
@@ -186,17 +186,6 @@ def make_environment(data: dict[str, Any], where: str, folder: Path) -> Array:
     Raises:
         PolarguideError: the type or a field is unknown, or a value is invalid.
     """
-    fields = dict(data)
-    kind = fields.pop("type", None)
-    maker = ENVIRONMENTS.get(kind) if isinstance(kind, str) else None
-    try:
-        if maker is None:
-            raise ValueError(f"the type {kind!r}")
-        return maker(**fields, **({"folder": folder} if kind == "image" else {}))
-    except (TypeError, ValueError, KeyError) as error:
-        raise PolarguideError(
-            f"{where} (environment)",
-            expected=f"a type of {', '.join(ENVIRONMENTS)} with its fields",
-            found=str(error),
-            remedy="docs/dataset.md describes them.",
-        ) from error
+    makers = {**ENVIRONMENTS, "image": lambda file: image(file, folder)}
+    expected = f"a type of {', '.join(ENVIRONMENTS)} with its fields"
+    return make(makers, data, f"{where} (environment)", expected)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -85,12 +85,8 @@ def synthesize(
     names = view_names(spec.camera.views)
     tests = held_out_names(names)
     if variant.note:
-        paths = (
-            settings.width
-            * settings.height
-            * settings.samples
-            * (len(names) + (TEST_SAMPLES - 1) * len(tests))
-        )
+        views = len(names) + (TEST_SAMPLES - 1) * len(tests)
+        paths = settings.width * settings.height * settings.samples * views
         reporter.warn(f"{variant.note} It will take {slow_estimate(paths)} on this scene.")
     built = build_scene(spec, out, variant)
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
@@ -129,7 +125,7 @@ def _render_view(job: Job, number: int) -> None:
     """Render one view and write its files."""
     settings, name, camera = job.settings, job.names[number], job.cameras[number]
     samples = settings.samples * (TEST_SAMPLES if name in job.tests else 1)
-    big = _doubled(camera) if job.mosaics else camera
+    big = camera.scaled(2, 2 * camera.width, 2 * camera.height) if job.mosaics else camera
     if job.mosaics:
         samples = max(1, samples // 4)
     limits = PathLimits(job.built.spec.depth, job.built.spec.clamp / job.exposure)
@@ -165,22 +161,10 @@ def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> fl
     values = []
     for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
         factor = max(1, camera.width // METER_WIDTH)
-        light = render_lobes(
-            built.scenes,
-            camera.downscaled(factor),
-            METER_SAMPLES,
-            seed=seed,
-            limits=PathLimits(built.spec.depth),
-        )
+        limits, small = PathLimits(built.spec.depth), camera.downscaled(factor)
+        light = render_lobes(built.scenes, small, METER_SAMPLES, seed=seed, limits=limits)
         values.append(light.stokes[0].ravel())
     return float(f"{BRIGHT / max(float(np.percentile(np.concatenate(values), 99)), 1e-9):.4g}")
-
-
-def _doubled(camera: Camera) -> Camera:
-    return replace(
-        camera, width=2 * camera.width, height=2 * camera.height,
-        fx=2 * camera.fx, fy=2 * camera.fy, cx=2 * camera.cx, cy=2 * camera.cy,
-    )  # fmt: skip
 
 
 def _halved(values: Array) -> Array:

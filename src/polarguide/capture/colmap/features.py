@@ -89,12 +89,7 @@ def match_features(
         numbers: dict[str, tuple[int, int]] = {}
         if cameras is not None:
             numbers = run_step(
-                lambda: _write_intrinsics(database, cameras),
-                seed,
-                reporter,
-                "setting intrinsics",
-                None,
-                lambda: 0,
+                lambda: _write_intrinsics(database, cameras), seed, reporter, "setting intrinsics"
             )
         with _RowCounter(database, "two_view_geometries") as counter:
             run_step(
@@ -149,8 +144,8 @@ def run_step(
     seed: int,
     reporter: Reporter,
     label: str,
-    total: int | None,
-    done: Callable[[], int],
+    total: int | None = None,
+    done: Callable[[], int] = lambda: 0,
 ) -> Any:
     """Run a step of COLMAP in a thread, so that progress is shown and Ctrl-C ends the program at once.
 
@@ -196,6 +191,14 @@ def set_seed(options: Any, seed: int) -> None:
     """Set the seed of COLMAP's options, if this version of COLMAP has one."""
     if hasattr(options, "random_seed"):
         options.random_seed = seed
+
+
+def pipeline_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """The options of mapping and triangulation, with all of their seeds."""
+    options = pycolmap.IncrementalPipelineOptions()
+    for part in (options, options.mapper, options.triangulation):
+        set_seed(part, seed)
+    return options
 
 
 class _RowCounter:

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.features import match_features, run_step, set_seed
+from polarguide.capture.colmap.features import match_features, pipeline_options, run_step
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
@@ -112,11 +112,9 @@ def _map(
     database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter, free: bool
 ) -> dict[int, Any]:
     """Incremental mapping: pycolmap's models, by number; ``free`` intrinsics are estimated."""
-    options = pycolmap.IncrementalPipelineOptions()
+    options = pipeline_options(seed)
     options.min_model_size = _LEAST
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
-    for part in (options, options.mapper, options.triangulation):
-        set_seed(part, seed)
     placed = [0]
 
     def step() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.features import match_features, run_step, set_seed
+from polarguide.capture.colmap.features import match_features, pipeline_options, run_step
 from polarguide.capture.colmap.model import load_model
 from polarguide.capture.colmap.visual_hull import colmap_camera, sample_visual_hull
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
@@ -107,15 +107,12 @@ def _triangulated(
         with writing(start):
             write_cameras(start, cameras, numbers)
         model = load_model(start, ".bin")
-        options = pycolmap.IncrementalPipelineOptions()
-        for part in (options, options.mapper, options.triangulation):
-            set_seed(part, seed)
-        options.ba_refine_focal_length = options.ba_refine_principal_point = (
-            options.ba_refine_extra_params
-        ) = False
+        options = pipeline_options(seed)
+        for name in ("focal_length", "principal_point", "extra_params"):
+            setattr(options, f"ba_refine_{name}", False)
         made = run_step(
             lambda: pycolmap.triangulate_points(model, database, images, trial, options=options),
-            seed, reporter, "triangulating", None, lambda: 0,
+            seed, reporter, "triangulating",
         )  # fmt: skip
     except PolarguideError as error:
         reporter.warn(f"Triangulation failed ({error.found}).")

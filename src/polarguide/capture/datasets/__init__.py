@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from polarguide.capture.datasets.dataset import Dataset, StokesImage, resized_mask
+from polarguide.capture.datasets.dataset import Dataset
 from polarguide.capture.datasets.gnerp import is_gnerp, open_gnerp
 from polarguide.capture.datasets.neisf import is_neisf, open_neisf
 from polarguide.capture.datasets.nersp import is_nersp, open_nersp
 from polarguide.capture.datasets.pandora import is_pandora, open_pandora
-from polarguide.capture.datasets.pisr import SENSOR as PISR_SENSOR
 from polarguide.capture.datasets.pisr import is_pisr, open_pisr
 
 DATASETS = {
@@ -39,14 +38,3 @@ def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
     if name == "gnerp":
         return open_gnerp(root, transfer=transfer)
     return {"pandora": open_pandora, "pisr": open_pisr, "nersp": open_nersp, "neisf": open_neisf}[name](root)
-
-
-__all__ = [
-    "DATASETS",
-    "PISR_SENSOR",
-    "Dataset",
-    "StokesImage",
-    "detect_dataset",
-    "open_dataset",
-    "resized_mask",
-]
