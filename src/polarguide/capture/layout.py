@@ -178,12 +178,7 @@ def angle_folders(root: Path) -> dict[int, Path]:
             continue
         angle = int(match["angle"])
         if angle in folders:
-            raise PolarguideError(
-                root,
-                expected=f"one folder for {angle} degrees",
-                found=f"{folders[angle].name} and {path.name}",
-                remedy="Remove or rename one of them.",
-            )
+            raise ambiguous(root, f"one folder for {angle} degrees", folders[angle], path)
         folders[angle] = path
     return dict(sorted(folders.items()))
 
@@ -197,14 +192,15 @@ def index_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
             continue
         if path.stem in files:
-            raise PolarguideError(
-                folder,
-                expected=f"one file called {path.stem}",
-                found=f"{files[path.stem].name} and {path.name}",
-                remedy="Remove one of them.",
-            )
+            raise ambiguous(folder, f"one file called {path.stem}", files[path.stem], path)
         files[path.stem] = path
     return files
+
+
+def ambiguous(folder: Path, expected: str, first: Path, second: Path) -> PolarguideError:
+    """The error that two files of a folder have the same meaning."""
+    found = f"{first.name} and {second.name}"
+    return PolarguideError(folder, expected=expected, found=found, remedy="Remove or rename one of them.")
 
 
 def describe_contents(root: Path) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import oriented
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.datasets.dataset import Dataset, not_as_published, resized_mask
+from polarguide.capture.datasets.dataset import Dataset, StokesImage, not_as_published, resized_mask
 from polarguide.polarizer import four_intensities
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import DevelopedView, Source
@@ -103,7 +103,6 @@ class StokesSource(Source):
             mask=resized_mask(self._dataset, view, (height, width)),
         )
 
-    def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def _stokes(self, view: str) -> StokesImage:
         assert self._dataset.read_stokes is not None
-        image = self._dataset.read_stokes(view)
-        return image.stokes, image.clipped
+        return self._dataset.read_stokes(view)

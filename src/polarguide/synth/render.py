@@ -93,8 +93,7 @@ def synthesize(
     exposure = spec.exposure or _metered_exposure(built, cameras, settings.seed)
     job = Job(built, settings, out, names, tests, cameras, exposure, Sensor())
     _render_all(job, reporter)
-    _write_model(job, names)
-    folder.write_file(out / "split.json", json.dumps({"test": tests}).encode())
+    write_sparse(built, cameras, names, tests, out, settings)
     clipped = folder.clipped_share(out, names)
     record = scene_record(spec, settings, variant, names, tests, exposure=exposure, clipped=clipped)
     if job.mosaics:
@@ -150,10 +149,19 @@ def _render_view(job: Job, number: int) -> None:
     write_view(job.out, name, codes)
 
 
-def _write_model(job: Job, names: list[str]) -> None:
-    pictures = [folder.photograph(job.out, name) for name in names]
-    sparse = sample_sparse_points(job.built, job.cameras, pictures, job.settings.points, job.settings.seed)
-    write_model(job.out / "sparse" / "0", job.cameras, names, sparse)
+def write_sparse(
+    built: BuiltScene,
+    cameras: list[Camera],
+    names: list[str],
+    tests: list[str],
+    out: Path,
+    settings: SynthSettings,
+) -> None:
+    """Write the COLMAP model of rendered views, and the split into training and test views."""
+    pictures = [folder.photograph(out, name) for name in names]
+    sparse = sample_sparse_points(built, cameras, pictures, settings.points, settings.seed)
+    write_model(out / "sparse" / "0", cameras, names, sparse)
+    folder.write_file(out / "split.json", json.dumps({"test": tests}).encode())
 
 
 def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> float:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from polarguide.capture.colmap.write import PosedCamera
+from polarguide.capture.colmap.write import PosedCamera, colmap_camera
 from polarguide.capture.write import write_png
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
@@ -126,16 +126,7 @@ def _write_intrinsics(database: Path, cameras: Mapping[str, PosedCamera]) -> dic
             image = link.read_image_with_name(f"{view}.png")
             assert image is not None
             numbers[view] = (int(image.image_id), int(image.camera_id))
-            link.update_camera(
-                pycolmap.Camera(
-                    camera_id=image.camera_id,
-                    model=camera.model,
-                    width=camera.width,
-                    height=camera.height,
-                    params=list(camera.parameters),
-                    has_prior_focal_length=True,
-                )
-            )
+            link.update_camera(colmap_camera(camera, camera_id=image.camera_id, has_prior_focal_length=True))
     return numbers
 
 

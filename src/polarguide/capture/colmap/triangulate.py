@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture.colmap.features import match_features, pipeline_options, run_step
 from polarguide.capture.colmap.model import load_model
-from polarguide.capture.colmap.visual_hull import colmap_camera, sample_visual_hull
-from polarguide.capture.colmap.write import PosedCamera, write_cameras
+from polarguide.capture.colmap.visual_hull import sample_visual_hull
+from polarguide.capture.colmap.write import PosedCamera, colmap_camera, write_cameras
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_file
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole, writing

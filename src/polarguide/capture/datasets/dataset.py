@@ -17,18 +17,8 @@ from polarguide.capture.formats.radiance import read_radiance
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
-
-@dataclass(frozen=True, eq=False)
-class StokesImage:
-    """The Stokes vectors of one view.
-
-    Attributes:
-        stokes: [3, H, W, 3] float32, in the dataset's own sense of angles.
-        clipped: pixels at full scale in the dataset's pictures, [H, W].
-    """
-
-    stokes: NDArray[np.float32]
-    clipped: NDArray[np.bool_]
+StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
+"""Stokes vectors of a view [3, H, W, 3] in the dataset's own sense of angles; pixels at full scale in its pictures."""
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -105,7 +95,7 @@ def stokes_dataset(
         planes = [read_radiance(path) for path in files[view]]
         for path, plane in zip(files[view], planes, strict=True):
             require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
-        return StokesImage(stokes(np.stack(planes)), np.zeros(planes[0].shape[:2], bool))
+        return stokes(np.stack(planes)), np.zeros(planes[0].shape[:2], bool)
 
     paths = [*(path for paths in files.values() for path in paths), *masks.values(), cameras_file]
     return Dataset(name, sorted(files), paths, cameras, read_stokes, masks, read_mask, sense, notes=notes)

@@ -40,11 +40,6 @@ from polarguide.records import read_record
 _SHAPES = ((3, 4), (4, 4))
 
 
-def is_gnerp(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return (root / "cameras.json").is_file() and (root / "aop").is_dir() and (root / "dop").is_dir()
-
-
 def open_gnerp(root: Path, *, transfer: str) -> Dataset:
     """Find the files and read the cameras.
 
@@ -72,7 +67,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
         aop, dop = (_plane(files[view], stored.shape, pictures[view]) for files in (angles, degrees))
         s0 = 2 * linear_codes(stored, transfer).astype(np.float32) / np.float32(FULL_CODE)
         stokes = [s0, s0 * (dop * np.cos(2 * aop))[..., None], s0 * (dop * np.sin(2 * aop))[..., None]]
-        return StokesImage(np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2)))
+        return np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2))
 
     used = [files[view] for view in numbers for files in (pictures, angles, degrees)]
     return Dataset(

@@ -22,11 +22,6 @@ _PARTS = ("images_s0", "images_s1", "images_s2")
 _STEM = re.compile(r"img_(\d{1,6})")
 
 
-def is_neisf(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return all((root / part).is_dir() for part in _PARTS)
-
-
 def open_neisf(root: Path) -> Dataset:
     """Find the files and read the cameras.
 

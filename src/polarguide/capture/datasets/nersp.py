@@ -25,11 +25,6 @@ from polarguide.capture.layout import index_files
 _PARTS = ("s0", "s1", "s2")
 
 
-def is_nersp(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return all((root / part).is_dir() for part in _PARTS)
-
-
 def open_nersp(root: Path) -> Dataset:
     """Find the files and read the cameras.
 

@@ -22,11 +22,6 @@ _PARTS = ("s0", "s0p1", "s0p2")
 _STEM = re.compile(r"(?P<view>\d{1,6})_(?P<part>s0|s0p1|s0p2)")
 
 
-def is_pandora(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return (root / "images_stokes").is_dir()
-
-
 def open_pandora(root: Path) -> Dataset:
     """Find the files and read the cameras.
 

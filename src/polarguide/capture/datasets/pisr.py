@@ -28,11 +28,6 @@ SIZE = (1224, 1024)
 _CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 
 
-def is_pisr(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return (root / "raw").is_dir() and (root / "intrinsics.npz").is_file()
-
-
 def open_pisr(root: Path) -> Dataset:
     """Find the files and read the cameras.
 

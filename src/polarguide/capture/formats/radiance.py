@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
@@ -15,15 +13,9 @@ from numpy.typing import NDArray
 from polarguide.capture.formats.arrays import array_kind, read_array
 from polarguide.capture.formats.integrity import damaged
 from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
-from polarguide.errors import PolarguideError
+from polarguide.errors import PolarguideError, optional_import
 
 _HDR_SIZE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
-
-openexr: ModuleType | None
-try:
-    openexr = importlib.import_module("OpenEXR")
-except ImportError:
-    openexr = None
 
 
 def read_radiance(path: Path) -> NDArray[np.float32]:
@@ -85,13 +77,7 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     data = read_file(path)
-    if openexr is None:
-        raise PolarguideError(
-            path,
-            expected="the package OpenEXR, which reads this format",
-            found="that it is not installed",
-            remedy="pip install 'polarguide[exr]'",
-        )
+    openexr = optional_import("OpenEXR", str(path), install="'polarguide[exr]'")
     found = "an empty file" if not data else "one that is damaged, cut short or something else"
     pixels = None
     if data.startswith(b"\x76\x2f\x31\x01"):
@@ -104,7 +90,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
     return pixels
 
 
-def _exr_channels(path: Path, package: ModuleType) -> NDArray[Any] | None:
+def _exr_channels(path: Path, package: Any) -> NDArray[Any] | None:
     with package.File(str(path), separate_channels=True) as file:
         window = file.header()["dataWindow"]
         width, height = (int(window[1][axis]) - int(window[0][axis]) + 1 for axis in (0, 1))
