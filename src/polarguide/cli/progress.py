@@ -29,14 +29,17 @@ class ConsoleReporter(Reporter):
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
-            TimeRemainingColumn(),
             TextColumn("{task.fields[note]}", markup=False),
+            TimeRemainingColumn(),
         )
         with Progress(*columns, console=console, transient=True) as progress:
             task = progress.add_task(label, total=total, note="")
 
             def advance(done: int, *, total: int | None = None, note: str = "") -> None:
                 progress.live.transient = not note
-                progress.update(task, completed=done, total=total, note=note)
+                # A note needs the room of the label, and says as much.
+                progress.update(
+                    task, completed=done, total=total, note=note, description="" if note else label
+                )
 
             yield advance

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polarguide.capture.calibration import (
     LARGEST_IMBALANCE,
@@ -114,7 +113,8 @@ class FilterSource(Source):
                 notes.append(f"{view}: (I0 + I90)/(I45 + I135) {said}; not corrected.")
         factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
         linear = oriented(linear * factors[:, None, None, None], asked.calibration)
-        upright = _apply_orientation(linear, shots.orientation)
+        turned = np.stack([apply_orientation(picture, shots.orientation) for picture in linear])
+        upright = np.ascontiguousarray(oriented(turned, orientation_calibration(shots.orientation)))
         height, width = upright.shape[1:3]
         return DevelopedView(
             intensities=upright,
@@ -132,12 +132,6 @@ class FilterSource(Source):
             },
             notes=tuple(notes),
         )
-
-
-def _apply_orientation(linear: NDArray[np.float32], code: int) -> NDArray[np.float32]:
-    """Apply the EXIF orientation to the pixels, and the same rotation to the angles."""
-    pictures = np.stack([apply_orientation(picture, code) for picture in linear])
-    return np.ascontiguousarray(oriented(pictures, orientation_calibration(code)))
 
 
 def _shift_notes(view: str, shifts: list[Shift]) -> list[str]:

@@ -5,6 +5,7 @@ A panorama is [H, W, 3] linear radiance; rows go from the zenith down, columns c
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,9 @@ def make_environment(data: dict[str, Any], where: str, folder: Path) -> Array:
     Raises:
         PolarguideError: the type or a field is unknown, or a value is invalid.
     """
-    makers = {**ENVIRONMENTS, "image": lambda file: image(file, folder)}
+    makers: dict[str, Callable[..., Array]] = {
+        **ENVIRONMENTS,
+        "image": functools.partial(image, folder=folder),
+    }
     expected = f"a type of {', '.join(ENVIRONMENTS)} with its fields"
     return make(makers, data, f"{where} (environment)", expected)

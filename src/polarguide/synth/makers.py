@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from polarguide.errors import PolarguideError
 
 T = TypeVar("T")
-REMEDY = "docs/dataset.md describes them."
+REMEDY = "docs/reference/scene-files.md describes them."
 
 
 def make(makers: Mapping[str, Callable[..., T]], data: Mapping[str, Any], where: str, expected: str) -> T:

@@ -1,6 +1,6 @@
 """Procedural geometry: the types of ``shape`` of an object.
 
-Every shape is centered at the origin or stands on it, with z up; docs/dataset.md describes the fields.
+Every shape is centered at the origin or stands on it, with z up; docs/reference/scene-files.md describes the fields.
 """
 
 from __future__ import annotations

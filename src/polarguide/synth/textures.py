@@ -6,6 +6,7 @@ are linear sRGB. The type ``image`` reads a user's picture.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -168,7 +169,7 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
     Raises:
         PolarguideError: the type or a field is unknown, or a value makes no sense.
     """
-    makers = {**TEXTURES, "image": lambda file: image(file, folder)}
+    makers: dict[str, Callable[..., Array]] = {**TEXTURES, "image": functools.partial(image, folder=folder)}
     expected = f'a color, "own", or a texture with type {", ".join(TEXTURES)}'
     return make(makers, data, f"{where} material.color", expected)
 

@@ -7,9 +7,8 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -81,20 +80,20 @@ def match_features(
         reading["reader_options"] = pycolmap.ImageReaderOptions()
         reading["reader_options"].mask_path = str(_named_for_colmap(masks, sizes))
     try:
-        with _RowCounter(database, "keypoints") as counter:
+        with _counted_rows(database, "keypoints") as rows:
             run_step(
                 lambda: pycolmap.extract_features(database, images, camera_mode=mode, **reading),
-                seed, reporter, "extracting features", count, lambda: counter.rows,
+                seed, reporter, "extracting features", count, rows,
             )  # fmt: skip
         numbers: dict[str, tuple[int, int]] = {}
         if cameras is not None:
             numbers = run_step(
                 lambda: _write_intrinsics(database, cameras), seed, reporter, "setting intrinsics"
             )
-        with _RowCounter(database, "two_view_geometries") as counter:
+        with _counted_rows(database, "two_view_geometries") as rows:
             run_step(
                 lambda: compare(database, verification_options=verify),
-                seed, reporter, "matching pairs", pairs, lambda: counter.rows,
+                seed, reporter, "matching pairs", pairs, rows,
             )  # fmt: skip
     except PolarguideError:
         for path in database.parent.glob(f"{database.name}*"):
@@ -192,42 +191,31 @@ def pipeline_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
     return options
 
 
-class _RowCounter:
-    """Counts the rows of a table from a process of its own, for as long as it is entered.
+@contextlib.contextmanager
+def _counted_rows(database: Path, table: str) -> Iterator[Callable[[], int]]:
+    """Counts the rows of a table from a process of its own; yields a function that returns the latest count.
 
     COLMAP brings its own copy of SQLite. Two copies in one process undo each other's file locks (those of POSIX
     belong to processes), and the database is destroyed: it must never be opened, nor even closed, from here.
     """
+    rows = 0
+    command = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, str(database), table]
 
-    def __init__(self, database: Path, table: str) -> None:
-        self.rows = 0
-        self._command = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, str(database), table]
-        self._process: subprocess.Popen[str] | None = None
-        self._listener: threading.Thread | None = None
+    def listen(lines: Iterable[str]) -> None:
+        nonlocal rows
+        for line in lines:
+            rows = max(rows, int(line))
 
-    def __enter__(self) -> _RowCounter:
-        with contextlib.suppress(OSError):  # without a second process there is no progress, but all else
-            self._process = subprocess.Popen(
-                self._command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-            )
-            self._listener = threading.Thread(target=self._listen, daemon=True)
-            self._listener.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._process is None:
-            return
-        self._process.kill()
-        self._process.wait()
-        if self._listener is not None:
-            self._listener.join()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-
-    def _listen(self) -> None:
-        assert self._process is not None
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self.rows = max(self.rows, int(line))
+    try:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    except OSError:  # without a second process there is no progress, but all else
+        yield lambda: 0
+        return
+    with process:
+        listener = threading.Thread(target=listen, args=(process.stdout,), daemon=True)
+        listener.start()
+        try:
+            yield lambda: rows
+        finally:
+            process.kill()
+            listener.join()
