@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 from pathlib import Path
 from typing import Any
@@ -115,13 +116,10 @@ def _map(
     options = pipeline_options(seed)
     options.min_model_size = _LEAST
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
-    placed = [0]
-
-    def step() -> None:
-        placed[0] += 1
-
+    placed: list[None] = []
+    step = functools.partial(placed.append, None)
     found: dict[int, Any] = run_step(
         lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
-        seed, reporter, "registering images", count, lambda: placed[0] + 2 if placed[0] else 0,
+        seed, reporter, "registering images", count, lambda: len(placed) + 2 if placed else 0,
     )  # fmt: skip
     return found

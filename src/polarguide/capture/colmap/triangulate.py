@@ -78,14 +78,10 @@ def add_points(
             f"The poses came without points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
         )
     with writing(model):
-        _replace(model, trial)
+        shutil.rmtree(model, ignore_errors=True)
+        trial.rename(model)
     write_whole(note, (json.dumps(found) + "\n").encode())
     return model, found
-
-
-def _replace(old: Path, new: Path) -> None:
-    shutil.rmtree(old, ignore_errors=True)
-    new.rename(old)
 
 
 def _triangulated(
@@ -170,7 +166,9 @@ def _colors(
         picture = decode_picture(path, read_file(path))
         camera = cameras[view]
         local = places @ camera.rotation.T + camera.translation
-        focal, center = _intrinsics(camera)
+        plain = colmap_camera(camera)  # without its distortion
+        focal = np.array([plain.focal_length_x, plain.focal_length_y])
+        center = np.array([plain.principal_point_x, plain.principal_point_y])
         pixel = local[:, :2] / np.maximum(local[:, 2:], 1e-9) * focal + center
         size = np.array([camera.width, camera.height])
         inside = (local[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
@@ -180,12 +178,3 @@ def _colors(
         seen[inside] += 1
     gray = np.where(seen[:, None] > 0, total / np.maximum(seen, 1)[:, None], 128)
     return np.rint(gray).astype(np.uint8)
-
-
-def _intrinsics(camera: PosedCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Focal lengths and principal point of any of COLMAP's models, without distortion."""
-    made = colmap_camera(camera)
-    return (
-        np.array([made.focal_length_x, made.focal_length_y]),
-        np.array([made.principal_point_x, made.principal_point_y]),
-    )
