@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from simulated_mosaics import linear_intensities
 
 from polarguide.capture.layout import find_layout
-from polarguide.capture.sensor import Pattern, demosaic, sensor_pattern
+from polarguide.capture.sensor.demosaic import demosaic
+from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
 from polarguide.capture.view import ANGLES
 
 ELECTRONS = 10_000

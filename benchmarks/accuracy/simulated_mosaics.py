@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.formats.pictures import decode_picture, linear_codes, read_file
 from polarguide.capture.layout import Layout, find_layout
-from polarguide.capture.sensor import sensor_pattern
+from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.capture.view import ANGLES
 
 FULL = 4095

@@ -111,17 +111,15 @@ class Camera:
         """Turn direction vectors [..., 3] from world axes into camera axes."""
         return vectors @ self.pose(vectors.dtype, vectors.device).rotation.T
 
+    def scaled(self, factor: float, width: int, height: int) -> Camera:
+        """The camera of the same view with ``factor`` times as many pixels each way, in a picture of this size."""
+        inner = {name: factor * getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
+        return replace(self, width=width, height=height, **inner)
+
     def downscaled(self, factor: int) -> Camera:
         """The camera of the same view averaged over ``factor`` x ``factor`` pixel boxes (remainders are cut)."""
-        return replace(
-            self,
-            width=self.width // factor,
-            height=self.height // factor,
-            fx=self.fx / factor,
-            fy=self.fy / factor,
-            cx=self.cx / factor,
-            cy=self.cy / factor,
-        )
+        inner = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
+        return replace(self, width=self.width // factor, height=self.height // factor, **inner)
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> tuple[Tensor, Tensor]:

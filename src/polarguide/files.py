@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from polarguide.errors import PolarguideError
@@ -83,10 +83,25 @@ def writing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def guarded(action: Callable[[], object], path: Path) -> None:
-    """Run what writes ``path``, under ``writing``."""
-    with writing(path):
-        action()
+def require_folder(path: Path, *, expected: str, remedy: str) -> None:
+    """Check that a folder exists.
+
+    Raises:
+        PolarguideError: there is a file of this name, or nothing.
+    """
+    if not path.is_dir():
+        found = "a file" if path.exists() else "nothing"
+        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+
+
+def check_out(path: Path) -> None:
+    """Check that a folder can be written to where there may be none yet.
+
+    Raises:
+        PolarguideError: there is a file of this name.
+    """
+    if path.exists():
+        require_folder(path, expected="a folder to write", remedy="Give another --out.")
 
 
 def read_file(path: Path, *, remedy: str = "Check that the file exists and may be read.") -> bytes:

@@ -113,7 +113,8 @@ def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
     if value is _UNKNOWN:
         found = _plain(got) or "another"
     if what.startswith("Object contains unknown field"):
-        expected = f"only {', '.join(_names(form))}"
+        fields = [field for kind in _kinds(form) for field in getattr(kind, "fields", ())]
+        expected = f"only {', '.join(field.encode_name for field in fields)}"
         found = what.partition("`")[2].rstrip("`")
     elif what.startswith("Object missing required field"):
         expected = f"the field {what.partition('`')[2].rstrip('`')}"
@@ -121,7 +122,7 @@ def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
     elif what.startswith("Number out of range"):
         expected = "a number of usual size"
     elif what.startswith("Invalid enum value"):
-        *others, last = map(str, _choices(form))
+        *others, last = (str(choice) for kind in _kinds(form) for choice in getattr(kind, "values", ()))
         expected = f"{', '.join(others)} or {last}" if others else last
     elif _limits(form) and not got:
         expected = _limits(form)
@@ -148,7 +149,7 @@ def _at(value: Any, name: str, index: str) -> Any:
 
 def _form_at(form: Any, name: str, index: str) -> Any:
     """The type one step further, None where it is not known."""
-    for option in getattr(form, "types", (form,)):
+    for option in _kinds(form):
         if name:
             for field in getattr(option, "fields", ()):
                 if field.encode_name == name:
@@ -162,19 +163,14 @@ def _form_at(form: Any, name: str, index: str) -> Any:
     return None
 
 
-def _names(form: Any) -> list[str]:
-    options = getattr(form, "types", (form,))
-    return [field.encode_name for option in options for field in getattr(option, "fields", ())]
-
-
-def _choices(form: Any) -> list[Any]:
-    options = getattr(form, "types", (form,))
-    return [choice for option in options for choice in getattr(option, "values", ())]
+def _kinds(form: Any) -> Any:
+    """The types that a value may have, of one or of a union."""
+    return getattr(form, "types", (form,))
 
 
 def _limits(form: Any) -> str:
     """The range of a number in words; empty where there is none."""
-    for option in getattr(form, "types", (form,)):
+    for option in _kinds(form):
         least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
         if least is not None and most is not None:
             return f"{least:.10g} to {most:.10g}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,6 @@ import numpy as np
 import pytest
 from camera_files import ANGLES, behind, read_invalid, read_polar, smooth_light
 
-from polarguide.capture.filter import camera_raw
 from polarguide.capture.filter.camera_raw import read_camera_raw
 from polarguide.capture.filter.exif import apply_orientation
 from polarguide.errors import PolarguideError
@@ -106,8 +106,8 @@ def test_damaged_files(tmp_path: Path, change: object, message: str) -> None:
 
 def test_without_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.nef").write_bytes(b"raw")
-    monkeypatch.setattr(camera_raw, "rawpy", None)
-    with pytest.raises(PolarguideError, match=r"not installed. pip install 'polarguide\[raw\]'"):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    with pytest.raises(PolarguideError, match=r"not installed. Install it: pip install 'polarguide\[raw\]'"):
         read_camera_raw(tmp_path / "a.nef", UNIT)
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from camera_files import COLOR, MONO, behind, busy_light, mosaic, smooth_light
 
-from polarguide.capture.sensor import DEMOSAIC_MODES, DemosaicedPicture, demosaic, sensor_pattern
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, DemosaicedPicture, demosaic
+from polarguide.capture.sensor.pattern import sensor_pattern
 
 MODES = [
     ("half", "bilinear"),

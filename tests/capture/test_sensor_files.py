@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 from camera_files import COLOR, MONO, pack, write_mosaic
 
-from polarguide.capture.sensor import (
-    PACKINGS,
-    RawFormat,
-    estimate_levels,
-    packed_size,
-    read_mosaic,
-    sensor_pattern,
-    unpack,
-    unusable_samples,
-)
+from polarguide.capture.sensor.packing import PACKINGS, packed_size, unpack
+from polarguide.capture.sensor.pattern import sensor_pattern
+from polarguide.capture.sensor.radiometry import estimate_levels, unusable_samples
+from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic
 from polarguide.errors import PolarguideError
 
 

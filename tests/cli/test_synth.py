@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from polarguide.cli.app import run
 def test_without_mitsuba_the_extra_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
     assert run(["synth", "proof", "--out", str(tmp_path / "x")]) == 2
     assert "polarguide[synth]" in capsys.readouterr().err
 

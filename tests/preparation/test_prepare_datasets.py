@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -248,8 +249,8 @@ def test_colmap_poses_and_sfm_may_be_asked_for_instead(tmp_path: Path) -> None:
 def test_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("OpenEXR")
     source = written("neisf", tmp_path / "in")
-    monkeypatch.setattr("polarguide.capture.formats.radiance.openexr", None)
-    with pytest.raises(PolarguideError, match=r"not installed. pip install 'polarguide\[exr\]'"):
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    with pytest.raises(PolarguideError, match=r"not installed. Install it: pip install 'polarguide\[exr\]'"):
         prepare_scene(source, tmp_path / "out", PLAIN)
 
 

@@ -13,8 +13,8 @@ import pytest
 from camera_files import ANGLES, behind, busy_light, read_invalid, read_polar, smooth_light, write_shots
 from tiny_capture import encode_srgb, write_picture
 
-from polarguide.capture.filter import estimate_shifts, orientation
-from polarguide.capture.filter.exif import apply_orientation
+from polarguide.capture.filter.align import estimate_shifts
+from polarguide.capture.filter.exif import apply_orientation, orientation
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

@@ -14,7 +14,9 @@ from camera_files import write_mosaics
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.datasets import DATASETS
-from polarguide.capture.sensor import DEMOSAIC_MODES, INTERPOLATIONS, PACKINGS, SENSORS
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, INTERPOLATIONS
+from polarguide.capture.sensor.packing import PACKINGS
+from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings

@@ -9,7 +9,8 @@ import pytest
 import torch
 from random_runs import ring
 
-from polarguide.viewer.viewport import free_camera, letterbox, quaternion, window_fov
+from polarguide.camera import quaternion
+from polarguide.viewer.viewport import free_camera, letterbox, window_fov
 
 CAMERA = next(iter(ring().values()))
 
@@ -20,7 +21,9 @@ def project(camera, point):
 
 
 def test_a_free_camera_takes_the_pose_of_its_quaternion_and_the_fov_from_top_to_bottom():
-    camera = free_camera(quaternion(CAMERA), CAMERA.center.tolist(), 2 * math.atan(0.5), (300, 200))
+    camera = free_camera(
+        quaternion(CAMERA.rotation.T), CAMERA.center.tolist(), 2 * math.atan(0.5), (300, 200)
+    )
     assert torch.allclose(camera.rotation, CAMERA.rotation, atol=1e-9)
     assert torch.allclose(camera.center, CAMERA.center, atol=1e-9)
     ahead, down = CAMERA.rotation[2], CAMERA.rotation[1]

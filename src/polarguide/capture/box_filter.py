@@ -13,11 +13,10 @@ def mean_codes(codes: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
     """Rounded box means of linear codes, [H, W, C] uint16 -> [H // K, W // K, C] uint16."""
     if factor == 1:
         return codes
-    height, width = codes.shape[0] // factor * factor, codes.shape[1] // factor * factor
-    total = np.zeros((height // factor, width // factor, codes.shape[2]), np.uint64)
-    for row in range(factor):
-        for column in range(factor):
-            total += codes[row:height:factor, column:width:factor]
+    parts = _strided(codes, factor)
+    total = np.zeros(parts[0].shape, np.uint64)
+    for part in parts:
+        total += part
     area = factor * factor
     return ((total + area // 2) // area).astype(np.uint16)
 
@@ -31,10 +30,7 @@ def mean(values: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
 
 def maximum(values: NDArray[Any], factor: int) -> NDArray[Any]:
     """The largest value of each box, of [H, W]; for bool: whether any is True."""
-    height, width = values.shape[0] // factor * factor, values.shape[1] // factor * factor
-    # Element-wise over strided slices: NumPy reduces over short axes an order of magnitude slower.
-    slices = [values[i:height:factor, j:width:factor] for i in range(factor) for j in range(factor)]
-    return functools.reduce(np.maximum, slices).copy()
+    return functools.reduce(np.maximum, _strided(values, factor)).copy()
 
 
 def every(values: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
@@ -47,6 +43,15 @@ def unit_mean(normals: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     average = mean(normals, factor)
     length = np.linalg.norm(average, axis=-1, keepdims=True)
     return np.where(length > 1e-6, average / np.maximum(length, 1e-6), 0.0).astype(np.float32)
+
+
+def _strided(values: NDArray[Any], factor: int) -> list[NDArray[Any]]:
+    """The K x K pixels of every box, each as [H // K, W // K, ...].
+
+    For work element by element: NumPy reduces over short axes an order of magnitude slower.
+    """
+    height, width = values.shape[0] // factor * factor, values.shape[1] // factor * factor
+    return [values[i:height:factor, j:width:factor] for i in range(factor) for j in range(factor)]
 
 
 def _boxed(values: NDArray[Any], factor: int) -> NDArray[Any]:

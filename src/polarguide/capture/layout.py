@@ -10,6 +10,7 @@ from pathlib import Path
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.view import ANGLES, listed, unknown_view
 from polarguide.errors import PolarguideError
+from polarguide.files import require_folder
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
@@ -49,13 +50,7 @@ def find_layout(root: Path) -> Layout:
     Raises:
         PolarguideError: there is no such folder, it has neither layout, or two files have the same view and angle.
     """
-    if not root.is_dir():
-        raise PolarguideError(
-            root,
-            expected="a capture folder",
-            found="a file" if root.exists() else "nothing",
-            remedy=_HINT,
-        )
+    require_folder(root, expected="a capture folder", remedy=_HINT)
     warnings: list[str] = []
     folders = angle_folders(root)
     if (root / "polar").is_dir():
@@ -183,12 +178,7 @@ def angle_folders(root: Path) -> dict[int, Path]:
             continue
         angle = int(match["angle"])
         if angle in folders:
-            raise PolarguideError(
-                root,
-                expected=f"one folder for {angle} degrees",
-                found=f"{folders[angle].name} and {path.name}",
-                remedy="Remove or rename one of them.",
-            )
+            raise ambiguous(root, f"one folder for {angle} degrees", folders[angle], path)
         folders[angle] = path
     return dict(sorted(folders.items()))
 
@@ -202,14 +192,15 @@ def index_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
             continue
         if path.stem in files:
-            raise PolarguideError(
-                folder,
-                expected=f"one file called {path.stem}",
-                found=f"{files[path.stem].name} and {path.name}",
-                remedy="Remove one of them.",
-            )
+            raise ambiguous(folder, f"one file called {path.stem}", files[path.stem], path)
         files[path.stem] = path
     return files
+
+
+def ambiguous(folder: Path, expected: str, first: Path, second: Path) -> PolarguideError:
+    """The error that two files of a folder have the same meaning."""
+    found = f"{first.name} and {second.name}"
+    return PolarguideError(folder, expected=expected, found=found, remedy="Remove or rename one of them.")
 
 
 def describe_contents(root: Path) -> str:

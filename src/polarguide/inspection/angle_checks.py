@@ -118,13 +118,9 @@ def order_check(angles: AngleFindings) -> Check:
     probability = angles.posterior.probabilities[best]
     files = ORDERS[best].files(PAIRINGS[angles.pairing])
     if angles.order is None:
-        rivals = [
-            f"{', '.join(map(str, order.files(PAIRINGS[angles.pairing])))} ({p:.0%})"
-            for order, p in sorted(
-                zip(ORDERS, angles.posterior.probabilities, strict=True), key=lambda t: -t[1]
-            )
-            if p > 0.02
-        ]
+        likely = [row for row in angles.hypotheses if row.probability > 0.02]
+        likely.sort(key=lambda row: -row.probability)
+        rivals = [f"{', '.join(map(str, row.files))} ({row.probability:.0%})" for row in likely]
         return Check(
             key, title, "warning",
             f"Not decided. The pictures named 0, 45, 90, 135 were taken at {' or '.join(rivals)}.",

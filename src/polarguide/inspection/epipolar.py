@@ -110,5 +110,5 @@ def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
     rotation = (second.rotation @ first.rotation.T).numpy()
     x, y, z = second.translation.numpy() - rotation @ first.translation.numpy()
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    inner = [np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]) for c in (first, second)]
-    return np.asarray(np.linalg.inv(inner[1]).T @ cross @ rotation @ np.linalg.inv(inner[0]))
+    inner1, inner2 = (np.linalg.inv(camera.intrinsics.numpy()) for camera in (first, second))
+    return np.asarray(inner2.T @ cross @ rotation @ inner1)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
+from polarguide.files import check_out
 from polarguide.inspection.angle_checks import (
     AngleFindings,
     combine_evidence,
@@ -29,6 +30,7 @@ from polarguide.inspection.surfaces import Surface, SurfaceSamples, normal_evide
 from polarguide.inspection.verdict import Check, Verdict, worst
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend
+from polarguide.records import check_options
 
 SURE = 0.98
 """Probability from which on ``auto`` is content with the points."""
@@ -69,10 +71,7 @@ def inspection_folder(scene: Path, out: Path | None = None) -> Path:
         PolarguideError: there is a file of this name.
     """
     folder = out if out is not None else scene.resolve().with_name(scene.resolve().name + "-inspection")
-    if folder.exists() and not folder.is_dir():
-        raise PolarguideError(
-            folder, expected="a folder to write", found="a file", remedy="Give another --out."
-        )
+    check_out(folder)
     return folder
 
 
@@ -91,7 +90,7 @@ def inspect_scene(
     Raises:
         PolarguideError: the scene cannot be read, or a setting is out of range.
     """
-    settings.check()
+    check_options(settings)
     capture = read_capture(path, downscale=settings.downscale, transfer=settings.transfer, reporter=reporter)
     index = settings.refractive_index or capture.refractive_index or 1.5
     measurements: list[ViewMeasurements] = []

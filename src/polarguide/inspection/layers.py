@@ -11,7 +11,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.inspection.capture import InspectedView
-from polarguide.inspection.measurements import ViewMeasurements
+from polarguide.inspection.measurements import ViewMeasurements, quantile
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.figures import Picture
@@ -62,9 +62,7 @@ def layer_uris(view: InspectedView) -> dict[str, str]:
     stokes = optics.stokes(gray)
     s0, degree = stokes[0].clamp(min=1e-6), optics.dolp(stokes)
     photograph = intensities.mean(dim=0)
-    step = max(1, photograph.numel() // 200_000)
-    top = float(torch.quantile(photograph.flatten()[::step], 0.99))
-    shown = figures.radiance_to_rgb(photograph / max(top, 1e-6))
+    shown = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
     excess = (gray[0] + gray[2] - gray[1] - gray[3]).abs() / s0
     pictures: dict[str, Picture] = {
         "s0": shown,

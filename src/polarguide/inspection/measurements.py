@@ -41,13 +41,13 @@ class ViewMeasurements:
     saturated: float
     invalid: float
     dark: float
-    noise: float
-    noise_share: float
-    pair_ratio: float | None
-    sum_error: float
-    dolp: tuple[float, float]
-    polarized: float
-    above_limit: float
+    noise: float = 0.0
+    noise_share: float = 0.0
+    pair_ratio: float | None = None
+    sum_error: float = 0.0
+    dolp: tuple[float, float] = (0.0, 0.0)
+    polarized: float = 0.0
+    above_limit: float = 0.0
 
     def record(self) -> dict[str, Any]:
         """As plain JSON types."""
@@ -67,22 +67,9 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     good = view.usable & ~dark
     share = float(good.float().mean())
     noise = optics.intensity_noise(gray)
-    bright = _quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
+    bright = quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
     saturated, invalid = (float(mask.float().mean()) for mask in (view.saturated, view.invalid))
-    nothing = ViewMeasurements(
-        view.name,
-        bright,
-        saturated,
-        invalid,
-        float(dark.float().mean()),
-        0.0,
-        0.0,
-        None,
-        0.0,
-        (0.0, 0.0),
-        0.0,
-        0.0,
-    )
+    nothing = ViewMeasurements(view.name, bright, saturated, invalid, float(dark.float().mean()))
     if share < 0.001:
         return nothing
     i0, i45, i90, i135 = (angle[good] for angle in gray)
@@ -91,17 +78,17 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     limit = float(optics.diffuse_dolp_limit(index))
     return replace(
         nothing,
-        noise=_quantile(noise[good], 0.5),
-        noise_share=_quantile(noise[good] / (s0 / 2), 0.5),
-        pair_ratio=_quantile((i0 + i90) / (i45 + i135).clamp(min=1e-6), 0.5),
-        sum_error=_quantile((i0 + i90 - i45 - i135).abs() / s0, 0.5),
-        dolp=(_quantile(degree, 0.5), _quantile(degree, 0.99)),
+        noise=quantile(noise[good], 0.5),
+        noise_share=quantile(noise[good] / (s0 / 2), 0.5),
+        pair_ratio=quantile((i0 + i90) / (i45 + i135).clamp(min=1e-6), 0.5),
+        sum_error=quantile((i0 + i90 - i45 - i135).abs() / s0, 0.5),
+        dolp=(quantile(degree, 0.5), quantile(degree, 0.99)),
         polarized=float(((degree > POLARIZED) & (degree > 3 * spread)).float().mean()),
         above_limit=float((degree > limit + 3 * spread).float().mean()),
     )
 
 
-def _quantile(values: Tensor, q: float) -> float:
+def quantile(values: Tensor, q: float) -> float:
     """Quantile of the values; of a regular subset where there are very many."""
     step = max(1, values.numel() // _QUANTILE_SAMPLES)
     return float(torch.quantile(values.flatten()[::step], q))

@@ -67,12 +67,12 @@ def point_evidence(
     )
     clusters = sum_by_cluster(likelihood.movedim(1, 0), spatial_cells(points))
     usable = misfit <= LARGEST_MISFIT_DEG
-    seen = (
-        _seen_pixels(fields[sense][keep].double(), weights, degrees[keep].unbind(-1), points, zero)
-        if usable
-        else None
+    evidence = Evidence(SOURCE, clusters.float(), count, usable, note)
+    if not usable:
+        return evidence, None
+    return evidence, _seen_pixels(
+        fields[sense][keep].double(), weights, degrees[keep].unbind(-1), points, zero
     )
-    return Evidence(SOURCE, clusters.float(), count, usable, note), seen
 
 
 def _seen_pixels(

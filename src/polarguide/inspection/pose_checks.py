@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
 from polarguide.capture.view import listed
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.epipolar import epipolar_errors, view_errors
 from polarguide.inspection.verdict import Check, Verdict
+from polarguide.scene_frame import scene_frame
+from polarguide.vectors import unit_array
 
 TYPICAL_PX, VIEW_PX = 2.0, 2.0
 """Median epipolar errors in stored pixels above which a capture, or one view of it, gets a warning."""
@@ -22,13 +24,8 @@ def pose_check(capture: Capture) -> Check:
     """Check whether feature matches agree with the poses."""
     key, title = "poses", "Pose quality"
     if capture.model is None:
-        return Check(
-            key,
-            title,
-            "n/a",
-            "There are no poses.",
-            "Run polarguide prepare with --poses sfm or --poses PATH.",
-        )
+        remedy = "Run polarguide prepare with --poses sfm or --poses PATH."
+        return Check(key, title, "n/a", "There are no poses.", remedy)
     missing = tuple(view.name for view in capture.views if view.camera is None)
     errors = view_errors(epipolar_errors(capture))
     if len(errors) < 3:
@@ -64,14 +61,11 @@ def coverage_check(capture: Capture) -> Check:
     cameras = [view.camera for view in capture.posed if view.camera is not None]
     if len(cameras) < 2:
         return Check(key, title, "n/a", "Fewer than two views have a pose.")
-    centers = np.stack([camera.center.numpy() for camera in cameras])
-    axes = np.stack([camera.rotation[2].numpy() for camera in cameras])
-    focus = _nearest_to_axes(centers, axes)
-    seen = centers - focus
-    seen = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    focus = scene_frame(cameras).center
+    seen = unit_array(torch.stack([camera.center - focus for camera in cameras]).numpy())
     angles = np.degrees(np.arccos(np.clip(seen @ seen.T, -1, 1))) + 360 * np.eye(len(seen))
     nearest = angles.min(axis=1)
-    spread = float(np.degrees(np.arccos(np.clip(seen @ _unit(seen.mean(axis=0)), -1, 1))).max())
+    spread = float(np.degrees(np.arccos(np.clip(seen @ unit_array(seen.mean(axis=0)), -1, 1))).max())
     figures = {"views": len(seen), "median_step_deg": float(np.median(nearest)),
                "largest_step_deg": float(nearest.max()), "half_angle_deg": spread}  # fmt: skip
     said = (
@@ -85,15 +79,3 @@ def coverage_check(capture: Capture) -> Check:
             "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.", lonely, figures,
         )  # fmt: skip
     return Check(key, title, "ok", said, figures=figures)
-
-
-def _nearest_to_axes(centers: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The point nearest to all optical axes (least squares), [3]."""
-    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
-    return np.asarray(
-        np.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)[:, 0], rcond=None)[0]
-    )
-
-
-def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)

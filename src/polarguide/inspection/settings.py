@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from polarguide.options import Transfer
-from polarguide.records import check_options
 
 Normals = Literal["auto", "points", "train"]
 
@@ -32,11 +31,3 @@ class InspectSettings:
     refractive_index: Annotated[float, Meta(gt=1, lt=4)] | None = None
     downscale: Annotated[int, Meta(ge=0)] = 0
     transfer: Transfer = "linear"
-
-    def check(self) -> None:
-        """Check all values.
-
-        Raises:
-            PolarguideError: one is out of range.
-        """
-        check_options(self)

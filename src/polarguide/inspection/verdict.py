@@ -36,15 +36,8 @@ class Check:
 
     def record(self) -> dict[str, Any]:
         """The check as plain JSON types; numbers that are not finite become null."""
-        return {
-            "key": self.key,
-            "title": self.title,
-            "verdict": self.verdict,
-            "finding": self.finding,
-            "remedy": self.remedy,
-            "views": list(self.views),
-            "figures": plain(self.figures),
-        }
+        record: dict[str, Any] = plain(vars(self))
+        return record
 
 
 def worst(checks: Iterable[Check]) -> Verdict:

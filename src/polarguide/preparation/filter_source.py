@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polarguide.capture.calibration import (
     LARGEST_IMBALANCE,
@@ -18,28 +17,21 @@ from polarguide.capture.calibration import (
     pair_ratio,
 )
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.filter import (
-    Shift,
-    align_shots,
-    decide_transfer,
-    estimate_shifts,
-    find_shots,
-    is_camera_raw,
-    linear_intensities,
-    read_shots,
-)
+from polarguide.capture.filter.align import Shift, align_shots, estimate_shifts
+from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
-from polarguide.capture.filter.shots import require_four_shots
+from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
+from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings, white_gains
-from polarguide.preparation.source import DevelopedView
+from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 _JUDGED_VIEWS = 8
 
 
-class FilterSource:
+class FilterSource(Source):
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
@@ -50,6 +42,8 @@ class FilterSource:
         shots = find_shots(root)
         require_four_shots(root, shots)
         self._files = dict(sorted(shots.items()))
+        self.views = list(self._files)
+        self.paths = [files[angle] for files in self._files.values() for angle in ANGLES]
         self._raw = [path for path in self.paths if is_camera_raw(path)]
         white = white_gains(settings.white_balance)
         if white is None or (white != (1.0, 1.0, 1.0) and len(self._raw) < len(self.paths)):
@@ -67,16 +61,6 @@ class FilterSource:
                 found="srgb",
                 remedy="Omit it.",
             )
-
-    @property
-    def views(self) -> list[str]:
-        """View names, sorted."""
-        return list(self._files)
-
-    @property
-    def paths(self) -> list[Path]:
-        """All files that are read."""
-        return [files[angle] for files in self._files.values() for angle in ANGLES]
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """The transfer of the capture, from a few views spread over it."""
@@ -129,7 +113,8 @@ class FilterSource:
                 notes.append(f"{view}: (I0 + I90)/(I45 + I135) {said}; not corrected.")
         factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
         linear = oriented(linear * factors[:, None, None, None], asked.calibration)
-        upright = _apply_orientation(linear, shots.orientation)
+        turned = np.stack([apply_orientation(picture, shots.orientation) for picture in linear])
+        upright = np.ascontiguousarray(oriented(turned, orientation_calibration(shots.orientation)))
         height, width = upright.shape[1:3]
         return DevelopedView(
             intensities=upright,
@@ -147,12 +132,6 @@ class FilterSource:
             },
             notes=tuple(notes),
         )
-
-
-def _apply_orientation(linear: NDArray[np.float32], code: int) -> NDArray[np.float32]:
-    """Apply the EXIF orientation to the pixels, and the same rotation to the angles."""
-    pictures = np.stack([apply_orientation(picture, code) for picture in linear])
-    return np.ascontiguousarray(oriented(pictures, orientation_calibration(code)))
 
 
 def _shift_notes(view: str, shifts: list[Shift]) -> list[str]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, write_whole
+from polarguide.files import check_out, make_folder, write_whole
 from polarguide.records import decode, read_record, to_json
 
 JOURNAL = "prepare.json"
@@ -73,10 +73,7 @@ class SceneFolder:
         self.views: dict[str, dict[str, Any]] = {}
         self.finished = False
         self._follows_none = False
-        if root.exists() and not root.is_dir():
-            raise PolarguideError(
-                root, expected="a folder to write", found="a file", remedy="Give another --out."
-            )
+        check_out(root)
         whole, journal = root / SCENE, root / JOURNAL
         path = journal if journal.exists() else whole
         if path.exists():

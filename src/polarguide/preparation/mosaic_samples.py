@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.sensor import Levels, Pattern
+from polarguide.capture.sensor.pattern import Pattern
+from polarguide.capture.sensor.radiometry import Levels
 from polarguide.capture.view import ANGLES
 
 _BLOCKS = 1024

@@ -12,32 +12,24 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_gains, oriented, pair_ratio
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.datasets import Dataset, resized_mask
+from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.layout import index_files
-from polarguide.capture.sensor import (
-    DEMOSAIC_MODES,
-    PACKINGS,
-    RAW_SUFFIXES,
-    SENSORS,
-    Levels,
-    RawFormat,
-    demosaic,
-    estimate_levels,
-    read_mosaic,
-    sensor_pattern,
-    unusable_samples,
-)
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
+from polarguide.capture.sensor.packing import PACKINGS
+from polarguide.capture.sensor.pattern import SENSORS, sensor_pattern, tiled
+from polarguide.capture.sensor.radiometry import Levels, estimate_levels, unusable_samples
+from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.preparation.mosaic_samples import block_intensities, gray_world, sample_blocks
 from polarguide.preparation.settings import PrepareSettings, white_gains
-from polarguide.preparation.source import DevelopedView
+from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 _SMALLEST = 16
 
 
-class MosaicSource:
+class MosaicSource(Source):
     """Raw mosaics of a division-of-focal-plane sensor."""
 
     def __init__(self, root: Path, settings: PrepareSettings, dataset: Dataset | None = None) -> None:
@@ -70,6 +62,9 @@ class MosaicSource:
             files = {view: path for view, path in files.items() if os.path.realpath(path) != dark}
         names = files.keys() if dataset is None else dataset.views
         self._files = {view: files[view] for view in sorted(names)}
+        self.views = list(self._files)
+        self.paths = list(self._files.values() if dataset is None else dataset.paths)
+        self.paths += [] if self._dark_path is None else [self._dark_path]
         pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
         self._crop = pattern.cell_corner()
         self._pattern = pattern.shifted(*self._crop)
@@ -81,17 +76,6 @@ class MosaicSource:
                 found=settings.white_balance,
                 remedy="Omit it.",
             )
-
-    @property
-    def views(self) -> list[str]:
-        """View names, sorted."""
-        return list(self._files)
-
-    @property
-    def paths(self) -> list[Path]:
-        """All files that are read."""
-        own = list(self._files.values()) if self._dataset is None else self._dataset.paths
-        return [*own, *([] if self._dark_path is None else [self._dark_path])]
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Levels, gains of the angles and white balance of the capture; every file is read once."""
@@ -156,22 +140,15 @@ class MosaicSource:
             intensities=intensities,
             invalid=picture.invalid,
             geometry=Geometry(
-                (stored.shape[1], stored.shape[0]),
-                self._crop,
-                DEMOSAIC_MODES[asked.demosaic],
-                (width, height),
+                stored.shape[::-1], self._crop, DEMOSAIC_MODES[asked.demosaic], (width, height)
             ),
             record={
                 "clipped_share": round(float(saturated.mean()), 6),
                 "dark_share": round(float(black.mean()), 6),
                 "invalid_share": round(float(picture.invalid.mean()), 6),
             },
-            mask=self._mask(view, (height, width)),
+            mask=None if self._dataset is None else resized_mask(self._dataset, view, (height, width)),
         )
-
-    def _mask(self, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
-        """The object mask, resized where it was made for another resolution of the same picture."""
-        return None if self._dataset is None else resized_mask(self._dataset, view, size)
 
     def _container(self, path: Path, values: NDArray[Any]) -> int:
         """Bits that a pixel takes in the file."""
@@ -238,5 +215,4 @@ class MosaicSource:
         gains = np.vectorize(lambda angle: measured["scale"] / of_angle[angle])(pattern.angles)
         if pattern.colors is not None:
             gains = gains * np.asarray(measured["white_balance"])[pattern.colors]
-        repeat = [-(-length // pattern.period) for length in shape]
-        return np.tile(gains.astype(np.float32), repeat)[: shape[0], : shape[1]]
+        return tiled(gains.astype(np.float32), shape)

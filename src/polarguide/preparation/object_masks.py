@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
@@ -19,7 +17,7 @@ from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 
-class MaskedSource:
+class MaskedSource(Source):
     """A source with object masks from a folder; the object is where a mask has at least half of its maximum."""
 
     def __init__(self, pictures: Source, folder: Path) -> None:
@@ -49,26 +47,8 @@ class MaskedSource:
                 remedy="Rename them; views without a mask are used whole.",
             )
         self._pictures = pictures
-
-    @property
-    def kind(self) -> str:
-        """Name of the format."""
-        return self._pictures.kind
-
-    @property
-    def cameras(self) -> Mapping[str, PosedCamera] | None:
-        """Cameras by view name, where the source brings poses."""
-        return self._pictures.cameras
-
-    @property
-    def views(self) -> list[str]:
-        """View names, sorted."""
-        return self._pictures.views
-
-    @property
-    def paths(self) -> list[Path]:
-        """All files that are read."""
-        return [*self._pictures.paths, *self._masks.values()]
+        self.kind, self.cameras, self.views = pictures.kind, pictures.cameras, pictures.views
+        self.paths = [*pictures.paths, *self._masks.values()]
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Measure the source, and note views without a mask."""

@@ -6,10 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from polarguide.capture.colmap.poses import Poses
-from polarguide.capture.datasets import PISR_SENSOR, detect_dataset, open_dataset
-from polarguide.capture.filter import find_shots
+from polarguide.capture.datasets import detect_dataset, open_dataset
+from polarguide.capture.datasets.pisr import SENSOR as PISR_SENSOR
+from polarguide.capture.filter.shots import find_shots
 from polarguide.capture.layout import angle_folders, describe_contents
 from polarguide.errors import PolarguideError
+from polarguide.files import require_folder
 from polarguide.preparation.filter_source import FilterSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.object_masks import MaskedSource
@@ -24,13 +26,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
     Raises:
         PolarguideError: there is no such folder, or nothing in it that can be read.
     """
-    if not root.is_dir():
-        raise PolarguideError(
-            root,
-            expected="a folder of camera files",
-            found="a file" if root.exists() else "nothing",
-            remedy="Give the folder that holds the raw mosaics, or the shots through the filter.",
-        )
+    remedy = "Give the folder that holds the raw mosaics, or the shots through the filter."
+    require_folder(root, expected="a folder of camera files", remedy=remedy)
     kind: str = settings.format
     if kind == "auto":
         kind = detect_dataset(root) or "filter"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
@@ -136,10 +138,9 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
     with reporter.track("writing views", len(views)) as advance:
         for count, view in enumerate(views, 1):
             known = folder.views.get(view)
+            warp = None
             if known is not None and poses is not None:
-                warp = poses.warp(view, Geometry.of(known["geometry"])).record()
-            else:
-                warp = None
+                warp = poses.warp(view, msgspec.convert(known["geometry"], Geometry)).record()
             if not folder.has(view, warp):
                 _write_view(folder, pictures, view, poses, reporter)
             advance(count)
@@ -156,7 +157,7 @@ def _write_view(
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
         warped = warp.record()
-    record = {**done.record, "geometry": done.geometry.record(), "warp": warped}
+    record = {**done.record, "geometry": asdict(done.geometry), "warp": warped}
     folder.write_view(view, intensities, invalid, record, mask)
     for note in done.notes:
         reporter.say(note)

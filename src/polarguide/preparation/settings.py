@@ -197,18 +197,15 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
     """
     if text in ("none", "gray", "grey"):
         return (1.0, 1.0, 1.0) if text == "none" else None
-    try:
-        red, green, blue = (float(part) for part in text.split(","))
-        if not all(math.isfinite(gain) and 0.05 <= gain <= 20 for gain in (red, green, blue)):
-            raise ValueError
-    except ValueError:
+    gains = _numbers(text)
+    if len(gains) != 3 or not all(0.05 <= gain <= 20 for gain in gains):
         raise PolarguideError(
             "--white-balance",
             expected="none, gray, or three gains from 0.05 to 20 such as 1.9,1,1.6",
             found=repr(text),
             remedy="Take the gains from a picture of a gray card.",
-        ) from None
-    return red, green, blue
+        )
+    return gains[0], gains[1], gains[2]
 
 
 def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
@@ -217,12 +214,8 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
     Raises:
         PolarguideError: it is neither.
     """
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-        right = len(numbers) in (4, 8) and all(map(math.isfinite, numbers)) and min(numbers[:4]) > 0
-    except ValueError:
-        right = False
-    if not right:
+    numbers = _numbers(text)
+    if len(numbers) not in (4, 8) or not all(map(math.isfinite, numbers)) or min(numbers[:4]) <= 0:
         raise PolarguideError(
             "--intrinsics",
             expected="fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 in pixels of the developed pictures",
@@ -230,6 +223,14 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
             remedy="Correct the value; the center of the first pixel is at 0.5.",
         )
     return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """The numbers of a list such as 1.9,1,1.6; none if it is something else."""
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return ()
 
 
 def _four_angles(text: str) -> tuple[int, int, int, int]:

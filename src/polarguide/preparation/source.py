@@ -37,23 +37,19 @@ class DevelopedView:
 
 
 class Source(Protocol):
-    """The pictures of one capture."""
+    """The pictures of one capture.
 
-    @property
-    def kind(self) -> str:
-        """Name of the format."""
+    Attributes:
+        kind: name of the format.
+        cameras: by view name, if the source has poses, else None.
+        views: view names, sorted.
+        paths: all files that are read.
+    """
 
-    @property
-    def cameras(self) -> Mapping[str, PosedCamera] | None:
-        """Cameras by view name, if the source has poses, else None."""
-
-    @property
-    def views(self) -> list[str]:
-        """View names, sorted."""
-
-    @property
-    def paths(self) -> list[Path]:
-        """All files that are read."""
+    kind: str
+    cameras: Mapping[str, PosedCamera] | None
+    views: list[str]
+    paths: list[Path]
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Measure what is common to the whole capture, as JSON types; ``notes`` are messages for the user."""

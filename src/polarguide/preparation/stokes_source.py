@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,10 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import oriented
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.datasets import Dataset, resized_mask
-from polarguide.errors import PolarguideError
+from polarguide.capture.datasets.dataset import Dataset, StokesImage, not_as_published, resized_mask
 from polarguide.polarizer import four_intensities
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import DevelopedView
+from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 PAIR_SUMS = (
@@ -26,26 +24,16 @@ _HEADROOM = 2.0
 _SAMPLES = 20_000
 
 
-class StokesSource:
+class StokesSource(Source):
     """Stokes vectors in any unit, without a full scale."""
 
     def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
         """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
-        self.kind = dataset.name
-        self.cameras = dataset.cameras
+        self.kind, self.cameras = dataset.name, dataset.cameras
+        self.views, self.paths = dataset.views, dataset.paths
         self._dataset = dataset
         asked = settings.calibration
         self._calibration = replace(asked, sense=asked.sense or dataset.sense)
-
-    @property
-    def views(self) -> list[str]:
-        """View names, sorted."""
-        return self._dataset.views
-
-    @property
-    def paths(self) -> list[Path]:
-        """All files that are read."""
-        return self._dataset.paths
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
@@ -68,12 +56,8 @@ class StokesSource:
             advance(number)
         bright = float(np.percentile(np.concatenate(peaks), _BRIGHT))
         if not largest > 0:
-            raise PolarguideError(
-                self.paths[0],
-                expected="light in at least one view",
-                found="intensities that are all 0 or less",
-                remedy="Take the files from the dataset as they were published.",
-            )
+            found = "intensities that are all 0 or less"
+            raise not_as_published(self.paths[0], "light in at least one view", found)
         white = min(largest, _HEADROOM * bright) if bright > 0 else largest
         share = negative / max(1, 12 * count)
         notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}."]
@@ -119,7 +103,6 @@ class StokesSource:
             mask=resized_mask(self._dataset, view, (height, width)),
         )
 
-    def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def _stokes(self, view: str) -> StokesImage:
         assert self._dataset.read_stokes is not None
-        image = self._dataset.read_stokes(view)
-        return image.stokes, image.clipped
+        return self._dataset.read_stokes(view)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from polarguide.capture.colmap.poses import Poses
@@ -89,7 +91,7 @@ class Workshop:
                     if done.mask is not None:
                         write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
                     write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
-                    known[view] = done.geometry.record()
+                    known[view] = asdict(done.geometry)
                     self._folder.save()
                 advance(count)
-        return {view: Geometry.of(known[view]) for view in views}
+        return {view: msgspec.convert(known[view], Geometry) for view in views}

@@ -5,6 +5,7 @@ A panorama is [H, W, 3] linear radiance; rows go from the zenith down, columns c
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.errors import PolarguideError
+from polarguide.synth.makers import make
 from polarguide.synth.mesh import Array
 from polarguide.synth.noise import fractal_noise
 from polarguide.synth.textures import image
@@ -186,17 +187,9 @@ def make_environment(data: dict[str, Any], where: str, folder: Path) -> Array:
     Raises:
         PolarguideError: the type or a field is unknown, or a value is invalid.
     """
-    fields = dict(data)
-    kind = fields.pop("type", None)
-    maker = ENVIRONMENTS.get(kind) if isinstance(kind, str) else None
-    try:
-        if maker is None:
-            raise ValueError(f"the type {kind!r}")
-        return maker(**fields, **({"folder": folder} if kind == "image" else {}))
-    except (TypeError, ValueError, KeyError) as error:
-        raise PolarguideError(
-            f"{where} (environment)",
-            expected=f"a type of {', '.join(ENVIRONMENTS)} with its fields",
-            found=str(error),
-            remedy="docs/reference/scene-files.md describes them.",
-        ) from error
+    makers: dict[str, Callable[..., Array]] = {
+        **ENVIRONMENTS,
+        "image": functools.partial(image, folder=folder),
+    }
+    expected = f"a type of {', '.join(ENVIRONMENTS)} with its fields"
+    return make(makers, data, f"{where} (environment)", expected)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -85,20 +85,15 @@ def synthesize(
     names = view_names(spec.camera.views)
     tests = held_out_names(names)
     if variant.note:
-        paths = (
-            settings.width
-            * settings.height
-            * settings.samples
-            * (len(names) + (TEST_SAMPLES - 1) * len(tests))
-        )
+        views = len(names) + (TEST_SAMPLES - 1) * len(tests)
+        paths = settings.width * settings.height * settings.samples * views
         reporter.warn(f"{variant.note} It will take {slow_estimate(paths)} on this scene.")
     built = build_scene(spec, out, variant)
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     exposure = spec.exposure or _metered_exposure(built, cameras, settings.seed)
     job = Job(built, settings, out, names, tests, cameras, exposure, Sensor())
     _render_all(job, reporter)
-    _write_model(job, names)
-    folder.write_file(out / "split.json", json.dumps({"test": tests}).encode())
+    write_sparse(built, cameras, names, tests, out, settings)
     clipped = folder.clipped_share(out, names)
     record = scene_record(spec, settings, variant, names, tests, exposure=exposure, clipped=clipped)
     if job.mosaics:
@@ -129,7 +124,7 @@ def _render_view(job: Job, number: int) -> None:
     """Render one view and write its files."""
     settings, name, camera = job.settings, job.names[number], job.cameras[number]
     samples = settings.samples * (TEST_SAMPLES if name in job.tests else 1)
-    big = _doubled(camera) if job.mosaics else camera
+    big = camera.scaled(2, 2 * camera.width, 2 * camera.height) if job.mosaics else camera
     if job.mosaics:
         samples = max(1, samples // 4)
     limits = PathLimits(job.built.spec.depth, job.built.spec.clamp / job.exposure)
@@ -154,10 +149,19 @@ def _render_view(job: Job, number: int) -> None:
     write_view(job.out, name, codes)
 
 
-def _write_model(job: Job, names: list[str]) -> None:
-    pictures = [folder.photograph(job.out, name) for name in names]
-    sparse = sample_sparse_points(job.built, job.cameras, pictures, job.settings.points, job.settings.seed)
-    write_model(job.out / "sparse" / "0", job.cameras, names, sparse)
+def write_sparse(
+    built: BuiltScene,
+    cameras: list[Camera],
+    names: list[str],
+    tests: list[str],
+    out: Path,
+    settings: SynthSettings,
+) -> None:
+    """Write the COLMAP model of rendered views, and the split into training and test views."""
+    pictures = [folder.photograph(out, name) for name in names]
+    sparse = sample_sparse_points(built, cameras, pictures, settings.points, settings.seed)
+    write_model(out / "sparse" / "0", cameras, names, sparse)
+    folder.write_file(out / "split.json", json.dumps({"test": tests}).encode())
 
 
 def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> float:
@@ -165,22 +169,10 @@ def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> fl
     values = []
     for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
         factor = max(1, camera.width // METER_WIDTH)
-        light = render_lobes(
-            built.scenes,
-            camera.downscaled(factor),
-            METER_SAMPLES,
-            seed=seed,
-            limits=PathLimits(built.spec.depth),
-        )
+        limits, small = PathLimits(built.spec.depth), camera.downscaled(factor)
+        light = render_lobes(built.scenes, small, METER_SAMPLES, seed=seed, limits=limits)
         values.append(light.stokes[0].ravel())
     return float(f"{BRIGHT / max(float(np.percentile(np.concatenate(values), 99)), 1e-9):.4g}")
-
-
-def _doubled(camera: Camera) -> Camera:
-    return replace(
-        camera, width=2 * camera.width, height=2 * camera.height,
-        fx=2 * camera.fx, fy=2 * camera.fy, cx=2 * camera.cx, cy=2 * camera.cy,
-    )  # fmt: skip
 
 
 def _halved(values: Array) -> Array:

@@ -6,13 +6,13 @@ read noise normal (EMVA 1288).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.sensor.pattern import sensor_pattern
+from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.polarizer import malus
 from polarguide.synth.mesh import Array
 
@@ -39,8 +39,7 @@ class Sensor:
 
     def data(self) -> dict[str, Any]:
         """As JSON."""
-        return {"full_well": self.full_well, "read_noise": self.read_noise, "extinction": self.extinction,
-                "gains": list(self.gains), "bits": self.bits, "black": self.black}  # fmt: skip
+        return asdict(self)
 
 
 def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: Sensor) -> Array:
@@ -68,14 +67,12 @@ def mosaic(
 
     An extinction ratio E scales S1 and S2 by (E - 1) / (E + 1). A monochrome sensor measures the mean of the colors.
     """
-    height, width = stokes.shape[1:3]
     pattern = sensor_pattern(name)
-    repeat = (-(-height // pattern.period), -(-width // pattern.period))
-    angles = np.tile(pattern.angles, repeat)[:height, :width]
+    angles = tiled(pattern.angles, stokes.shape[1:3])
     if pattern.colors is None:
         light = stokes.mean(-1)
     else:
-        colors = np.tile(pattern.colors, repeat)[:height, :width]
+        colors = tiled(pattern.colors, stokes.shape[1:3])
         light = np.take_along_axis(stokes, colors[None, ..., None], -1)[..., 0]
     contrast = (sensor.extinction - 1) / (sensor.extinction + 1)
     value = malus((light[0], contrast * light[1], contrast * light[2]), np.radians(angles))

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.errors import PolarguideError
 from polarguide.synth.implicit_surface import solid
+from polarguide.synth.makers import make
 from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals
 from polarguide.synth.noise import fractal_noise
 from polarguide.vectors import unit_array as unit
@@ -150,22 +150,4 @@ def make_mesh(shape: dict[str, Any], where: str) -> Mesh:
     Raises:
         PolarguideError: the type or a field is unknown, or a value makes no sense.
     """
-    fields = dict(shape)
-    kind = fields.pop("type", None)
-    maker = SHAPES.get(kind) if isinstance(kind, str) else None
-    if maker is None:
-        raise PolarguideError(
-            f"{where} shape.type",
-            expected=f"one of {', '.join([*SHAPES, 'mesh'])}",
-            found=repr(kind),
-            remedy="docs/reference/scene-files.md describes them.",
-        )
-    try:
-        return maker(**fields)
-    except (TypeError, ValueError, IndexError, KeyError) as error:
-        raise PolarguideError(
-            f"{where} shape",
-            expected=f"the fields of a {kind}",
-            found=str(error),
-            remedy="docs/reference/scene-files.md has them.",
-        ) from error
+    return make(SHAPES, shape, f"{where} shape", f"a type of {', '.join([*SHAPES, 'mesh'])}")

@@ -34,14 +34,11 @@ class SparsePoints:
     Attributes:
         points: [M, 3]. colors: [M, 3] display-encoded.
         tracks: of each point, (view, x, y) of each observation.
-        virtual, outliers: number of points behind mirrors, and of outliers.
     """
 
     points: Array
     colors: NDArray[np.uint8]
     tracks: list[list[tuple[int, float, float]]]
-    virtual: int
-    outliers: int
 
 
 def sample_sparse_points(
@@ -74,23 +71,21 @@ def sample_sparse_points(
     places = origin + hits.distance[:, None] * ray
     seen = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < FOUND)
     ghost, places = _mirrored(built, origin, ray, places, hits.normal, hits.thing, random)
-    near = (
-        np.abs(np.arange(len(cameras)) - view[:, None]) <= 1
-    )  # a reflection is consistent only between neighbors
+    # A reflection is consistent only between neighbors.
+    near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1
     seen = np.where(ghost[:, None], near, seen)
     seen[np.arange(len(view)), view] = True
     keep = np.flatnonzero((hits.thing > 0) & (seen.sum(1) >= 2))
     keep = np.sort(random.permutation(keep)[:count])
     tracks = [_track(places[k], np.flatnonzero(seen[k]), cameras, random) for k in keep]
-    focal = cameras[0].fx
     reach = np.linalg.norm(places - origin, axis=1)[keep]
-    size = NOISE_PIXELS * reach / focal
+    size = NOISE_PIXELS * reach / cameras[0].fx
     moved = places[keep] + size[:, None] * random.normal(size=(len(keep), 3))
     moved += (2 * size * random.normal(size=len(keep)))[:, None] * ray[keep]
     wrong = random.random(len(keep)) < OUTLIERS
     stretch = random.uniform(0.5, 1.8, len(keep))[:, None]
     moved = np.where(wrong[:, None], origin[keep] + stretch * (moved - origin[keep]), moved)
-    return SparsePoints(moved, color[keep], tracks, int(ghost[keep].sum()), int(wrong.sum()))
+    return SparsePoints(moved, color[keep], tracks)
 
 
 def _visible(built: BuiltScene, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +16,9 @@ from polarguide.synth import folder
 from polarguide.synth.build import build_scene
 from polarguide.synth.cameras import held_out_names, place_cameras, view_names
 from polarguide.synth.manifest import verify_scene, write_manifest
-from polarguide.synth.render import synthesize
+from polarguide.synth.render import synthesize, write_sparse
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, SynthSettings
-from polarguide.synth.sparse import sample_sparse_points, write_model
 from polarguide.synth.variant import choose_variant
 
 PARAMETERS = ("views", "noise", "roughness", "index", "spacing")
@@ -70,12 +70,9 @@ def sweep_scenes(
         one, how = overrides, settings
         if sweep.parameter == "noise":
             how = replace(settings, noise=value)
-        elif sweep.parameter == "roughness":
-            one = replace(overrides, roughness=value)
-        elif sweep.parameter == "index":
-            one = replace(overrides, index=value)
         else:
-            one = replace(overrides, spacing=value)
+            change: dict[str, Any] = {sweep.parameter: value}
+            one = replace(overrides, **change)
         done.append(synthesize(one.apply(spec), _member(out, sweep, value), how, reporter, threads=threads))
         _note(done[-1], sweep.parameter, value)
     return done
@@ -125,14 +122,7 @@ def _fewer_views(
         variant = choose_variant(settings.color, threads=threads)
         built = build_scene(spec, member, variant)
         some = [by_name[name] for name in names]
-        pictures = [folder.photograph(member, name) for name in names]
-        write_model(
-            member / "sparse" / "0",
-            some,
-            names,
-            sample_sparse_points(built, some, pictures, settings.points, settings.seed),
-        )
-        folder.write_file(member / "split.json", json.dumps({"test": tests}).encode())
+        write_sparse(built, some, names, tests, member, settings)
         smaller = {**record, "views": names, "train": chosen, "sha256": write_manifest(member)}
         folder.write_file(member / "scene.json", json.dumps(smaller, indent=1).encode())
         _note(member, "views", value)

@@ -6,6 +6,7 @@ are linear sRGB. The type ``image`` reads a user's picture.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from polarguide.color import srgb_decode_array
 from polarguide.errors import PolarguideError
+from polarguide.synth.makers import make
 from polarguide.synth.mesh import Array
 from polarguide.synth.noise import fractal_noise
 
@@ -167,27 +169,9 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
     Raises:
         PolarguideError: the type or a field is unknown, or a value makes no sense.
     """
-    fields = dict(data)
-    kind = fields.pop("type", None)
-    maker = TEXTURES.get(kind) if isinstance(kind, str) else None
-    if maker is None:
-        raise PolarguideError(
-            f"{where} material.color",
-            expected=f'a color, "own", or a texture with type {", ".join(TEXTURES)}',
-            found=repr(data),
-            remedy="docs/reference/scene-files.md describes them.",
-        )
-    if kind == "image":
-        fields["folder"] = folder
-    try:
-        return maker(**fields)
-    except (TypeError, ValueError, IndexError) as error:
-        raise PolarguideError(
-            f"{where} texture",
-            expected=f"the fields of {kind}",
-            found=str(error),
-            remedy="docs/reference/scene-files.md has them.",
-        ) from error
+    makers: dict[str, Callable[..., Array]] = {**TEXTURES, "image": functools.partial(image, folder=folder)}
+    expected = f'a color, "own", or a texture with type {", ".join(TEXTURES)}'
+    return make(makers, data, f"{where} material.color", expected)
 
 
 def _grid(pixels: int) -> tuple[Array, Array]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from polarguide.errors import PolarguideError
+from polarguide.errors import optional_import
 
 Color = Literal["rgb", "spectral"]
 OLDEST_LLVM = 16
@@ -52,16 +51,8 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
     Raises:
         PolarguideError: Mitsuba is not installed.
     """
-    if importlib.util.find_spec("mitsuba") is None:
-        raise PolarguideError(
-            "synth",
-            expected="Mitsuba 3.9, which renders the scenes",
-            found="no package mitsuba",
-            remedy="Install the optional extra: pip install 'polarguide[synth]'.",
-        )
     with _silent_stderr():
-        import mitsuba as mi
-
+        mi = optional_import("mitsuba", "synth", install="'polarguide[synth]'")
         missing = _missing_llvm()
     if not missing:
         mi.set_variant("llvm_ad_mono_polarized" if color == "rgb" else "llvm_ad_spectral_polarized")

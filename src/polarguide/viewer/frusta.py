@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import torch
 
+from polarguide.camera import quaternion
 from polarguide.capture import Scene, View
 from polarguide.scene_frame import SceneFrame
 from polarguide.viewer.appearance import Crop
-from polarguide.viewer.viewport import quaternion
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 
@@ -79,7 +79,7 @@ class Frusta:
                 color=HELD_OUT_COLOR if photograph.held_out else COLOR,
                 image=photograph.thumbnail,
                 jpeg_quality=80,
-                wxyz=quaternion(camera),
+                wxyz=quaternion(camera.rotation.T),
                 position=camera.center.numpy(),
                 cast_shadow=False,
                 receive_shadow=False,

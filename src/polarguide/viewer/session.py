@@ -44,12 +44,8 @@ class Session:
         options: PanelOptions,
         wake: Callable[[], None],
     ) -> None:
-        self._client, self._photographs, self._scene_frame, self._wake = (
-            client,
-            photographs,
-            scene_frame,
-            wake,
-        )
+        self._client, self._photographs = client, photographs
+        self._scene_frame, self._wake = scene_frame, wake
         self._lock = threading.Lock()
         self._painter = Painter(scene_frame)
         self.pacing = FramePacing()

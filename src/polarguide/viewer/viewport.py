@@ -32,12 +32,6 @@ def free_camera(
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, -rotation @ center)
 
 
-def quaternion(camera: Camera) -> tuple[float, float, float, float]:
-    """(w, x, y, z) of a camera's camera-to-world rotation."""
-    x, y, z, w = Rotation.from_matrix(camera.rotation.T.numpy()).as_quat()
-    return float(w), float(x), float(y), float(z)
-
-
 @dataclass(frozen=True)
 class Letterbox:
     """The placement of a photograph in a window of another aspect ratio: as large as possible, centered.
@@ -54,16 +48,8 @@ class Letterbox:
 
     def camera(self, photograph: Camera) -> Camera:
         """The photograph's camera, extended to the window."""
-        s, (width, height) = self.scale, self.frame_size
-        return replace(
-            photograph,
-            width=width,
-            height=height,
-            fx=s * photograph.fx,
-            fy=s * photograph.fy,
-            cx=s * photograph.cx + self.left,
-            cy=s * photograph.cy + self.top,
-        )
+        scaled = photograph.scaled(self.scale, *self.frame_size)
+        return replace(scaled, cx=scaled.cx + self.left, cy=scaled.cy + self.top)
 
     def apply(self, picture: Picture) -> Picture:
         """A picture of the photograph's size, resampled into the window with gray borders."""
@@ -78,17 +64,12 @@ class Letterbox:
 def letterbox(photograph: Camera, frame_size: tuple[int, int]) -> Letterbox:
     """The placement of a photograph in a window of ``frame_size``, width and height."""
     scale = min(frame_size[0] / photograph.width, frame_size[1] / photograph.height)
-    left, top = (
-        0.5 * (frame_size[0] - scale * photograph.width),
-        0.5 * (frame_size[1] - scale * photograph.height),
-    )
+    left = 0.5 * (frame_size[0] - scale * photograph.width)
+    top = 0.5 * (frame_size[1] - scale * photograph.height)
     return Letterbox(scale, left, top, frame_size)
 
 
 def window_fov(photograph: Camera, aspect: float) -> float:
     """Vertical field of view in radians with which a window of ``aspect`` (width / height) contains a photograph."""
-    high, wide = (
-        0.5 * photograph.height / photograph.fy,
-        0.5 * photograph.width / photograph.fx,
-    )
+    high, wide = 0.5 * photograph.height / photograph.fy, 0.5 * photograph.width / photograph.fx
     return 2 * math.atan(max(high, wide / aspect))

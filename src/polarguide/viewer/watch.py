@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 
+from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.options import LOOPBACK
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
+from polarguide.shading.model import ShadingModel
 from polarguide.training.trainer import Trainer
 from polarguide.viewer.frusta import photographs
 from polarguide.viewer.server import Viewer
-from polarguide.viewer.shown import shown_run, shown_training
+from polarguide.viewer.shown import Shown, shown_run, shown_training
 
 PATIENCE = 0.2  # seconds between two looks at whether a paused training should end
 
@@ -31,17 +34,8 @@ def view_run(
     Raises:
         PolarguideError: the address cannot be listened at.
     """
-    shown = shown_run(run)
-    viewer = Viewer(
-        lambda: shown,
-        photographs(run.scene),
-        shading=run.model.shading,
-        host=host,
-        port=port,
-        title=f"polarguide {run.folder.resolve().name}",
-    )
-    with closing(viewer):
-        _announce(viewer, host, reporter)
+    shown, name = shown_run(run), run.folder.resolve().name
+    with _opened(lambda: shown, run.scene, run.model.shading, name, host, port, reporter) as viewer:
         while True:
             viewer.serve(1.0)
 
@@ -61,15 +55,6 @@ def watched(trainer: Trainer, host: str, port: int, reporter: Reporter = SILENT)
             remedy="Leave it out, and look at the checkpoints: polarguide view RUN.",
         )
     scene = trainer.scene
-    viewer = Viewer(
-        lambda: shown_training(trainer),
-        photographs(scene),
-        shading=trainer.shading,
-        trains=True,
-        host=host,
-        port=port,
-        title=f"polarguide {scene.name}",
-    )
 
     def look(ends: Ends) -> None:
         viewer.refresh()
@@ -77,13 +62,23 @@ def watched(trainer: Trainer, host: str, port: int, reporter: Reporter = SILENT)
         while viewer.paused and not ends():
             viewer.serve(PATIENCE)
 
-    with closing(viewer):
-        _announce(viewer, host, reporter)
+    current = functools.partial(shown_training, trainer)
+    with _opened(current, scene, trainer.shading, scene.name, host, port, reporter, trains=True) as viewer:
         yield look
 
 
-def _announce(viewer: Viewer, host: str, reporter: Reporter) -> None:
-    """Say where to look, and warn of strangers."""
-    if host not in LOOPBACK:
-        reporter.warn(f"whoever reaches {host} over the network can look: there is no password")
-    reporter.say(f"viewer: {viewer.address}")
+@contextmanager
+def _opened(
+    current: Callable[[], Shown], scene: Scene, shading: ShadingModel, name: str, host: str, port: int,
+    reporter: Reporter, *, trains: bool = False,
+) -> Iterator[Viewer]:  # fmt: skip
+    """A viewer: says where to look, and warns of strangers."""
+    title = f"polarguide {name}"
+    viewer = Viewer(
+        current, photographs(scene), shading=shading, trains=trains, host=host, port=port, title=title
+    )
+    with closing(viewer):
+        if host not in LOOPBACK:
+            reporter.warn(f"whoever reaches {host} over the network can look: there is no password")
+        reporter.say(f"viewer: {viewer.address}")
+        yield viewer

@@ -7,15 +7,14 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from polarguide.capture.colmap.write import PosedCamera
+from polarguide.capture.colmap.write import PosedCamera, colmap_camera
 from polarguide.capture.write import write_png
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
@@ -81,25 +80,20 @@ def match_features(
         reading["reader_options"] = pycolmap.ImageReaderOptions()
         reading["reader_options"].mask_path = str(_named_for_colmap(masks, sizes))
     try:
-        with _RowCounter(database, "keypoints") as counter:
+        with _counted_rows(database, "keypoints") as rows:
             run_step(
                 lambda: pycolmap.extract_features(database, images, camera_mode=mode, **reading),
-                seed, reporter, "extracting features", count, lambda: counter.rows,
+                seed, reporter, "extracting features", count, rows,
             )  # fmt: skip
         numbers: dict[str, tuple[int, int]] = {}
         if cameras is not None:
             numbers = run_step(
-                lambda: _write_intrinsics(database, cameras),
-                seed,
-                reporter,
-                "setting intrinsics",
-                None,
-                lambda: 0,
+                lambda: _write_intrinsics(database, cameras), seed, reporter, "setting intrinsics"
             )
-        with _RowCounter(database, "two_view_geometries") as counter:
+        with _counted_rows(database, "two_view_geometries") as rows:
             run_step(
                 lambda: compare(database, verification_options=verify),
-                seed, reporter, "matching pairs", pairs, lambda: counter.rows,
+                seed, reporter, "matching pairs", pairs, rows,
             )  # fmt: skip
     except PolarguideError:
         for path in database.parent.glob(f"{database.name}*"):
@@ -131,16 +125,7 @@ def _write_intrinsics(database: Path, cameras: Mapping[str, PosedCamera]) -> dic
             image = link.read_image_with_name(f"{view}.png")
             assert image is not None
             numbers[view] = (int(image.image_id), int(image.camera_id))
-            link.update_camera(
-                pycolmap.Camera(
-                    camera_id=image.camera_id,
-                    model=camera.model,
-                    width=camera.width,
-                    height=camera.height,
-                    params=list(camera.parameters),
-                    has_prior_focal_length=True,
-                )
-            )
+            link.update_camera(colmap_camera(camera, camera_id=image.camera_id, has_prior_focal_length=True))
     return numbers
 
 
@@ -149,8 +134,8 @@ def run_step(
     seed: int,
     reporter: Reporter,
     label: str,
-    total: int | None,
-    done: Callable[[], int],
+    total: int | None = None,
+    done: Callable[[], int] = lambda: 0,
 ) -> Any:
     """Run a step of COLMAP in a thread, so that progress is shown and Ctrl-C ends the program at once.
 
@@ -198,42 +183,39 @@ def set_seed(options: Any, seed: int) -> None:
         options.random_seed = seed
 
 
-class _RowCounter:
-    """Counts the rows of a table from a process of its own, for as long as it is entered.
+def pipeline_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """The options of mapping and triangulation, with all of their seeds."""
+    options = pycolmap.IncrementalPipelineOptions()
+    for part in (options, options.mapper, options.triangulation):
+        set_seed(part, seed)
+    return options
+
+
+@contextlib.contextmanager
+def _counted_rows(database: Path, table: str) -> Iterator[Callable[[], int]]:
+    """Counts the rows of a table from a process of its own; yields a function that returns the latest count.
 
     COLMAP brings its own copy of SQLite. Two copies in one process undo each other's file locks (those of POSIX
     belong to processes), and the database is destroyed: it must never be opened, nor even closed, from here.
     """
+    rows = 0
+    command = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, str(database), table]
 
-    def __init__(self, database: Path, table: str) -> None:
-        self.rows = 0
-        self._command = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, str(database), table]
-        self._process: subprocess.Popen[str] | None = None
-        self._listener: threading.Thread | None = None
+    def listen(lines: Iterable[str]) -> None:
+        nonlocal rows
+        for line in lines:
+            rows = max(rows, int(line))
 
-    def __enter__(self) -> _RowCounter:
-        with contextlib.suppress(OSError):  # without a second process there is no progress, but all else
-            self._process = subprocess.Popen(
-                self._command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-            )
-            self._listener = threading.Thread(target=self._listen, daemon=True)
-            self._listener.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._process is None:
-            return
-        self._process.kill()
-        self._process.wait()
-        if self._listener is not None:
-            self._listener.join()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-
-    def _listen(self) -> None:
-        assert self._process is not None
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self.rows = max(self.rows, int(line))
+    try:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    except OSError:  # without a second process there is no progress, but all else
+        yield lambda: 0
+        return
+    with process:
+        listener = threading.Thread(target=listen, args=(process.stdout,), daemon=True)
+        listener.start()
+        try:
+            yield lambda: rows
+        finally:
+            process.kill()
+            listener.join()

@@ -7,7 +7,7 @@ import difflib
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -102,11 +102,8 @@ def read_model(root: Path) -> ColmapModel:
             found="none",
             remedy="Triangulate points with the known poses (colmap point_triangulator).",
         )
-    warnings = (
-        (f"{dropped} of {dropped + len(points)} 3D points are not finite and were left out.",)
-        if dropped
-        else ()
-    )
+    warning = f"{dropped} of {dropped + len(points)} 3D points are not finite and were left out."
+    warnings = (warning,) if dropped else ()
     return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks)
 
 
@@ -125,16 +122,7 @@ def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: s
             found=f"{camera.width}x{camera.height}",
             remedy="Give intrinsics for these pictures, or pictures of the size COLMAP saw (no crop).",
         )
-    factor = width / camera.width
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * factor,
-        fy=camera.fy * factor,
-        cx=camera.cx * factor,
-        cy=camera.cy * factor,
-    )
+    return camera.scaled(width / camera.width, width, height)
 
 
 def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
@@ -223,38 +211,36 @@ def posed_images(model: Any) -> dict[str, list[Any]]:
     return images
 
 
+def is_pinhole(camera: Any) -> bool:
+    """Whether a camera of pycolmap's is a pinhole without distortion."""
+    extra = camera.extra_params_idxs()
+    return camera.model_name in PINHOLES and all(camera.params[index] == 0 for index in extra)
+
+
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     where = f"{folder} (camera {camera.camera_id}, image {image.name})"
-    model = camera.model_name
-    if model not in PINHOLES or any(camera.params[index] != 0.0 for index in camera.extra_params_idxs()):
+    if not is_pinhole(camera):
         raise PolarguideError(
             where,
             expected="an undistorted camera (PINHOLE or SIMPLE_PINHOLE)",
-            found=f"{model} with parameters {', '.join(f'{value:g}' for value in camera.params)}",
+            found=f"{camera.model_name} with parameters {', '.join(f'{value:g}' for value in camera.params)}",
             remedy="Undistort the four intensities of each view, and the model with them.",
         )
-    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
-    rotation = np.asarray(pose.rotation.matrix(), dtype=np.float64)
-    translation = np.asarray(pose.translation, dtype=np.float64)
+    placed = image.cam_from_world()
+    rotation = np.asarray(placed.rotation.matrix(), dtype=np.float64)
+    translation = np.asarray(placed.translation, dtype=np.float64)
     inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    numbers = np.isfinite([*translation, *inner]).all() and min(inner[:2]) > 0
-    if not numbers or abs(float(np.linalg.norm(pose.rotation.quat)) - 1.0) > 1e-6:
+    sound = np.isfinite([*translation, *inner]).all() and min(inner[:2]) > 0
+    if not sound or abs(float(np.linalg.norm(placed.rotation.quat)) - 1.0) > 1e-6:
         raise PolarguideError(
             where,
             expected="a unit quaternion, a finite translation and positive focal lengths",
-            found=f"quaternion {pose.rotation.quat}, translation {translation}, intrinsics {inner}",
+            found=f"quaternion {placed.rotation.quat}, translation {translation}, intrinsics {inner}",
             remedy="Export the model again.",
         )
-    return Camera(
-        width=int(camera.width),
-        height=int(camera.height),
-        fx=float(inner[0]),
-        fy=float(inner[1]),
-        cx=float(inner[2]),
-        cy=float(inner[3]),
-        rotation=torch.from_numpy(rotation.copy()),
-        translation=torch.from_numpy(translation.copy()),
-    )
+    fx, fy, cx, cy = map(float, inner)
+    pose = torch.from_numpy(rotation.copy()), torch.from_numpy(translation.copy())
+    return Camera(int(camera.width), int(camera.height), fx, fy, cx, cy, *pose)
 
 
 def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], int]:

@@ -94,7 +94,7 @@ class Poses:
         for view in self.views:
             image = self._images[view]
             camera = self.warp(view, geometries[view]).source
-            pose = _pose(image)
+            pose = image.cam_from_world()
             found[view] = PosedCamera(
                 camera.width,
                 camera.height,
@@ -112,16 +112,13 @@ class Poses:
             PolarguideError: the camera is neither of the stored nor the developed size, nor a resized one.
         """
         number = self._images[view].camera_id
-        key = (number, geometry)
+        key, where = (number, geometry), f"{self.folder} (camera of view {view})"
         if key not in self._warps:
-            camera = camera_for_picture(
-                self._model.cameras[number], geometry, f"{self.folder} (camera of view {view})"
-            )
-            self._warps[key] = undistortion(camera)
+            self._warps[key] = undistortion(camera_for_picture(self._model.cameras[number], geometry, where))
         warp = self._warps[key]
         if self._of_camera.setdefault(number, warp) is not warp:
             raise PolarguideError(
-                f"{self.folder} (camera of view {view})",
+                where,
                 expected="pictures of one size for one camera",
                 found=f"{geometry.size[0]}x{geometry.size[1]} beside another size",
                 remedy="Give each size a camera of its own in the model.",
@@ -136,12 +133,8 @@ class Poses:
                 self._move_points(image, model.cameras[image.camera_id], self._of_camera[image.camera_id])
         for number, warp in self._of_camera.items():
             camera = model.cameras[number]
-            camera.model, camera.width, camera.height = (
-                warp.target.model,
-                warp.target.width,
-                warp.target.height,
-            )
-            camera.params = warp.target.params
+            for name in ("model", "width", "height", "params"):
+                setattr(camera, name, getattr(warp.target, name))
         model.write_binary(str(folder))
 
     def _move_points(self, image: Any, before: Any, warp: Undistortion) -> None:
@@ -154,7 +147,7 @@ class Poses:
 
     def _require_numbers(self, view: str) -> None:
         image = self._images[view]
-        pose = _pose(image)
+        pose = image.cam_from_world()
         quaternion, translation = np.asarray(pose.rotation.quat), np.asarray(pose.translation)
         camera = self._model.cameras[image.camera_id]
         finite = np.isfinite([*quaternion, *translation, *camera.params]).all()
@@ -165,8 +158,3 @@ class Poses:
                 found=f"quaternion {quaternion}, translation {translation}, camera {camera.params}",
                 remedy="Export the model again, or leave the image out.",
             )
-
-
-def _pose(image: Any) -> Any:
-    """World-to-camera pose, for old and new versions of pycolmap."""
-    return image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world

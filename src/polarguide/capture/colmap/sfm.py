@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.features import match_features, run_step, set_seed
+from polarguide.capture.colmap.features import match_features, pipeline_options, run_step
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
@@ -112,18 +113,13 @@ def _map(
     database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter, free: bool
 ) -> dict[int, Any]:
     """Incremental mapping: pycolmap's models, by number; ``free`` intrinsics are estimated."""
-    options = pycolmap.IncrementalPipelineOptions()
+    options = pipeline_options(seed)
     options.min_model_size = _LEAST
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
-    for part in (options, options.mapper, options.triangulation):
-        set_seed(part, seed)
-    placed = [0]
-
-    def step() -> None:
-        placed[0] += 1
-
+    placed: list[None] = []
+    step = functools.partial(placed.append, None)
     found: dict[int, Any] = run_step(
         lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
-        seed, reporter, "registering images", count, lambda: placed[0] + 2 if placed[0] else 0,
+        seed, reporter, "registering images", count, lambda: len(placed) + 2 if placed else 0,
     )  # fmt: skip
     return found

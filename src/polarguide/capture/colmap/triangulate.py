@@ -13,10 +13,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.features import match_features, run_step, set_seed
+from polarguide.capture.colmap.features import match_features, pipeline_options, run_step
 from polarguide.capture.colmap.model import load_model
-from polarguide.capture.colmap.visual_hull import colmap_camera, sample_visual_hull
-from polarguide.capture.colmap.write import PosedCamera, write_cameras
+from polarguide.capture.colmap.visual_hull import sample_visual_hull
+from polarguide.capture.colmap.write import PosedCamera, colmap_camera, write_cameras
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_file
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole, writing
@@ -78,14 +78,10 @@ def add_points(
             f"The poses came without points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
         )
     with writing(model):
-        _replace(model, trial)
+        shutil.rmtree(model, ignore_errors=True)
+        trial.rename(model)
     write_whole(note, (json.dumps(found) + "\n").encode())
     return model, found
-
-
-def _replace(old: Path, new: Path) -> None:
-    shutil.rmtree(old, ignore_errors=True)
-    new.rename(old)
 
 
 def _triangulated(
@@ -107,15 +103,12 @@ def _triangulated(
         with writing(start):
             write_cameras(start, cameras, numbers)
         model = load_model(start, ".bin")
-        options = pycolmap.IncrementalPipelineOptions()
-        for part in (options, options.mapper, options.triangulation):
-            set_seed(part, seed)
-        options.ba_refine_focal_length = options.ba_refine_principal_point = (
-            options.ba_refine_extra_params
-        ) = False
+        options = pipeline_options(seed)
+        for name in ("focal_length", "principal_point", "extra_params"):
+            setattr(options, f"ba_refine_{name}", False)
         made = run_step(
             lambda: pycolmap.triangulate_points(model, database, images, trial, options=options),
-            seed, reporter, "triangulating", None, lambda: 0,
+            seed, reporter, "triangulating",
         )  # fmt: skip
     except PolarguideError as error:
         reporter.warn(f"Triangulation failed ({error.found}).")
@@ -173,7 +166,9 @@ def _colors(
         picture = decode_picture(path, read_file(path))
         camera = cameras[view]
         local = places @ camera.rotation.T + camera.translation
-        focal, center = _intrinsics(camera)
+        plain = colmap_camera(camera)  # without its distortion
+        focal = np.array([plain.focal_length_x, plain.focal_length_y])
+        center = np.array([plain.principal_point_x, plain.principal_point_y])
         pixel = local[:, :2] / np.maximum(local[:, 2:], 1e-9) * focal + center
         size = np.array([camera.width, camera.height])
         inside = (local[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
@@ -183,12 +178,3 @@ def _colors(
         seen[inside] += 1
     gray = np.where(seen[:, None] > 0, total / np.maximum(seen, 1)[:, None], 128)
     return np.rint(gray).astype(np.uint8)
-
-
-def _intrinsics(camera: PosedCamera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Focal lengths and principal point of any of COLMAP's models, without distortion."""
-    made = colmap_camera(camera)
-    return (
-        np.array([made.focal_length_x, made.focal_length_y]),
-        np.array([made.principal_point_x, made.principal_point_y]),
-    )

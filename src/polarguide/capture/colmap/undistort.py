@@ -12,7 +12,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.model import PINHOLES
+from polarguide.capture.colmap.model import is_pinhole
+from polarguide.capture.filter.align import remapped_mask
 from polarguide.errors import PolarguideError
 
 
@@ -31,18 +32,6 @@ class Geometry:
     crop: tuple[int, int]
     step: int
     size: tuple[int, int]
-
-    def record(self) -> dict[str, Any]:
-        """As plain JSON types."""
-        return {
-            "stored": list(self.stored), "crop": list(self.crop), "step": self.step, "size": list(self.size)
-        }  # fmt: skip
-
-    @classmethod
-    def of(cls, record: dict[str, Any]) -> Geometry:
-        """The inverse of ``record``."""
-        stored, crop, size = ((int(x), int(y)) for x, y in (record[n] for n in ("stored", "crop", "size")))
-        return cls(stored, crop, int(record["step"]), size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +69,7 @@ class Undistortion:
             return intensities, invalid
         x, y = self._map
         moved = [cv2.remap(p, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in intensities]
-        wrong = cv2.remap(
-            invalid.astype(np.float32),
-            x,
-            y,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=1.0,
-        )
-        return np.stack(moved), np.asarray(wrong > 0)
+        return np.stack(moved), remapped_mask(invalid, x, y)
 
     @functools.cached_property
     def _map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -130,13 +111,9 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
 
 def undistortion(camera: Any) -> Undistortion:
     """The undistortion of pictures of a COLMAP camera."""
-    straight = camera.model_name in PINHOLES and all(
-        camera.params[i] == 0 for i in camera.extra_params_idxs()
-    )
-    if not straight:
-        return Undistortion(
-            camera, pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera), True
-        )
+    if not is_pinhole(camera):
+        target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+        return Undistortion(camera, target, True)
     inner = [camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y]
     target = pycolmap.Camera(
         model="PINHOLE", width=camera.width, height=camera.height, params=inner, camera_id=camera.camera_id

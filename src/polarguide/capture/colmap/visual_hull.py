@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.write import PosedCamera
+from polarguide.capture.colmap.write import PosedCamera, colmap_camera
 
 _ROUNDS = 4
 _BATCH = 100_000
@@ -97,10 +97,3 @@ def _seen_by_most(
             inside[hit] += masks[view][row, column]
     enough = seen >= max(1.0, _SHARE_OF_VIEWS * len(cameras))
     return np.asarray(enough & (inside >= _SHARE_IN_MASKS * seen)) if masks else np.asarray(enough)
-
-
-def colmap_camera(camera: PosedCamera) -> pycolmap.Camera:
-    """The intrinsics of a camera as pycolmap's type."""
-    return pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=list(camera.parameters)
-    )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from polarguide.camera import quaternion
@@ -49,6 +50,12 @@ class PosedCamera:
     def center(self) -> NDArray[np.float64]:
         """Camera center in the world, [3]."""
         return np.asarray(-self.rotation.T @ self.translation)
+
+
+def colmap_camera(camera: PosedCamera, **more: Any) -> pycolmap.Camera:
+    """The intrinsics of a camera as pycolmap's type."""
+    size, params = {"width": camera.width, "height": camera.height}, list(camera.parameters)
+    return pycolmap.Camera(model=camera.model, params=params, **size, **more)
 
 
 def write_cameras(

@@ -2,27 +2,29 @@
 
 from pathlib import Path
 
-from polarguide.capture.datasets.dataset import Dataset, StokesImage, resized_mask
-from polarguide.capture.datasets.gnerp import is_gnerp, open_gnerp
-from polarguide.capture.datasets.neisf import is_neisf, open_neisf
-from polarguide.capture.datasets.nersp import is_nersp, open_nersp
-from polarguide.capture.datasets.pandora import is_pandora, open_pandora
-from polarguide.capture.datasets.pisr import SENSOR as PISR_SENSOR
-from polarguide.capture.datasets.pisr import is_pisr, open_pisr
+from polarguide.capture.datasets.dataset import Dataset
+from polarguide.capture.datasets.gnerp import open_gnerp
+from polarguide.capture.datasets.neisf import open_neisf
+from polarguide.capture.datasets.nersp import open_nersp
+from polarguide.capture.datasets.pandora import open_pandora
+from polarguide.capture.datasets.pisr import open_pisr
 
 DATASETS = {
-    "pandora": is_pandora,
-    "pisr": is_pisr,
-    "nersp": is_nersp,
-    "neisf": is_neisf,
-    "gnerp": is_gnerp,
+    "pandora": ("images_stokes/",),
+    "pisr": ("raw/", "intrinsics.npz"),
+    "nersp": ("s0/", "s1/", "s2/"),
+    "neisf": ("images_s0/", "images_s1/", "images_s2/"),
+    "gnerp": ("cameras.json", "aop/", "dop/"),
 }
-"""Names, and functions that tell whether a folder has the layout."""
+"""Names, and the files and folders that a folder with the layout has."""
 
 
 def detect_dataset(root: Path) -> str | None:
     """The dataset whose layout a folder has, or None."""
-    return next((name for name, has_layout in DATASETS.items() if has_layout(root)), None)
+    for name, parts in DATASETS.items():
+        if all((root / part).is_dir() if part[-1] == "/" else (root / part).is_file() for part in parts):
+            return name
+    return None
 
 
 def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
@@ -39,14 +41,3 @@ def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
     if name == "gnerp":
         return open_gnerp(root, transfer=transfer)
     return {"pandora": open_pandora, "pisr": open_pisr, "nersp": open_nersp, "neisf": open_neisf}[name](root)
-
-
-__all__ = [
-    "DATASETS",
-    "PISR_SENSOR",
-    "Dataset",
-    "StokesImage",
-    "detect_dataset",
-    "open_dataset",
-    "resized_mask",
-]

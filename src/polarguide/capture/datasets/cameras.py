@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.formats.arrays import finite_numbers, read_arrays
+from polarguide.capture.datasets.dataset import not_as_published
+from polarguide.capture.formats.arrays import finite_numbers, read_arrays, wrong_camera
 from polarguide.errors import PolarguideError
 
 _LARGEST_SKEW = 1e-3
@@ -57,12 +58,7 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
     """
     left = projection[:, :3]
     if not np.linalg.cond(left) < 1e10:
-        raise PolarguideError(
-            where,
-            expected="a camera matrix that can be inverted",
-            found="a singular one",
-            remedy="Export the cameras again.",
-        )
+        raise wrong_camera(where, "a camera matrix that can be inverted", "a singular one")
     if np.linalg.det(left) < 0:  # a matrix means the same with the other sign; rotations have determinant 1
         projection, left = -projection, -left
     inner, rotation = rq(left)
@@ -81,12 +77,8 @@ def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
     lower = np.abs([inner[1, 0], inner[2, 0], inner[2, 1], inner[2, 2] - 1]).max()
     skew = abs(inner[0, 1]) / max(abs(inner[0, 0]), 1e-12)
     if not (inner[0, 0] > 0 and inner[1, 1] > 0 and lower < 1e-6 and skew < _LARGEST_SKEW):
-        raise PolarguideError(
-            where,
-            expected="an intrinsic matrix with positive focal lengths and without skew",
-            found=str(np.round(inner, 4).tolist()),
-            remedy="Export the cameras again.",
-        )
+        expected = "an intrinsic matrix with positive focal lengths and without skew"
+        raise wrong_camera(where, expected, str(np.round(inner, 4).tolist()))
     return inner
 
 
@@ -98,13 +90,9 @@ def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
     """
     u, spread, vt = np.linalg.svd(matrix[:3, :3])
     if not (np.abs(spread - 1) < 1e-2).all() or np.linalg.det(u @ vt) < 0:
-        raise PolarguideError(
-            where,
-            expected="a rotation and a translation",
-            found=f"a matrix with singular values {np.round(spread, 4).tolist()} and determinant "
-            f"{np.linalg.det(matrix[:3, :3]):.3g}",
-            remedy="Export the cameras again.",
-        )
+        found = f"a matrix with singular values {np.round(spread, 4).tolist()} and determinant "
+        found += f"{np.linalg.det(matrix[:3, :3]):.3g}"
+        raise wrong_camera(where, "a rotation and a translation", found)
     return u @ vt, matrix[:3, 3]
 
 
@@ -117,11 +105,7 @@ def pinhole_camera(
 
 
 def distorted_camera(
-    where: object,
-    size: tuple[int, int],
-    inner: Matrix,
-    coefficients: Any,
-    pose: tuple[Matrix, Matrix],
+    where: object, size: tuple[int, int], inner: Matrix, coefficients: Any, pose: Sequence[Matrix]
 ) -> PosedCamera:
     """A camera calibrated with OpenCV, with 4, 5 or 8 distortion coefficients.
 
@@ -134,16 +118,12 @@ def distorted_camera(
     k = finite_numbers(where, flat, ((4,), (5,), (8,)))
     padded = [*k, *[0.0] * (8 - len(k))]
     parameters = (inner[0, 0], inner[1, 1], inner[0, 2] + 0.5, inner[1, 2] + 0.5, *padded)
-    return PosedCamera(*size, "FULL_OPENCV", tuple(float(p) for p in parameters), *pose)
+    rotation, translation = pose
+    return PosedCamera(*size, "FULL_OPENCV", tuple(float(p) for p in parameters), rotation, translation)
 
 
 def missing_entry(path: Path, key: str, found: Mapping[str, object]) -> PolarguideError:
     """The error that a file lacks an entry."""
     names = sorted(found)
     shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-    return PolarguideError(
-        path,
-        expected=f"the entry {key}",
-        found=shown or "no entry",
-        remedy="Take the file from the dataset as it was published.",
-    )
+    return not_as_published(path, f"the entry {key}", shown or "no entry")

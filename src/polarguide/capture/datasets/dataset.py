@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,22 +12,18 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Sense
 from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.formats.pictures import decode_stored, read_file
+from polarguide.capture.formats.pictures import decode_mask, decode_stored, read_file
+from polarguide.capture.formats.radiance import read_radiance
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
+StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
+"""Stokes vectors of a view [3, H, W, 3] in the dataset's own sense of angles; pixels at full scale in its pictures."""
 
-@dataclass(frozen=True, eq=False)
-class StokesImage:
-    """The Stokes vectors of one view.
 
-    Attributes:
-        stokes: [3, H, W, 3] float32, in the dataset's own sense of angles.
-        clipped: pixels at full scale in the dataset's pictures, [H, W].
-    """
-
-    stokes: NDArray[np.float32]
-    clipped: NDArray[np.bool_]
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """An object mask [H, W] from a picture: where it reaches half of its maximum."""
+    return decode_mask(path, read_file(path), any_value=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +36,8 @@ class Dataset:
         paths: all files that are read.
         cameras: view -> camera.
         read_stokes: reads the Stokes vectors of a view; None if ``mosaics`` holds raw files instead.
-        mask: reads the object mask of a view, [H, W]; None if it has none.
+        masks: view -> file of its object mask, for the views that have one.
+        read_mask: reads such a file, [H, W].
         sense: direction in which angles increase as displayed, "ccw" or "cw".
         mosaics: folder of raw mosaics, or None.
         gamma: exponent of the mosaics' stored values: stored = linear ^ gamma.
@@ -52,11 +49,56 @@ class Dataset:
     paths: list[Path]
     cameras: Mapping[str, PosedCamera]
     read_stokes: Callable[[str], StokesImage] | None
-    mask: Callable[[str], NDArray[np.bool_] | None]
+    masks: Mapping[str, Path]
+    read_mask: Callable[[Path], NDArray[np.bool_]] = read_mask
     sense: Sense = "ccw"
     mosaics: Path | None = None
     gamma: float = 1.0
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+
+
+def not_as_published(where: object, expected: str, found: str) -> PolarguideError:
+    """The error that a file of a dataset is not what its authors published."""
+    remedy = "Take the files from the dataset as they were published."
+    return PolarguideError(where, expected=expected, found=found, remedy=remedy)
+
+
+def stokes_dataset(
+    name: str,
+    parts: Sequence[str],
+    files: Mapping[str, Sequence[Path]],
+    stokes: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+    cameras_file: Path,
+    cameras: Mapping[str, PosedCamera],
+    masks: Mapping[str, Path],
+    *,
+    read_mask: Callable[[Path], NDArray[np.bool_]] = read_mask,
+    sense: Sense = "ccw",
+    notes: tuple[str, ...] = (),
+) -> Dataset:
+    """A dataset whose Stokes vectors follow from three radiance files a view.
+
+    Args:
+        name, cameras, masks, read_mask, sense, notes: as in ``Dataset``.
+        parts: what the three files of a view are called in messages.
+        files: view -> its three files.
+        stokes: the Stokes vectors [3, H, W, 3], given the three pictures [3, H, W, 3].
+        cameras_file: the file of the cameras.
+
+    Raises:
+        PolarguideError: a file is missing.
+    """
+    for index, part in enumerate(parts):
+        require_files({view: paths[index] for view, paths in files.items()}, part)
+
+    def read_stokes(view: str) -> StokesImage:
+        planes = [read_radiance(path) for path in files[view]]
+        for path, plane in zip(files[view], planes, strict=True):
+            require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
+        return stokes(np.stack(planes)), np.zeros(planes[0].shape[:2], bool)
+
+    paths = [*(path for paths in files.values() for path in paths), *masks.values(), cameras_file]
+    return Dataset(name, sorted(files), paths, cameras, read_stokes, masks, read_mask, sense, notes=notes)
 
 
 def require_files(files: Mapping[str, Path], kind: str) -> None:
@@ -108,12 +150,8 @@ def require_same_shape(path: Path, found: tuple[int, ...], first: tuple[int, ...
         PolarguideError: the sizes differ.
     """
     if found[:2] != first[:2]:
-        raise PolarguideError(
-            path,
-            expected=f"{first[1]}x{first[0]} pixels like {like.name}",
-            found=f"{found[1]}x{found[0]}",
-            remedy="Take the files from the dataset as they were published.",
-        )
+        expected = f"{first[1]}x{first[0]} pixels like {like.name}"
+        raise not_as_published(path, expected, f"{found[1]}x{found[0]}")
 
 
 def numbered_views(stems: set[str]) -> dict[str, int]:
@@ -128,12 +166,7 @@ def first_picture_size(pictures: Mapping[str, Path], folder: Path) -> tuple[int,
         PolarguideError: there is none, or it is damaged.
     """
     if not pictures:
-        raise PolarguideError(
-            folder,
-            expected="the pictures that the intrinsics belong to",
-            found="none",
-            remedy="Take the folder from the dataset as it was published.",
-        )
+        raise not_as_published(folder, "the pictures that the intrinsics belong to", "none")
     path = pictures[min(pictures)]
     height, width = decode_stored(path, read_file(path)).shape[:2]
     return width, height
@@ -147,16 +180,14 @@ def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[
     Raises:
         PolarguideError: the mask has another aspect.
     """
-    mask = dataset.mask(view)
-    if mask is None or mask.shape == size:
+    if view not in dataset.masks:
+        return None
+    mask = dataset.read_mask(dataset.masks[view])
+    if mask.shape == size:
         return mask
     height, width = mask.shape
     if abs(height * size[1] - width * size[0]) > max(height, width):
-        raise PolarguideError(
-            f"mask of view {view}",
-            expected=f"the aspect of the pictures, {size[1]}x{size[0]}",
-            found=f"{width}x{height}",
-            remedy="Take the file from the dataset as it was published.",
-        )
+        expected = f"the aspect of the pictures, {size[1]}x{size[0]}"
+        raise not_as_published(f"mask of view {view}", expected, f"{width}x{height}")
     way = cv2.INTER_AREA if height > size[0] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(mask.astype(np.float32), (size[1], size[0]), interpolation=way) >= 0.5)

@@ -26,23 +26,18 @@ from polarguide.capture.datasets.dataset import (
     StokesImage,
     cameras_of_views,
     first_picture_size,
+    not_as_published,
     numbered_views,
     require_files,
     require_same_shape,
 )
-from polarguide.capture.formats.arrays import finite_numbers, read_array
-from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_picture, linear_codes, read_file
+from polarguide.capture.formats.arrays import array_kind, finite_numbers, read_array
+from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, linear_codes, read_file
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import FULL_CODE
-from polarguide.errors import PolarguideError
 from polarguide.records import read_record
 
 _SHAPES = ((3, 4), (4, 4))
-
-
-def is_gnerp(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return (root / "cameras.json").is_file() and (root / "aop").is_dir() and (root / "dop").is_dir()
 
 
 def open_gnerp(root: Path, *, transfer: str) -> Dataset:
@@ -72,11 +67,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
         aop, dop = (_plane(files[view], stored.shape, pictures[view]) for files in (angles, degrees))
         s0 = 2 * linear_codes(stored, transfer).astype(np.float32) / np.float32(FULL_CODE)
         stokes = [s0, s0 * (dop * np.cos(2 * aop))[..., None], s0 * (dop * np.sin(2 * aop))[..., None]]
-        return StokesImage(np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2)))
-
-    def mask(view: str) -> NDArray[np.bool_] | None:
-        path = masks.get(view)
-        return None if path is None else decode_mask(path, read_file(path), any_value=False)
+        return np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2))
 
     used = [files[view] for view in numbers for files in (pictures, angles, degrees)]
     return Dataset(
@@ -85,7 +76,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
         paths=[*used, *masks.values(), cameras_file],
         cameras=cameras_of_views(cameras_file, numbers, _cameras(cameras_file, size), "w2c_mat_"),
         read_stokes=read_stokes,
-        mask=mask,
+        masks=masks,
         notes=(
             "AoP and DoP have one channel and are shared by R, G and B.",
             f"The pictures were taken as {transfer}"
@@ -101,12 +92,7 @@ def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32
     if plane.ndim == 3 and plane.shape[2] == 1:
         plane = plane[..., 0]
     if plane.ndim != 2 or plane.dtype.kind != "f":
-        raise PolarguideError(
-            path,
-            expected="floating-point numbers of one channel",
-            found=f"an array {'x'.join(map(str, plane.shape))} of {plane.dtype}",
-            remedy="Take the file from the dataset as it was published.",
-        )
+        raise not_as_published(path, "floating-point numbers of one channel", array_kind(plane))
     require_same_shape(path, plane.shape, shape, like)
     return np.asarray(plane, np.float32)
 

@@ -11,30 +11,15 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.datasets.cameras import checked_pose, pinhole_camera
-from polarguide.capture.datasets.dataset import (
-    Dataset,
-    StokesImage,
-    cameras_of_views,
-    require_files,
-    require_same_shape,
-)
-from polarguide.capture.formats.arrays import finite_numbers, read_array
-from polarguide.capture.formats.pictures import decode_mask, read_file
-from polarguide.capture.formats.radiance import read_radiance
+from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, not_as_published, stokes_dataset
+from polarguide.capture.formats.arrays import array_size, finite_numbers, read_array
 from polarguide.capture.layout import index_files
-from polarguide.errors import PolarguideError
 
 _PARTS = ("images_s0", "images_s1", "images_s2")
 _STEM = re.compile(r"img_(\d{1,6})")
-
-
-def is_neisf(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return all((root / part).is_dir() for part in _PARTS)
 
 
 def open_neisf(root: Path) -> Dataset:
@@ -46,31 +31,12 @@ def open_neisf(root: Path) -> Dataset:
     matches = [_STEM.fullmatch(stem) for part in _PARTS for stem in index_files(root / part, (".exr",))]
     numbers = {match[0]: int(match[1]) for match in matches if match is not None}
     files = {view: [root / part / f"{view}.exr" for part in _PARTS] for view in numbers}
-    for index, part in enumerate(_PARTS):
-        require_files({view: paths[index] for view, paths in files.items()}, part)
-    masks = index_files(root / "masks", (".png",))
     cameras_file = root / "poses_bounds.npy"
-
-    def read_stokes(view: str) -> StokesImage:
-        planes = [read_radiance(path) for path in files[view]]
-        for path, plane in zip(files[view], planes, strict=True):
-            require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
-        return StokesImage(np.stack(planes), np.zeros(planes[0].shape[:2], bool))
-
-    def mask(view: str) -> NDArray[np.bool_] | None:
-        path = masks.get(view)
-        return None if path is None else decode_mask(path, read_file(path), any_value=False)
-
-    return Dataset(
-        name="neisf",
-        views=sorted(numbers),
-        paths=[*(p for paths in files.values() for p in paths), *masks.values(), cameras_file],
-        cameras=cameras_of_views(cameras_file, numbers, _cameras(cameras_file), "row "),
-        read_stokes=read_stokes,
-        mask=mask,
-        notes=(
-            "The sense of NeISF's angles is not stated by its release: taken as counter-clockwise (--sense cw if not).",
-        ),
+    cameras = cameras_of_views(cameras_file, numbers, _cameras(cameras_file), "row ")
+    masks = index_files(root / "masks", (".png",))
+    note = "The sense of NeISF's angles is not stated by its release: taken as counter-clockwise (--sense cw if not)."
+    return stokes_dataset(
+        "neisf", _PARTS, files, lambda planes: planes, cameras_file, cameras, masks, notes=(note,)
     )
 
 
@@ -78,30 +44,19 @@ def _cameras(path: Path) -> dict[int, PosedCamera]:
     """Row -> camera; rows count from 1 like the files."""
     rows = read_array(path)
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
-        raise PolarguideError(
-            path,
-            expected="an array N x 17 of poses and bounds (LLFF)",
-            found="x".join(map(str, rows.shape)) or "a single value",
-            remedy="Take the file from the dataset as it was published.",
-        )
+        raise not_as_published(path, "an array N x 17 of poses and bounds (LLFF)", array_size(rows))
     cameras = {}
     for index, row in enumerate(rows):
         where = f"{path} (row {index})"
         down, right, back, center, inner = finite_numbers(where, row[:15], ((15,),)).reshape(3, 5).T
         height, width, focal = inner
         if not (1 <= height <= 1e5 and 1 <= width <= 1e5 and focal > 0):
-            raise PolarguideError(
-                where,
-                expected="height, width and focal length in pixels",
-                found=f"{height:g}, {width:g} and {focal:g}",
-                remedy="Take the file from the dataset as it was published.",
-            )
-        axes = np.column_stack(
-            [np.stack([right, down, -back]), np.zeros(3)]
-        )  # OpenCV's: right, down, forward
+            found = f"{height:g}, {width:g} and {focal:g}"
+            raise not_as_published(where, "height, width and focal length in pixels", found)
+        # OpenCV's axes: right, down, forward.
+        axes = np.column_stack([np.stack([right, down, -back]), np.zeros(3)])
         rotation, _ = checked_pose(where, axes)
         middle = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        cameras[index + 1] = pinhole_camera(
-            (round(width), round(height)), middle, rotation, -rotation @ center
-        )
+        size = round(width), round(height)
+        cameras[index + 1] = pinhole_camera(size, middle, rotation, -rotation @ center)
     return cameras

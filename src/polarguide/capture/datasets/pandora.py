@@ -14,25 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.datasets.cameras import pinhole_camera, read_projections
-from polarguide.capture.datasets.dataset import (
-    Dataset,
-    StokesImage,
-    cameras_of_views,
-    first_picture_size,
-    require_files,
-    require_same_shape,
-)
-from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
-from polarguide.capture.formats.radiance import read_radiance
+from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, first_picture_size, stokes_dataset
+from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import index_files
 
 _PARTS = ("s0", "s0p1", "s0p2")
 _STEM = re.compile(r"(?P<view>\d{1,6})_(?P<part>s0|s0p1|s0p2)")
-
-
-def is_pandora(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return (root / "images_stokes").is_dir()
 
 
 def open_pandora(root: Path) -> Dataset:
@@ -45,32 +32,17 @@ def open_pandora(root: Path) -> Dataset:
     matches = [_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
     views = sorted({match["view"] for match in matches if match is not None})
     files = {view: [folder / f"{view}_{part}.hdr" for part in _PARTS] for view in views}
-    for index, part in enumerate(_PARTS):
-        require_files({view: paths[index] for view, paths in files.items()}, part)
     masks = index_files(root / "mask", SUFFIXES)
     pictures = index_files(root / "images", SUFFIXES)
     first = 0 if any(int(view) == 0 for view in views) else 1
     size = first_picture_size(pictures, root / "images") if views else (1, 1)
     found = {i: pinhole_camera(size, *camera) for i, camera in read_projections(cameras_file).items()}
     numbers = {view: int(view) - first for view in views}
+    cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
+    notes = (f"Files count from {first}, cameras from 0.",)
+    return stokes_dataset("pandora", _PARTS, files, _stokes, cameras_file, cameras, masks, notes=notes)
 
-    def read_stokes(view: str) -> StokesImage:
-        total, plus1, plus2 = (read_radiance(path) for path in files[view])
-        for path, other in zip(files[view][1:], (plus1, plus2), strict=True):
-            require_same_shape(path, other.shape, total.shape, files[view][0])
-        stokes = np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)
-        return StokesImage(stokes, np.zeros(total.shape[:2], bool))
 
-    def mask(view: str) -> NDArray[np.bool_] | None:
-        path = masks.get(view)
-        return None if path is None else decode_mask(path, read_file(path), any_value=False)
-
-    return Dataset(
-        name="pandora",
-        views=views,
-        paths=[*(p for paths in files.values() for p in paths), *masks.values(), cameras_file],
-        cameras=cameras_of_views(cameras_file, numbers, found, "world_mat_"),
-        read_stokes=read_stokes,
-        mask=mask,
-        notes=(f"Files count from {first}, cameras from 0.",),
-    )
+def _stokes(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    total, plus1, plus2 = planes
+    return np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)

@@ -11,30 +11,21 @@ import math
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from polarguide.capture.datasets.cameras import (
     checked_intrinsics,
     distorted_camera,
     missing_entry,
     read_projections,
 )
-from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, numbered_views
+from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, not_as_published, numbered_views
 from polarguide.capture.formats.arrays import finite_numbers, read_arrays
-from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
+from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import index_files
-from polarguide.errors import PolarguideError
 
 SENSOR: Final = "IMX250MYR"
 SIZE = (1224, 1024)
 """Size that ``camera_matrix`` was made for."""
 _CAMERAS = ("cameras_sphere.npz", "cameras.npz")
-
-
-def is_pisr(root: Path) -> bool:
-    """Whether a folder has the layout."""
-    return (root / "raw").is_dir() and (root / "intrinsics.npz").is_file()
 
 
 def open_pisr(root: Path) -> Dataset:
@@ -55,33 +46,22 @@ def open_pisr(root: Path) -> Dataset:
     inner = checked_intrinsics(where, finite_numbers(where, intrinsics["camera_matrix"], ((3, 3),)))
     coefficients = intrinsics["dist_coeffs"]
     cameras = {
-        number: distorted_camera(
-            f"{inner_file} (dist_coeffs)", SIZE, inner, coefficients, (rotation, translation)
-        )
-        for number, (_, rotation, translation) in read_projections(cameras_file).items()
+        number: distorted_camera(f"{inner_file} (dist_coeffs)", SIZE, inner, coefficients, pose)
+        for number, (_, *pose) in read_projections(cameras_file).items()
     }
     masks = index_files(root / "mask", SUFFIXES)
     gamma = _gamma(root)
-
-    def mask(view: str) -> NDArray[np.bool_] | None:
-        path = masks.get(view)
-        return None if path is None else decode_mask(path, read_file(path), any_value=False)
-
-    said = (
-        (f"Stored values are the light to the power of {gamma:g} (gamma file): undone.",)
-        if gamma != 1
-        else ()
-    )
+    note = f"Stored values are the light to the power of {gamma:g} (gamma file): undone."
     return Dataset(
         name="pisr",
         views=sorted(numbers),
         paths=[*files.values(), *masks.values(), inner_file, cameras_file, *_gamma_files(root)],
         cameras=cameras_of_views(cameras_file, numbers, cameras, "world_mat_"),
         read_stokes=None,
-        mask=mask,
+        masks=masks,
         mosaics=root / "raw",
         gamma=gamma,
-        notes=said,
+        notes=(note,) if gamma != 1 else (),
     )
 
 
@@ -99,10 +79,6 @@ def _gamma(root: Path) -> float:
     except ValueError:
         gamma = math.nan
     if len(files) > 1 or not 0.2 <= gamma <= 5:
-        raise PolarguideError(
-            root,
-            expected="one file called gamma<number>.txt with a number from 0.2 to 5",
-            found=", ".join(path.name for path in files),
-            remedy="Take the file from the dataset as it was published.",
-        )
+        expected = "one file called gamma<number>.txt with a number from 0.2 to 5"
+        raise not_as_published(root, expected, ", ".join(path.name for path in files))
     return gamma

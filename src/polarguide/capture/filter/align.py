@@ -85,11 +85,12 @@ def align_shots(
         y, x = np.mgrid[:height, :width].astype(np.float32)
         x, y = x + np.float32(shift.x), y + np.float32(shift.y)
         moved[index] = cv2.remap(linear[index], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        bad[index] = _remapped_mask(clipped[index], x, y)
+        bad[index] = remapped_mask(clipped[index], x, y)
     return moved, bad
 
 
-def _remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
+def remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
+    """A mask [H, W] looked up at places ``x`` and ``y``: True where a pixel of it or one outside has weight."""
     weight = cv2.remap(
         mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
     )

@@ -7,28 +7,23 @@ scale and demosaicing.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.formats.arrays import array_kind
 from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
-from polarguide.errors import PolarguideError
+from polarguide.errors import PolarguideError, optional_import
 
 CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 """Suffixes that are read as camera raw."""
 _EXIF_OF_FLIP = {0: 1, 3: 3, 5: 8, 6: 6}
-
-rawpy: ModuleType | None
-try:
-    rawpy = importlib.import_module("rawpy")
-except ImportError:
-    rawpy = None
 
 
 def is_camera_raw(path: Path) -> bool:
@@ -52,16 +47,10 @@ def read_camera_raw(
     Raises:
         PolarguideError: rawpy is missing, or the file cannot be read or is damaged.
     """
-    if opener is None and rawpy is None:
-        raise PolarguideError(
-            path,
-            expected="the package rawpy, which reads camera raw files",
-            found="that it is not installed",
-            remedy="pip install 'polarguide[raw]'",
-        )
+    opened = opener or optional_import("rawpy", str(path), install="'polarguide[raw]'").imread
     data = read_file(path)
     try:
-        with (opener or rawpy.imread)(io.BytesIO(data)) as raw:  # type: ignore[union-attr]
+        with opened(io.BytesIO(data)) as raw:
             if raw.sizes.raw_width * raw.sizes.raw_height > LARGEST_PIXELS:
                 raise ValueError(f"{raw.sizes.raw_width}x{raw.sizes.raw_height} pixels")
             flip = int(raw.sizes.flip)  # before user_flip takes its place
@@ -78,7 +67,7 @@ def read_camera_raw(
         raise PolarguideError(
             path,
             expected="a camera raw file with three colors",
-            found=f"an array {'x'.join(map(str, pixels.shape))} of {pixels.dtype}",
+            found=array_kind(pixels),
             remedy="Develop it to 16-bit linear TIFF.",
         )
     return pixels, _EXIF_OF_FLIP.get(flip, 1)
@@ -107,7 +96,8 @@ def libraw_parameters(gains: tuple[float, float, float]) -> dict[str, Any]:
         "user_flip": 0,
         "median_filter_passes": 0,
     }
-    if rawpy is not None:
+    with contextlib.suppress(ImportError):
+        rawpy = importlib.import_module("rawpy")
         settings |= {
             "output_color": rawpy.ColorSpace.raw,
             "demosaic_algorithm": rawpy.DemosaicAlgorithm.LINEAR,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Calibration
+from polarguide.capture.formats.integrity import jpeg_segments, png_chunks, tiff_entries, tiff_order
 
 _ORIENTATION = 274
 _MIRRORED = (2, 4, 5, 7)
@@ -17,14 +18,8 @@ _QUARTER = (5, 6, 7, 8)
 
 def orientation(data: bytes) -> int:
     """The orientation tag of a picture file, 1 to 8; 1 (as stored) where there is none that can be read."""
-    if data.startswith(b"\xff\xd8"):
-        block = _jpeg_exif(data)
-    elif data.startswith(b"\x89PNG"):
-        block = _png_exif(data)
-    else:
-        block = data
     try:
-        value = _tag(block)
+        value = _tag(_exif(data))
     except struct.error:
         value = 1
     return value if 1 <= value <= 8 else 1
@@ -45,35 +40,20 @@ def orientation_calibration(code: int) -> Calibration:
     return Calibration(sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in _QUARTER else 0.0)
 
 
-def _jpeg_exif(data: bytes) -> bytes:
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        length = int.from_bytes(data[at + 2 : at + 4], "big")
-        if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
-            return data[at + 10 : at + 2 + length]
-        at += 2 + length
-    return b""
-
-
-def _png_exif(data: bytes) -> bytes:
-    at = 8
-    while at + 8 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        if kind == b"eXIf":
-            return data[at + 8 : at + 8 + length]
-        at += 12 + length
-    return b""
+def _exif(data: bytes) -> bytes:
+    """The TIFF structure that holds the tags of a picture file; empty if there is none."""
+    if data.startswith(b"\xff\xd8"):
+        segments = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
+        return next((content[6:] for content in segments if content.startswith(b"Exif\0\0")), b"")
+    if data.startswith(b"\x89PNG"):
+        return next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
+    return data
 
 
 def _tag(tiff: bytes) -> int:
     """The orientation in the first directory of a TIFF structure, 1 if it has none."""
-    if tiff[:4] not in (b"II*\0", b"MM\0*"):
-        return 1
-    order = "<" if tiff[:2] == b"II" else ">"
-    (start,) = struct.unpack_from(order + "I", tiff, 4)
-    (count,) = struct.unpack_from(order + "H", tiff, start)
-    for index in range(count):
-        tag, _, _, value = struct.unpack_from(order + "HHIH", tiff, start + 2 + 12 * index)
-        if tag == _ORIENTATION:
-            return int(value)
+    if tiff[:4] in (b"II*\0", b"MM\0*"):
+        for tag, _, _, at in tiff_entries(tiff):
+            if tag == _ORIENTATION:
+                return int(struct.unpack_from(tiff_order(tiff) + "H", tiff, at)[0])
     return 1

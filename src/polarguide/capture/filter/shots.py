@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
 from polarguide.capture.filter.exif import orientation
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_file
-from polarguide.capture.layout import angle_folders, index_files, pictures_of_folders
+from polarguide.capture.layout import ambiguous, angle_folders, index_files, pictures_of_folders
 from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import require_alike
 from polarguide.errors import PolarguideError
@@ -65,12 +65,7 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
             continue
         of_view, angle = shots.setdefault(match["view"], {}), int(match["angle"])
         if angle in of_view:
-            raise PolarguideError(
-                root,
-                expected=f"one picture of {match['view']} at {angle} degrees",
-                found=f"{of_view[angle].name} and {path.name}",
-                remedy="Remove one of them.",
-            )
+            raise ambiguous(root, f"one picture of {match['view']} at {angle} degrees", of_view[angle], path)
         of_view[angle] = path
     return shots
 

@@ -10,11 +10,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.formats.integrity import damaged
 from polarguide.capture.formats.pictures import read_file
 from polarguide.errors import PolarguideError
 
+_BROKEN = (ValueError, EOFError, OSError, MemoryError, SyntaxError)
 _LARGEST_ARCHIVE = 1 << 26
 """Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
+
+
+def array_size(array: NDArray[Any]) -> str:
+    """The shape of an array in words: "3x4"."""
+    return "x".join(map(str, array.shape)) or "a single value"
+
+
+def array_kind(array: NDArray[Any]) -> str:
+    """Shape and type of an array in words, for messages."""
+    return f"an array {array_size(array)} of {array.dtype}"
+
+
+def wrong_camera(where: object, expected: str, found: str) -> PolarguideError:
+    """The error that the numbers of a camera make no sense."""
+    return PolarguideError(where, expected=expected, found=found, remedy="Export the cameras again.")
 
 
 def read_array(path: Path) -> NDArray[Any]:
@@ -26,13 +43,9 @@ def read_array(path: Path) -> NDArray[Any]:
     data = read_file(path)
     try:
         return _array(data)
-    except (ValueError, EOFError, OSError, MemoryError, SyntaxError) as error:
-        raise PolarguideError(
-            path,
-            expected="a complete .npy file of numbers",
-            found="an empty file" if not data else f"{len(data)} bytes that are none",
-            remedy="Copy or export the file again.",
-        ) from error
+    except _BROKEN as error:
+        found = "an empty file" if not data else f"{len(data)} bytes that are none"
+        raise damaged(path, "a complete .npy file of numbers", found) from error
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -48,21 +61,11 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             if size > _LARGEST_ARCHIVE:
                 raise ValueError(f"an archive that unfolds to {size} bytes")
             return {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
-    except (
-        ValueError,
-        EOFError,
-        OSError,
-        MemoryError,
-        SyntaxError,
-        NotImplementedError,
-        RuntimeError,
-    ) as error:
+    except (*_BROKEN, RuntimeError) as error:
         found = f"a damaged one ({error})"
     except zipfile.BadZipFile as error:
         found = "an empty file" if not data else f"one that cannot be unpacked ({error})"
-    raise PolarguideError(
-        path, expected="a complete .npz file of numbers", found=found, remedy="Copy or export the file again."
-    )
+    raise damaged(path, "a complete .npz file of numbers", found)
 
 
 def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
@@ -75,17 +78,11 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
     try:
         found = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise PolarguideError(
-            where, expected=expected, found=f"something else ({error})", remedy="Export the cameras again."
-        ) from None
-    if found.shape not in shapes or not np.isfinite(found).all():
-        shape = "x".join(map(str, found.shape)) or "a single value"
-        raise PolarguideError(
-            where,
-            expected=expected,
-            found=shape if found.shape not in shapes else "values that are not finite",
-            remedy="Export the cameras again.",
-        )
+        raise wrong_camera(where, expected, f"something else ({error})") from None
+    if found.shape not in shapes:
+        raise wrong_camera(where, expected, array_size(found))
+    if not np.isfinite(found).all():
+        raise wrong_camera(where, expected, "values that are not finite")
     return found
 
 

@@ -9,6 +9,10 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from polarguide.errors import PolarguideError
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.
@@ -16,6 +20,11 @@ _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _TIFF_CODES = {1: "B", 3: "H", 4: "I"}
 _TIFF_STRIPS = ((273, 279), (324, 325))
+
+
+def damaged(path: Path, expected: str, found: str) -> PolarguideError:
+    """The error that a file cannot be decoded."""
+    return PolarguideError(path, expected=expected, found=found, remedy="Copy or export the file again.")
 
 
 def find_damage(data: bytes) -> str | None:
@@ -51,35 +60,65 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, start and end of the chunks of a PNG file; the last may end beyond the file."""
+    at = len(_PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        yield kind, at, at + 12 + length
+        at += 12 + length
+
+
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Kind and content of the segments of a JPEG file before its first scan."""
     at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        kind = data[at + 1]
-        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", data, at + 5)
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        if data[at + 1] == 0xFF:  # fill byte
+            at += 1
+            continue
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        yield data[at + 1], data[at + 4 : end]
+        at = end
+
+
+def tiff_entries(data: bytes) -> Iterator[tuple[int, int, int, int]]:
+    """Tag, type and count of the entries in the first directory of a TIFF file, and where their values stand.
+
+    Raises:
+        struct.error: the file is too short.
+    """
+    order = tiff_order(data)
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, start)
+    for entry in range(start + 2, start + 2 + 12 * count, 12):
+        tag, kind, length = struct.unpack_from(order + "HHI", data, entry)
+        yield tag, kind, length, entry + 8
+
+
+def tiff_order(data: bytes) -> str:
+    """The order of bytes of a TIFF file, for ``struct``."""
+    return "<" if data[:2] == b"II" else ">"
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    for kind, content in jpeg_segments(data):
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and len(content) >= 5:
+            height, width = struct.unpack_from(">HH", content, 1)
             return width, height
-        at += 1 if kind == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return None
 
 
 def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    order = "<" if data[:2] == b"II" else ">"
     found = {}
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, start)
-    for index in range(count):
-        tag, kind = struct.unpack_from(order + "HH", data, start + 2 + 12 * index)
+    for tag, kind, _, at in tiff_entries(data):
         if tag in (256, 257) and kind in (3, 4):
-            (found[tag],) = struct.unpack_from(order + _TIFF_CODES[kind], data, start + 10 + 12 * index)
+            (found[tag],) = struct.unpack_from(tiff_order(data) + _TIFF_CODES[kind], data, at)
     return (found[256], found[257]) if len(found) == 2 else None
 
 
 def _png_damage(data: bytes) -> str | None:
     """Walk the chunks of a PNG file and check their checksums."""
-    at = len(_PNG_SIGNATURE)
-    while at + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 12 + length
+    for kind, at, end in png_chunks(data):
         if end > len(data):
             break
         (stored,) = struct.unpack_from(">I", data, end - 4)
@@ -87,7 +126,6 @@ def _png_damage(data: bytes) -> str | None:
             return f"a damaged PNG file (wrong checksum at byte {at})"
         if kind == b"IEND":
             return None
-        at = end
     return f"a PNG file cut short (it ends after {len(data)} bytes)"
 
 
@@ -114,16 +152,11 @@ def _jpeg_is_complete(data: bytes) -> bool:
 
 def _tiff_is_complete(data: bytes) -> bool:
     """Whether the first directory of a TIFF file and all of its strips or tiles lie within the file."""
-    order = "<" if data[:2] == b"II" else ">"
+    order, tags = tiff_order(data), {}
     try:
-        (start,) = struct.unpack_from(order + "I", data, 4)
-        (count,) = struct.unpack_from(order + "H", data, start)
-        tags = {}
-        for index in range(count):
-            entry = start + 2 + 12 * index
-            tag, kind, length = struct.unpack_from(order + "HHI", data, entry)
+        for tag, kind, length, place in tiff_entries(data):
             size = length * _TIFF_SIZES.get(kind, 0)
-            at = entry + 8 if size <= 4 else struct.unpack_from(order + "I", data, entry + 8)[0]
+            at = place if size <= 4 else struct.unpack_from(order + "I", data, place)[0]
             if at + size > len(data):
                 return False
             if kind in _TIFF_CODES and any(tag in pair for pair in _TIFF_STRIPS):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.integrity import declared_size, find_damage
+from polarguide.capture.formats.integrity import damaged, declared_size, find_damage
 from polarguide.capture.view import FULL_CODE
 from polarguide.color import srgb_decode_array
 from polarguide.errors import PolarguideError
@@ -96,17 +97,10 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
         damage = f"one of {size[0]}x{size[1]} pixels, more than any camera takes"
     pixels = None
     if damage is None:
-        try:
+        with contextlib.suppress(cv2.error):
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            pixels = None
         if pixels is None:
             damage = "one that cannot be decoded"
     if damage is not None:
-        raise PolarguideError(
-            path,
-            expected="a complete PNG, JPEG or TIFF file",
-            found=damage,
-            remedy="Copy or export the file again.",
-        )
+        raise damaged(path, "a complete PNG, JPEG or TIFF file", damage)
     return np.asarray(pixels)

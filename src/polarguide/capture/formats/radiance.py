@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.formats.arrays import array_kind, read_array
+from polarguide.capture.formats.integrity import damaged
 from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
-from polarguide.errors import PolarguideError
+from polarguide.errors import PolarguideError, optional_import
 
-RADIANCE_SUFFIXES = (".hdr", ".exr", ".npy")
 _HDR_SIZE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
-
-openexr: ModuleType | None
-try:
-    openexr = importlib.import_module("OpenEXR")
-except ImportError:
-    openexr = None
 
 
 def read_radiance(path: Path) -> NDArray[np.float32]:
@@ -48,12 +40,9 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3) or 0 in pixels.shape or pixels.dtype.kind != "f":
-        shape = "x".join(map(str, pixels.shape)) or "a single value"
+        expected = "a picture of floating-point numbers with one or three channels"
         raise PolarguideError(
-            path,
-            expected="a picture of floating-point numbers with one or three channels",
-            found=f"an array {shape} of {pixels.dtype}",
-            remedy="Export the file again.",
+            path, expected=expected, found=array_kind(pixels), remedy="Export the file again."
         )
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), dtype=np.float32)
@@ -71,12 +60,7 @@ def _read_hdr(path: Path) -> NDArray[Any]:
         if 0 < height * width <= min(LARGEST_PIXELS, 64 * len(data)):
             pixels = _decoded(data)
     if pixels is None or pixels.dtype != np.float32 or pixels.ndim != 3:
-        raise PolarguideError(
-            path,
-            expected="a complete Radiance HDR file",
-            found=found,
-            remedy="Copy or export the file again.",
-        )
+        raise damaged(path, "a complete Radiance HDR file", found)
     return pixels[..., 2::-1]
 
 
@@ -93,13 +77,7 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     data = read_file(path)
-    if openexr is None:
-        raise PolarguideError(
-            path,
-            expected="the package OpenEXR, which reads this format",
-            found="that it is not installed",
-            remedy="pip install 'polarguide[exr]'",
-        )
+    openexr = optional_import("OpenEXR", str(path), install="'polarguide[exr]'")
     found = "an empty file" if not data else "one that is damaged, cut short or something else"
     pixels = None
     if data.startswith(b"\x76\x2f\x31\x01"):
@@ -108,16 +86,11 @@ def _read_exr(path: Path) -> NDArray[Any]:
         except Exception as error:  # the binding raises whatever C++ threw
             found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
     if pixels is None:
-        raise PolarguideError(
-            path,
-            expected="a complete OpenEXR file with channels R, G and B, or Y",
-            found=found,
-            remedy="Copy or export the file again.",
-        )
+        raise damaged(path, "a complete OpenEXR file with channels R, G and B, or Y", found)
     return pixels
 
 
-def _exr_channels(path: Path, package: ModuleType) -> NDArray[Any] | None:
+def _exr_channels(path: Path, package: Any) -> NDArray[Any] | None:
     with package.File(str(path), separate_channels=True) as file:
         window = file.header()["dataWindow"]
         width, height = (int(window[1][axis]) - int(window[0][axis]) + 1 for axis in (0, 1))

@@ -15,7 +15,7 @@ from polarguide.capture.sensor.interpolate import (
     guided_polarization,
     used_by_bilinear,
 )
-from polarguide.capture.sensor.pattern import Pattern
+from polarguide.capture.sensor.pattern import Pattern, tiled
 from polarguide.capture.view import ANGLES
 
 DEMOSAIC_MODES = {"half": 2, "quarter": 4, "full": 1}
@@ -93,7 +93,7 @@ def _cells(values: Array, bad: Mask, pattern: Pattern, interpolation: str) -> _C
         if pattern.colors is None:
             colors[row, column], wrong[row, column] = sample[..., None], mask
             continue
-        bayer = _tiled(pattern.colors[row::2, column::2], sample.shape)
+        bayer = tiled(pattern.colors[row::2, column::2], sample.shape)
         if interpolation == "bilinear":
             planes = [bilinear(sample, bayer == color) for color in range(3)]
             uses = [used_by_bilinear(mask, bayer == color) for color in range(3)]
@@ -119,7 +119,7 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> DemosaicedPict
     bad = np.empty((2 * height, 2 * width), bool)
     for (row, column), colors in cells.colors.items():
         mosaic[row::2, column::2], bad[row::2, column::2] = colors, cells.bad[row, column]
-    places = _tiled(pattern.angles[:2, :2], bad.shape)
+    places = tiled(pattern.angles[:2, :2], bad.shape)
     planes = []
     for channel in range(channels):
         plane = np.ascontiguousarray(mosaic[..., channel])
@@ -161,11 +161,6 @@ def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> DemosaicedPictur
     return DemosaicedPicture(
         _with_three_channels(picture), np.asarray(bad.reshape(rows, 4, columns, 4).any(axis=(1, 3)))
     )
-
-
-def _tiled(pattern: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64]:
-    height, width = pattern.shape
-    return np.tile(pattern, (-(-shape[0] // height), -(-shape[1] // width)))[: shape[0], : shape[1]]
 
 
 def _with_three_channels(picture: Array) -> Array:

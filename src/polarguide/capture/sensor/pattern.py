@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,12 @@ class Pattern:
         if self.colors is not None:
             names = np.array(list("RGB"), dtype=object)[self.colors] + names
         return [" ".join(row) for row in names]
+
+
+def tiled(pattern: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """A pattern repeated over [H, W]."""
+    repeat = [-(-length // period) for length, period in zip(shape, pattern.shape, strict=True)]
+    return np.tile(pattern, repeat)[: shape[0], : shape[1]]
 
 
 def sensor_pattern(sensor: str) -> Pattern:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.arrays import read_array
+from polarguide.capture.formats.arrays import array_kind, read_array
 from polarguide.capture.formats.pictures import decode_stored, read_file
 from polarguide.capture.sensor.packing import PACKINGS, packed_size, unpack
 from polarguide.errors import PolarguideError
@@ -46,11 +46,10 @@ def read_mosaic(path: Path, raw: RawFormat) -> NDArray[Any]:
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
-        shape = "x".join(str(length) for length in values.shape) or "a single value"
         raise PolarguideError(
             path,
             expected="a raw mosaic: one channel of 8- or 16-bit whole numbers",
-            found=f"an array {shape} of {values.dtype}",
+            found=array_kind(values),
             remedy="Save what the sensor delivers, before any demosaicing or conversion to color.",
         )
     found = (values.shape[1], values.shape[0])
