@@ -5,6 +5,7 @@ The command line reads names, types, defaults and texts from these classes.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +14,7 @@ from polarguide.errors import PolarguideError
 DeviceName = Literal["auto", "cpu", "cuda"]
 Transfer = Literal["linear", "srgb"]
 ExportFormat = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
+PathLike = str | os.PathLike[str]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 

@@ -57,9 +57,10 @@ def render(
     reporter = ConsoleReporter()
     opened = polarguide.open_run(run, device=compute.device, reporter=reporter)
     opened.relight(environment, rotate_environment, reporter=reporter)
-    folder = out or run / "render"
     if path:
-        opened.write_film(video or folder, path=path, layers=names, frames=frames, reporter=reporter)
+        opened.write_film(
+            video or out or run / "render", path=path, layers=names, frames=frames, reporter=reporter
+        )
         return
-    sheet = opened.write_pictures(folder, views=views, layers=names, reporter=reporter)
-    console.print(f"pictures: {folder}   contact sheet: {sheet}")
+    sheet = opened.write_pictures(out, views=views, layers=names, reporter=reporter)
+    console.print(f"pictures: {sheet.parent}   contact sheet: {sheet}")

@@ -11,6 +11,7 @@ import torch
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
+from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.video import write_video
 from polarguide.runs.opened import OpenedRun, checked_layers
@@ -44,7 +45,7 @@ def path_cameras(run: OpenedRun, path: str, frames: int) -> tuple[list[Camera], 
 
 def write_film(
     run: OpenedRun,
-    out: Path,
+    out: PathLike,
     *,
     path: str = "orbit",
     layers: Sequence[str] = ("final",),
@@ -62,7 +63,7 @@ def write_film(
     Raises:
         PolarguideError: a layer that the recipe has not, cameras of several sizes, or a video that cannot be encoded.
     """
-    names = checked_layers(list(layers))
+    out, names = Path(out), checked_layers(list(layers))
     cameras, speed = path_cameras(run, path, frames)
     pictures = _pictures(run, names, cameras, reporter)
     if out.suffix.lower() == ".mp4":

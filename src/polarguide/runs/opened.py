@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError, PolarguideWarning
-from polarguide.options import DeviceName, SceneOptions
+from polarguide.options import DeviceName, PathLike, SceneOptions
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend, choose_backend
 from polarguide.recipes import recipe_named
@@ -110,7 +109,7 @@ class OpenedRun:
         recipe: Recipe,
         model: GaussianModel,
         *,
-        scene: Scene | str | os.PathLike[str] | None = None,
+        scene: Scene | PathLike | None = None,
         reporter: Reporter = SILENT,
     ) -> None:
         self.folder, self.configuration, self.recipe, self.model = folder, configuration, recipe, model
@@ -123,10 +122,10 @@ class OpenedRun:
     @classmethod
     def open(
         cls: type[Opened],
-        folder: str | os.PathLike[str],
+        folder: PathLike,
         *,
         recipe: Recipe | None = None,
-        scene: Scene | str | os.PathLike[str] | None = None,
+        scene: Scene | PathLike | None = None,
         device: DeviceName = "auto",
         reporter: Reporter = SILENT,
     ) -> Opened:
@@ -154,6 +153,12 @@ class OpenedRun:
             )
         model = GaussianModel(state, recipe.shading.bind(configuration.settings.refractive_index), backend)
         return cls(folder, configuration, recipe, model, scene=scene, reporter=reporter)
+
+    @classmethod
+    def of(cls: type[Opened], run: OpenedRun) -> Opened:
+        """Another run as one of this class, with the same scene and in the same memory."""
+        scene, reporter = run._scene_source, run._reporter
+        return cls(run.folder, run.configuration, run.recipe, run.model, scene=scene, reporter=reporter)
 
     @property
     def steps(self) -> int:
@@ -252,7 +257,7 @@ def checked_layers(names: list[str]) -> list[str]:
 
 
 def read_scene(
-    folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(), reporter: Reporter = SILENT
+    folder: PathLike, options: SceneOptions = SceneOptions(), reporter: Reporter = SILENT
 ) -> Scene:
     """Load a scene, with progress, and hand on its warnings.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -16,7 +15,7 @@ import torch
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
-from polarguide.options import SceneOptions, SessionOptions
+from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import use_threads
 from polarguide.recipes import recipe_named
@@ -59,8 +58,8 @@ class TrainingStopped(KeyboardInterrupt):
 
 
 def train(
-    scene: Scene | str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    scene: Scene | PathLike,
+    out: PathLike,
     *,
     recipe: Recipe | str = "polarguide-stokes",
     settings: TrainSettings = TrainSettings(),
