@@ -6,6 +6,7 @@ The command line reads names, types, defaults and texts from these classes.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -28,6 +29,29 @@ def check_count(name: str, value: int, minimum: int = 1) -> None:
         raise PolarguideError(
             name, expected=f"{minimum} or more", found=str(value), remedy="Give a larger number."
         )
+
+
+def check_range(name: str, value: int, least: int, most: int) -> None:
+    """Check an option's value.
+
+    Raises:
+        PolarguideError: it is less than ``least`` or more than ``most``.
+    """
+    if not least <= value <= most:
+        raise PolarguideError(
+            name, expected=f"{least} to {most}", found=str(value), remedy="Choose such a number."
+        )
+
+
+def check_choice(name: str, value: str, choices: Iterable[str], remedy: str = "Correct the name.") -> None:
+    """Check an option's value.
+
+    Raises:
+        PolarguideError: it is none of the choices.
+    """
+    known = list(choices)
+    if value not in known:
+        raise PolarguideError(name, expected="one of " + ", ".join(known), found=value, remedy=remedy)
 
 
 @dataclass(frozen=True)

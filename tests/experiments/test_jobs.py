@@ -15,6 +15,7 @@ import pytest
 
 from polarguide.experiments.jobs import Job, last_line, run_jobs
 from polarguide.experiments.worker import Scoring
+from polarguide.options import ComputeOptions
 from polarguide.progress import Advance, Reporter
 from polarguide.system import signals_as_interrupts
 
@@ -55,7 +56,7 @@ def job(tmp_path: Path) -> Callable[..., Job]:
 
     def make(name: str, *verbs: str) -> Job:
         folder = tmp_path / name
-        tasks = [Scoring(folder=str(folder), speed=False, device=verb, threads=3) for verb in verbs]  # type: ignore[arg-type]
+        tasks = [Scoring(folder=str(folder), speed=False, compute=ComputeOptions(3, verb)) for verb in verbs]  # type: ignore[arg-type]
         return Job(name, folder, tuple(tasks), 10)
 
     return make

@@ -16,7 +16,7 @@ from polarguide.export.share import share_page, write_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
 from polarguide.files import make_folder
-from polarguide.options import ExportFormat, PathLike
+from polarguide.options import ExportFormat, PathLike, check_choice, check_range
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.relight import needs_radiance, panorama, write_exr
 from polarguide.runs.opened import OpenedRun
@@ -63,14 +63,8 @@ def export(
         "environment": lambda: _environment(run, folder),
         "cameras": lambda: _cameras(run, folder),
     }
-    if format not in writers:
-        raise PolarguideError(
-            "format", expected="one of " + ", ".join(writers), found=format, remedy="Correct the name."
-        )
-    if not 16 <= resolution <= 1024:
-        raise PolarguideError(
-            "resolution", expected="16 to 1024", found=str(resolution), remedy="Choose such a number."
-        )
+    check_choice("format", format, writers)
+    check_range("resolution", resolution, 16, 1024)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return writers[format]()

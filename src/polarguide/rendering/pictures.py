@@ -13,6 +13,7 @@ from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.visualization import figures
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture, true_depth_range
+from polarguide.visualization.sheet import contact_sheet
 
 SHEET_VIEWS = 8
 CONTACT_SHEET = "contact_sheet.png"
@@ -81,7 +82,7 @@ def write_pictures(
                 labels += [view.name, f"{view.name} true"]
             advance(number + 1)
     sheet = folder / CONTACT_SHEET
-    figures.write_png(sheet, figures.contact_sheet(rows, labels, names))
+    figures.write_png(sheet, contact_sheet(rows, labels, names))
     if missing:
         reporter.say(f"this recipe has no layer {', '.join(sorted(missing))}")
     return sheet

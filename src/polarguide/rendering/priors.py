@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide import optics
@@ -19,8 +17,7 @@ from polarguide.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_vie
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.priors import facing_chromatic, guide_normals
 from polarguide.visualization import figures
-
-Picture = NDArray[np.uint8]
+from polarguide.visualization.sheet import Picture, contact_sheet
 
 
 def write_priors(
@@ -79,7 +76,7 @@ def write_priors(
                 labels.append(view.name)
             advance(number + 1)
     sheet = out / CONTACT_SHEET
-    figures.write_png(sheet, figures.contact_sheet(rows, labels, names))
+    figures.write_png(sheet, contact_sheet(rows, labels, names))
     return sheet
 
 

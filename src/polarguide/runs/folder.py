@@ -102,11 +102,6 @@ def _series(version: str) -> str:
     return ".".join(version.split(".")[:2])
 
 
-def recipe_data(recipe: Recipe) -> dict[str, Any]:
-    """All values of a recipe as plain JSON types."""
-    return recipe.data()
-
-
 def save_checkpoint(run: Path, state: TrainingState) -> None:
     """Write the state so that a kill at any moment leaves either the old checkpoint or the new one."""
     with atomic(run / CHECKPOINT) as path:

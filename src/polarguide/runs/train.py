@@ -26,7 +26,6 @@ from polarguide.runs.folder import (
     RunConfiguration,
     RunLog,
     load_checkpoint,
-    recipe_data,
     save_checkpoint,
 )
 from polarguide.runs.opened import GaussianModel, OpenedRun, read_scene
@@ -106,7 +105,7 @@ def train(
             scene=str(loaded.root.resolve()),
             scene_digest=loaded.digest,
             recipe=chosen.name,
-            recipe_data=recipe_data(chosen),
+            recipe_data=chosen.data(),
             settings=settings,
             downscale=loaded.downscale,
             transfer="srgb" if loaded.transfer == "srgb" else "linear",
@@ -263,22 +262,14 @@ def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
 
 
 def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
-    has_run = (out / CONFIGURATION).exists()
-    if resume and not has_run:
-        return PolarguideError(
-            out,
-            expected="a run to resume",
-            found="no run.json",
-            remedy="Train without --resume, or name the folder of a run.",
-        )
-    if not resume and has_run:
-        return PolarguideError(
-            out,
-            expected="a new folder",
-            found="a run",
-            remedy="Add --resume (resume=True) to go on with it, or name another folder.",
-        )
-    return None
+    if (out / CONFIGURATION).exists() == resume:
+        return None
+    expected, found, remedy = (
+        ("a run to resume", "no run.json", "Train without --resume, or name the folder of a run.")
+        if resume
+        else ("a new folder", "a run", "Add --resume (resume=True) to go on with it, or name another folder.")
+    )
+    return PolarguideError(out, expected=expected, found=found, remedy=remedy)
 
 
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:

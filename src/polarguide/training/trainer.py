@@ -31,8 +31,6 @@ from polarguide.training.schedule import Schedule
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState, first_state, seeded
 
-__all__ = ["StepReport", "TrainSettings", "Trainer", "first_state"]
-
 
 class _Shown(NamedTuple):
     """A training view's photograph [H, W, 3] as shown, and 1 where it counts [H, W] (None: everywhere)."""
