@@ -10,7 +10,6 @@ from torch.autograd.function import once_differentiable
 
 from polarguide import _native
 from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
 from polarguide.raster.interface import (
     NEAR_PLANE,
     Rasterized,
@@ -18,6 +17,7 @@ from polarguide.raster.interface import (
     Splats,
     check_shapes,
     not_finite,
+    refusal,
 )
 
 
@@ -84,10 +84,6 @@ def rasterize_cpu(splats: Splats, camera: Camera, *, statistic: ScreenStatistic 
     check_shapes(splats, statistic)
     for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise PolarguideError(
-                f"rasterize({name})",
-                expected="float32 on the CPU",
-                found=f"{tensor.dtype} on {tensor.device}",
-                remedy="Convert it, or use rasterize_reference.",
-            )
+            found, remedy = f"{tensor.dtype} on {tensor.device}", "Convert it, or use rasterize_reference."
+            raise refusal(name, "float32 on the CPU", found, remedy)
     return Rasterized(*_Rasterize.apply(*splats, camera, statistic))

@@ -182,8 +182,9 @@ class Trainer:
         betas = (0.9**views, 0.999**views)
         self.state.gaussians.set_betas(betas)
         if self.state.environment is not None:
-            rates = {name: rate * self._rate for name, rate in self.recipe.light_rates.items()}
-            self.state.environment.retune(rates, betas)
+            self.state.environment.set_betas(betas)
+            for name, rate in self.recipe.light_rates.items():
+                self.state.environment.set_rate(name, rate * self._rate)
 
     def _optimize(self) -> None:
         state = self.state
