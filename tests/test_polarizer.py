@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from polarguide import capture, optics
+from polarguide import optics
+from polarguide.capture import view
 from polarguide.polarizer import ANGLES, four_intensities, malus, stokes_of_four
 
 LIGHT = np.random.default_rng(0).uniform(0.1, 1.0, (3, 4, 5))
@@ -44,4 +45,4 @@ def test_the_four_angles_are_the_law_and_invert() -> None:
 
 def test_the_angles_are_one_object() -> None:
     assert optics.ANGLES is ANGLES
-    assert capture.ANGLES is ANGLES
+    assert view.ANGLES is ANGLES

@@ -101,7 +101,7 @@ def provide(pack: Path, out: Path) -> dict[str, str]:
     site = out / "site"
     if not pack.is_dir():
         sys.exit(
-            f"{pack}: expected the folder that benchmarks/gpu/pack.py makes, found nothing; see docs/gpu.md"
+            f"{pack}: expected the folder that benchmarks/gpu/pack.py makes, found nothing; see docs/how-to/gpu.md"
         )
     paths = [str(site), *(path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path)]
     as_installed = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}

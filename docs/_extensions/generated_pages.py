@@ -124,19 +124,20 @@ def rooms_table(docs: Path) -> str:
 
 
 def public_names() -> str:
-    """Every name of ``import polarguide``, described where it stands."""
+    """Every name of ``import polarguide``, described where it stands: functions, the run, then all else."""
     package = importlib.import_module(PACKAGE)
+    found = {name: getattr(package, name) for name in package.__all__ if not name.startswith("_")}
     directives = []
-    for name in package.__all__:
-        found = getattr(package, name)
-        if name.startswith("_") or inspect.ismodule(found):
-            continue
-        if inspect.isclass(found):
-            directives.append(f".. autoclass:: {PACKAGE}.{name}\n   :members:\n")
-        elif callable(found):
-            directives.append(f".. autofunction:: {PACKAGE}.{name}\n")
-        else:
-            directives.append(f".. autodata:: {PACKAGE}.{name}\n")
+    for name in sorted(found, key=lambda name: (inspect.isclass(found[name]), name != "Run", name.lower())):
+        value, place = found[name], f"{PACKAGE}.{name}"
+        if inspect.isclass(value):
+            inherits = any(base.__module__.startswith(PACKAGE) for base in value.__mro__[1:])
+            more = "   :inherited-members:\n" if inherits else ""
+            directives.append(f".. autoclass:: {place}\n   :members:\n{more}")
+        elif callable(value):
+            directives.append(f".. autofunction:: {place}\n")
+        elif not inspect.ismodule(value):
+            directives.append(f".. autodata:: {place}\n")
     return "```{eval-rst}\n" + "\n".join(directives) + "```\n"
 
 

@@ -28,7 +28,7 @@ from polarguide.vectors import dot, unit
 
 LARGEST_SIDE = 8192
 MOST_FRAMES = 100_000
-REMEDY = "Give orbit, spiral, interpolate, or a JSON file with cameras as docs/exporting.md shows it."
+REMEDY = "Give orbit, spiral, interpolate, or a JSON file with cameras as docs/how-to/export.md shows it."
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
 
 

@@ -138,6 +138,8 @@ def test_options_exist():
     words = set(parameters())
     unknown = {}
     for path in TEXTS:
+        if path.name == "CHANGELOG.md":  # it names options that are no more
+            continue
         for option in re.findall(r"(?<![\w-])--([a-z][a-z-]+)", text_of(path)):
             if option not in FOREIGN_OPTIONS and option.replace("-", "_") not in words:
                 unknown.setdefault(option, path.name)
@@ -161,3 +163,13 @@ def test_the_bibliography_holds_what_is_cited():
 def test_american_spelling(path):
     # Names that stay (an ablation's) and old names (in the changelog) are code.
     assert BRITISH.findall(re.sub(r"`[^`\n]*`", "", text_of(path))) == []
+
+
+def test_pages_that_messages_name_exist() -> None:
+    named = {
+        name
+        for path in sorted((ROOT / "src").rglob("*.py"))
+        for name in re.findall(r"docs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+    }
+    assert named
+    assert {name for name in named if not (ROOT / name).is_file()} == set()

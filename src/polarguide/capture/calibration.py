@@ -104,7 +104,7 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         PolarguideError: the file cannot be read, has unknown keys or values that make no sense.
     """
-    file = read_record(path, _File, remedy="See docs/formats.md for the calibration file.")
+    file = read_record(path, _File, remedy="See docs/reference/formats.md for the calibration file.")
     gains = None if file.gains is None else msgspec.structs.astuple(file.gains)
     return checked(Calibration(gains, file.order, file.sense, file.zero), path)
 

@@ -1,1 +1,1 @@
-
+"""The command line: one file for each verb, loaded when it is called."""

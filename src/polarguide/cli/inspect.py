@@ -29,7 +29,7 @@ def inspect(
     """What is right and wrong with a capture: a page, a JSON file, and the order of its angles by geometry.
 
     Each check ends in ok, warning, wrong or n/a, and says what to do. Works without poses; order, sense and zero of the
-    angles take poses. docs/inspect.md describes the checks and what they cannot decide.
+    angles take poses. docs/how-to/inspect.md describes the checks and what they cannot decide.
 
     Args:
         scene: Scene folder.

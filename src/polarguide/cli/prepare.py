@@ -27,7 +27,7 @@ def prepare(
 ) -> None:
     """Camera files to a scene folder: raw mosaics, shots through a rotating filter, published datasets.
 
-    A preparation that was stopped goes on with the same command. docs/formats.md describes the files.
+    A preparation that was stopped goes on with the same command. docs/reference/formats.md describes the files.
 
     Args:
         source: Folder of raw mosaics (one file a view), of filter shots (four folders or suffixes), or of a dataset.

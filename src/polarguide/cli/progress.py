@@ -17,8 +17,8 @@ def bars(memory_seconds: float = 30.0) -> Progress:
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", markup=False),
+        TimeRemainingColumn(),
         console=console,
         transient=True,
         speed_estimate_period=memory_seconds,
@@ -44,6 +44,9 @@ class ConsoleReporter(Reporter):
 
             def advance(done: int, *, total: int | None = None, note: str = "") -> None:
                 progress.live.transient = not note
-                progress.update(task, completed=done, total=total, note=note)
+                # A note needs the room of the label, and says as much.
+                progress.update(
+                    task, completed=done, total=total, note=note, description="" if note else label
+                )
 
             yield advance

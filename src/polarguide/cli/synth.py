@@ -27,8 +27,8 @@ def synth(
 ) -> None:
     """Render a polarized scene with ground truth: figure, kit, car, cup, water, proof, or a scene file.
 
-    Needs the extra polarguide[synth]. A rendering that was stopped goes on with the same command. docs/dataset.md
-    describes scene files and what is written.
+    Needs the extra polarguide[synth]. A rendering that was stopped goes on with the same command.
+    docs/reference/scene-files.md describes scene files and what is written.
 
     Args:
         scene: Name of a preset, or path of a scene file in JSON.

@@ -1,1 +1,1 @@
-
+"""Gaussians and their parameters: initialization, density control, geometry, harmonics, PLY."""

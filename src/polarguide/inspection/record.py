@@ -20,7 +20,7 @@ FILE = "inspection.json"
 
 
 def inspection_record(found: Inspection) -> dict[str, Any]:
-    """The findings as plain JSON types; docs/inspect.md describes the keys."""
+    """The findings as plain JSON types; docs/reference/inspection.md describes the keys."""
     capture = found.capture
     record: dict[str, Any] = plain(
         {

@@ -46,7 +46,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             if kind in ("mosaic", "filter")
             else f"the files of a {kind} dataset",
             found=describe_contents(root),
-            remedy="See docs/formats.md for the layouts.",
+            remedy="See docs/reference/formats.md for the layouts.",
         )
     return found if settings.masks is None else MaskedSource(found, settings.masks)
 

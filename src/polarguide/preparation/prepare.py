@@ -50,7 +50,7 @@ def prepare_scene(
     settings: PrepareSettings | None = None,
     reporter: Reporter | None = None,
 ) -> Prepared:
-    """Write a scene folder from camera files; see docs/formats.md.
+    """Write a scene folder from camera files; see docs/reference/formats.md.
 
     A call that was stopped is gone on with by the same call. Nothing but unfinished work of the same request
     is ever replaced.

@@ -4,10 +4,10 @@ gsplat is found, and its kernels are compiled, by ``load_gsplat``; nothing of it
 interface that 1.5.3 and 1.6.0 share is used, by keyword; what differs between them is in ``load_gsplat`` and
 ``COMPILED``.
 
-Where its definition departs from ours (docs/gpu.md has the table): alpha is at most 0.999 in 1.5.3, and 0.99 as here in
-1.6.0; a pixel ends at a transmittance of 1e-4 exactly, too; the radius is that of the wider side of the box that is
-drawn, whole pixels, and at most 3.33 standard deviations; exponentials are approximate. Inputs are not searched for
-NaN, since the process would wait for the answer.
+Where its definition departs from ours (docs/explanation/gpu.md has the table): alpha is at most 0.999 in 1.5.3, and
+0.99 as here in 1.6.0; a pixel ends at a transmittance of 1e-4 exactly, too; the radius is that of the wider side of the
+box that is drawn, whole pixels, and at most 3.33 standard deviations; exponentials are approximate. Inputs are not
+searched for NaN, since the process would wait for the answer.
 """
 
 from __future__ import annotations

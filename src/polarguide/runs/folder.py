@@ -21,6 +21,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from polarguide import __version__
+from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.files import atomic, write_text
 from polarguide.options import Transfer
@@ -57,6 +58,22 @@ class RunConfiguration:
     transfer: Transfer
     device: str
     version: str = __version__
+
+    @classmethod
+    def of(
+        cls, scene: Scene, recipe: Recipe, settings: TrainSettings, device: torch.device
+    ) -> RunConfiguration:
+        """What is recorded of a training."""
+        return cls(
+            scene=str(scene.root.resolve()),
+            scene_digest=scene.digest,
+            recipe=recipe.name,
+            recipe_data=recipe.data(),
+            settings=settings,
+            downscale=scene.downscale,
+            transfer="srgb" if scene.transfer == "srgb" else "linear",
+            device=str(device),
+        )
 
     def save(self, run: Path) -> None:
         """Write ``run.json``."""

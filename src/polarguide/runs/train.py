@@ -101,16 +101,7 @@ def train(
         )
         backend = backend_of(ranks, session.device, reporter)
         loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
-        configuration = RunConfiguration(
-            scene=str(loaded.root.resolve()),
-            scene_digest=loaded.digest,
-            recipe=chosen.name,
-            recipe_data=chosen.data(),
-            settings=settings,
-            downscale=loaded.downscale,
-            transfer="srgb" if loaded.transfer == "srgb" else "linear",
-            device=str(backend.device),
-        )
+        configuration = RunConfiguration.of(loaded, chosen, settings, backend.device)
         state = None
         if resume:
             _check_same(RunConfiguration.load(out), configuration, out)

@@ -198,5 +198,5 @@ def make_environment(data: dict[str, Any], where: str, folder: Path) -> Array:
             f"{where} (environment)",
             expected=f"a type of {', '.join(ENVIRONMENTS)} with its fields",
             found=str(error),
-            remedy="docs/dataset.md describes them.",
+            remedy="docs/reference/scene-files.md describes them.",
         ) from error

@@ -81,7 +81,7 @@ def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> d
             f"{where} (lights)",
             expected="position, toward, size and radiance of each light",
             found=repr(error),
-            remedy="docs/dataset.md describes them.",
+            remedy="docs/reference/scene-files.md describes them.",
         ) from error
     up = (
         [0, 0, 1]

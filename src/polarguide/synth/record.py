@@ -13,7 +13,7 @@ from polarguide.synth.variant import Variant
 CONVENTION = {
     "intensity": "I_a = (S0 + S1 cos 2a + S2 sin 2a) / 2 is PNG value / 65535, linear",
     "aolp": "atan2(S2, S1) / 2 from the image's horizontal, counter-clockwise as displayed, in the lens frame of "
-    "each ray (docs/conventions.md)",
+    "each ray (docs/explanation/conventions.md)",
     "camera": "OpenCV axes, world to camera x_cam = R x_world + t, pixel centers at 0.5",
     "truth": "gt/<view>.npz: stokes, specular and diffuse as S0 of the lobes of the first surface, exposed like "
     "the pictures, whose sum is S0 on surfaces; normal (world), depth (camera z), mask, objid at pixel centers",

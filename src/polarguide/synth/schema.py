@@ -1,7 +1,7 @@
 """A scene as data: what a scene file may say, read from JSON with every mistake named.
 
-The fields are described in docs/dataset.md. Lengths are in one unit of the author's choice, z is up, colors are linear
-sRGB in [0, 1], radiance is linear and unbounded, angles are degrees.
+docs/reference/scene-files.md describes the fields. Lengths are in one unit of the author's choice, z is up, colors are
+linear sRGB in [0, 1], radiance is linear and unbounded, angles are degrees.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 Data = dict[str, Any]
 OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
 """Names that fields had in earlier scene files and requests."""
-REMEDY = "docs/dataset.md describes the fields."
+REMEDY = "docs/reference/scene-files.md describes the fields."
 
 
 class Material(Struct, frozen=True, forbid_unknown_fields=True):

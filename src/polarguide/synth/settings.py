@@ -122,6 +122,6 @@ def find_scene(name: str) -> SceneSpec:
             name,
             expected=f"a scene file, or one of {', '.join(PRESETS)}",
             found="nothing of this name",
-            remedy="docs/dataset.md describes scene files.",
+            remedy="docs/reference/scene-files.md describes scene files.",
         )
     return read_scene_file(Path(name))

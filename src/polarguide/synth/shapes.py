@@ -1,6 +1,6 @@
 """Procedural geometry: the types of ``shape`` of an object.
 
-Every shape is centered at the origin or stands on it, with z up; docs/dataset.md describes the fields.
+Every shape is centered at the origin or stands on it, with z up; docs/reference/scene-files.md describes the fields.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def make_mesh(shape: dict[str, Any], where: str) -> Mesh:
             f"{where} shape.type",
             expected=f"one of {', '.join([*SHAPES, 'mesh'])}",
             found=repr(kind),
-            remedy="docs/dataset.md describes them.",
+            remedy="docs/reference/scene-files.md describes them.",
         )
     try:
         return maker(**fields)
@@ -167,5 +167,5 @@ def make_mesh(shape: dict[str, Any], where: str) -> Mesh:
             f"{where} shape",
             expected=f"the fields of a {kind}",
             found=str(error),
-            remedy="docs/dataset.md has them.",
+            remedy="docs/reference/scene-files.md has them.",
         ) from error

@@ -49,7 +49,7 @@ def parse_sweep(text: str) -> Sweep:
             "--sweep",
             expected=f"one of {', '.join(PARAMETERS)} with values, such as noise=0,1,2 or views=9,18,36",
             found=repr(text),
-            remedy="docs/dataset.md has examples.",
+            remedy="docs/reference/scene-files.md has examples.",
         )
     return Sweep(parameter, values)
 

@@ -175,7 +175,7 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
             f"{where} material.color",
             expected=f'a color, "own", or a texture with type {", ".join(TEXTURES)}',
             found=repr(data),
-            remedy="docs/dataset.md describes them.",
+            remedy="docs/reference/scene-files.md describes them.",
         )
     if kind == "image":
         fields["folder"] = folder
@@ -186,7 +186,7 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
             f"{where} texture",
             expected=f"the fields of {kind}",
             found=str(error),
-            remedy="docs/dataset.md has them.",
+            remedy="docs/reference/scene-files.md has them.",
         ) from error
 
 
