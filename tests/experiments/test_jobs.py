@@ -23,9 +23,9 @@ from polarguide.system import signals_as_interrupts
 PROGRAM = """
 import json, os, pathlib, signal, sys, time
 task = json.load(sys.stdin)
-verb, folder = task["device"], pathlib.Path(task["folder"])
+verb, folder = task["compute"]["device"], pathlib.Path(task["folder"])
 with open(folder / "did", "a") as did:
-    print(verb, task["threads"], os.environ["OMP_NUM_THREADS"], file=did)
+    print(verb, task["compute"]["threads"], os.environ["OMP_NUM_THREADS"], file=did)
 if verb == "fail":
     print("a warning\\n" + folder.name + " is broken.\\n", file=sys.stderr)
     sys.exit(2)
