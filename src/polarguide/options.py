@@ -43,7 +43,7 @@ def check_range(name: str, value: int, least: int, most: int) -> None:
         )
 
 
-def check_choice(name: str, value: str, choices: Iterable[str], remedy: str = "Correct the name.") -> None:
+def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     """Check an option's value.
 
     Raises:
@@ -51,7 +51,8 @@ def check_choice(name: str, value: str, choices: Iterable[str], remedy: str = "C
     """
     known = list(choices)
     if value not in known:
-        raise PolarguideError(name, expected="one of " + ", ".join(known), found=value, remedy=remedy)
+        expected = "one of " + ", ".join(known)
+        raise PolarguideError(name, expected=expected, found=value, remedy="Correct the name.")
 
 
 @dataclass(frozen=True)

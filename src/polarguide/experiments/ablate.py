@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from polarguide.errors import PolarguideError
 from polarguide.experiments.compare import compare
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.results import Results
@@ -50,8 +51,10 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
     Raises:
         PolarguideError: a recipe without ablations, or an ablation that it does not have.
     """
-    remedy = "Take one of these, which have ablations, or use compare."
-    check_choice("base", base, ABLATIONS, remedy)
+    if base not in ABLATIONS:
+        expected = "a recipe with ablations: " + ", ".join(ABLATIONS)
+        remedy = "Take one of these, or use compare."
+        raise PolarguideError("base", expected=expected, found=base, remedy=remedy)
     names = [recipe.name for recipe in ABLATIONS[base]]
     wanted = [name if name.startswith(f"{base}:") else f"{base}:{name}" for name in only]
     for name in only:
