@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file
 
 import polarguide
-from polarguide.evaluation import validate_metrics
+from polarguide.evaluation.record import validate_metrics
 from polarguide.options import SceneOptions, SessionOptions
 from polarguide.progress import Advance
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY

@@ -11,15 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polarguide import optics
-    from polarguide.api import (
-        Run,
-        demo_scene,
-        inspect,
-        open_run,
-        prepare,
-        priors,
-        train,
-    )
+    from polarguide.api import Run, demo_scene, inspect, open_run, prepare, priors, train
     from polarguide.capture import Scene, load_scene
     from polarguide.errors import PolarguideError, PolarguideWarning
     from polarguide.experiments.ablate import ablate
@@ -34,30 +26,22 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_MODULES = {
-    "CompareOptions": "experiments.options",
-    "InspectSettings": "inspection.settings",
-    "PolarguideError": "errors",
-    "PolarguideWarning": "errors",
-    "PrepareSettings": "preparation.settings",
-    "Recipe": "training.recipe",
-    "Reporter": "progress",
-    "Run": "api",
-    "Scene": "capture",
-    "SceneOptions": "options",
-    "SessionOptions": "options",
-    "TrainSettings": "training.settings",
-    "ablate": "experiments.ablate",
-    "compare": "experiments.compare",
-    "demo_scene": "api",
-    "inspect": "api",
-    "load_scene": "capture",
-    "open_run": "api",
-    "prepare": "api",
-    "priors": "api",
-    "train": "api",
+_NAMES = {
+    "api": ("Run", "demo_scene", "inspect", "open_run", "prepare", "priors", "train"),
+    "capture": ("Scene", "load_scene"),
+    "errors": ("PolarguideError", "PolarguideWarning"),
+    "experiments.ablate": ("ablate",),
+    "experiments.compare": ("compare",),
+    "experiments.options": ("CompareOptions",),
+    "inspection.settings": ("InspectSettings",),
+    "options": ("SceneOptions", "SessionOptions"),
+    "preparation.settings": ("PrepareSettings",),
+    "progress": ("Reporter",),
+    "training.recipe": ("Recipe",),
+    "training.settings": ("TrainSettings",),
 }
-"""Where each public name is defined, below the package."""
+"""The public names by the module below the package that defines them."""
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "CompareOptions",

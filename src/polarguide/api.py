@@ -5,38 +5,32 @@ Nothing here prints or installs signal handlers: progress and messages go to a `
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import read_metrics
-from polarguide.evaluation.evaluate import evaluate
-from polarguide.export.formats import export, share
+from polarguide.evaluation import evaluate
+from polarguide.evaluation.record import read_metrics
+from polarguide.export import formats
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
 from polarguide.inspection.record import write_inspection
 from polarguide.inspection.settings import InspectSettings
-from polarguide.options import LOOPBACK, DeviceName, ExportFormat, SceneOptions, SessionOptions
-from polarguide.preparation.prepare import Prepared, prepare_scene
-from polarguide.preparation.settings import PrepareSettings
+from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOptions
+from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
-from polarguide.rendering.film import write_film
-from polarguide.rendering.pictures import write_pictures
+from polarguide.rendering import film, pictures, relight
 from polarguide.rendering.priors import write_priors
-from polarguide.rendering.relight import relight
 from polarguide.runs import train as training
-from polarguide.runs.opened import OpenedRun, read_scene
+from polarguide.runs.opened import OpenedRun
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
-from polarguide.viewer.watch import view_run, watched
-
-PathLike = str | os.PathLike[str]
+from polarguide.viewer import watch
 
 
 class Run(OpenedRun):
@@ -51,9 +45,13 @@ class Run(OpenedRun):
         torch.Size([96, 128, 3])
     """
 
-    def evaluate(self, *, speed: bool = False, reporter: Reporter = SILENT) -> dict[str, Any]:
-        """Score the test views and write ``metrics.json``; see ``evaluation.evaluate.evaluate``."""
-        return evaluate(self, speed=speed, reporter=reporter)
+    evaluate = evaluate.evaluate
+    export = formats.export
+    relight = relight.relight
+    share = formats.share
+    view = watch.view_run
+    write_film = film.write_film
+    write_pictures = pictures.write_pictures
 
     def metrics(self) -> Mapping[str, Any]:
         """The record that ``evaluate`` wrote: means over the test views, and ``views`` by name.
@@ -63,58 +61,10 @@ class Run(OpenedRun):
         """
         return read_metrics(self.folder)
 
-    def export(
-        self,
-        format: ExportFormat,
-        out: PathLike | None = None,
-        *,
-        resolution: int = 192,
-        reporter: Reporter = SILENT,
-    ) -> list[Path]:
-        """Write the files of other programs; returns their paths. See ``export.formats.export``."""
-        return export(self, format, _path(out), resolution=resolution, reporter=reporter)
 
-    def share(self, path: PathLike | None = None, *, title: str = "", caption: str = "") -> Path:
-        """Write one web page that renders the run with its reflections; see ``export.formats.share``."""
-        return share(self, _path(path), title=title, caption=caption)
-
-    def relight(
-        self, panorama: PathLike | None = None, degrees: float = 0.0, *, reporter: Reporter = SILENT
-    ) -> None:
-        """Let it reflect a panorama, or turn its light, in memory; see ``rendering.relight.relight``."""
-        relight(self, _path(panorama), degrees, reporter=reporter)
-
-    def write_pictures(
-        self,
-        out: PathLike | None = None,
-        *,
-        views: str = "test",
-        layers: Sequence[str] | None = None,
-        reporter: Reporter = SILENT,
-    ) -> Path:
-        """Write layers of views as PNG files, ``render`` in the run's folder by default, all layers by default.
-
-        Returns the contact sheet's path; see ``rendering.pictures.write_pictures``.
-        """
-        folder = _path(out) or self.folder / "render"
-        names = self.layers if layers is None else layers
-        return write_pictures(self, folder, views=views, layers=names, reporter=reporter)
-
-    def write_film(
-        self,
-        out: PathLike,
-        *,
-        path: str = "orbit",
-        layers: Sequence[str] = ("final",),
-        frames: int = 120,
-        reporter: Reporter = SILENT,
-    ) -> None:
-        """Render along a path of cameras into an MP4 file or a folder; see ``rendering.film.write_film``."""
-        write_film(self, Path(out), path=path, layers=layers, frames=frames, reporter=reporter)
-
-    def view(self, *, host: str = LOOPBACK[0], port: int = 8080, reporter: Reporter = SILENT) -> None:
-        """Serve it to browsers until KeyboardInterrupt; see ``viewer.watch.view_run``."""
-        view_run(self, host=host, port=port, reporter=reporter)
+open_run = Run.open
+prepare = prepare_scene
+priors = write_priors
 
 
 def train(
@@ -141,9 +91,7 @@ def train(
         KeyboardInterrupt: it was stopped; the state is saved, and ``resume=True`` goes on to the same result.
     """
 
-    def watch(trainer: Trainer) -> AbstractContextManager[training.Look]:
-        return watched(trainer, session.viewer_host, session.viewer_port, reporter)
-
+    host, port = session.viewer_host, session.viewer_port
     opened = training.train(
         scene,
         out,
@@ -154,52 +102,9 @@ def train(
         resume=resume,
         reporter=reporter,
         should_stop=should_stop,
-        watch=watch if session.viewer else None,
+        watch=partial(watch.watched, host=host, port=port, reporter=reporter) if session.viewer else None,
     )
-    return Run(
-        opened.folder,
-        opened.configuration,
-        opened.recipe,
-        opened.model,
-        scene=opened.scene,
-        reporter=reporter,
-    )
-
-
-def open_run(
-    folder: PathLike,
-    *,
-    recipe: Recipe | None = None,
-    scene: Scene | PathLike | None = None,
-    device: DeviceName = "auto",
-    reporter: Reporter = SILENT,
-) -> Run:
-    """Open a run folder; see ``Run.open``. Warns if the recipe has changed since it was trained.
-
-    Args:
-        folder: what a training wrote.
-        recipe: the recipe it was trained with, where that is not one of ours.
-        scene: the scene or its folder, where that has moved since; read when it is first asked for.
-        device: what to compute on.
-        reporter: told what takes long.
-
-    Raises:
-        PolarguideError: it is no run folder, is damaged, or belongs to another version.
-    """
-    return Run.open(folder, recipe=recipe, scene=scene, device=device, reporter=reporter)
-
-
-def prepare(
-    source: PathLike, out: PathLike, *, settings: PrepareSettings | None = None, reporter: Reporter = SILENT
-) -> Prepared:
-    """Make a scene folder from camera files: raw mosaics, shots through a filter, published datasets.
-
-    A preparation that was stopped goes on with the same call.
-
-    Raises:
-        PolarguideError: the source or a setting cannot be used, or ``out`` holds something else.
-    """
-    return prepare_scene(source, out, settings, reporter)
+    return Run.of(opened)
 
 
 def inspect(
@@ -222,35 +127,11 @@ def inspect(
     Raises:
         PolarguideError: the scene cannot be read.
     """
-    folder = inspection_folder(Path(scene), _path(out))
+    folder = inspection_folder(Path(scene), None if out is None else Path(out))
     backend = choose_backend(device, say=reporter.say)
     found = inspect_scene(Path(scene), folder, settings, backend, reporter)
     write_inspection(found, folder, reporter)
     return found
-
-
-def priors(
-    scene: Scene | PathLike,
-    out: PathLike,
-    *,
-    run: OpenedRun | None = None,
-    views: str = "test",
-    refractive_index: float = 1.5,
-    threshold: float = 0.05,
-    reading: SceneOptions = SceneOptions(),
-    reporter: Reporter = SILENT,
-) -> Path:
-    """Pictures of what polarization says about a scene; see ``rendering.priors.write_priors``."""
-    loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
-    return write_priors(
-        loaded,
-        Path(out),
-        run=run,
-        views=views,
-        refractive_index=refractive_index,
-        threshold=threshold,
-        reporter=reporter,
-    )
 
 
 @contextmanager
@@ -266,7 +147,3 @@ def demo_scene() -> Iterator[Path]:
                 scene, expected="the demo scene", found="nothing", remedy="Install the package again."
             )
         yield scene
-
-
-def _path(path: PathLike | None) -> Path | None:
-    return None if path is None else Path(path)

@@ -5,6 +5,8 @@ The command line reads names, types, defaults and texts from these classes.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +15,7 @@ from polarguide.errors import PolarguideError
 DeviceName = Literal["auto", "cpu", "cuda"]
 Transfer = Literal["linear", "srgb"]
 ExportFormat = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
+PathLike = str | os.PathLike[str]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
@@ -26,6 +29,30 @@ def check_count(name: str, value: int, minimum: int = 1) -> None:
         raise PolarguideError(
             name, expected=f"{minimum} or more", found=str(value), remedy="Give a larger number."
         )
+
+
+def check_range(name: str, value: int, least: int, most: int) -> None:
+    """Check an option's value.
+
+    Raises:
+        PolarguideError: it is less than ``least`` or more than ``most``.
+    """
+    if not least <= value <= most:
+        raise PolarguideError(
+            name, expected=f"{least} to {most}", found=str(value), remedy="Choose such a number."
+        )
+
+
+def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
+    """Check an option's value.
+
+    Raises:
+        PolarguideError: it is none of the choices.
+    """
+    known = list(choices)
+    if value not in known:
+        expected = "one of " + ", ".join(known)
+        raise PolarguideError(name, expected=expected, found=value, remedy="Correct the name.")
 
 
 @dataclass(frozen=True)

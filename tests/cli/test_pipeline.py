@@ -15,7 +15,7 @@ from plyfile import PlyData
 from safetensors.torch import load_file
 
 from polarguide.cli.app import run
-from polarguide.evaluation import validate_metrics
+from polarguide.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, LOG, PLY
 from polarguide.training.trainer import StepReport, Trainer
 

@@ -15,7 +15,8 @@ from other_device import BACKEND, OtherDevice
 from polarguide.api import Run, open_run
 from polarguide.capture import load_scene
 from polarguide.cli.render import render
-from polarguide.evaluation import ViewTarget, score_view
+from polarguide.evaluation.scores import score_view
+from polarguide.evaluation.target import ViewTarget
 from polarguide.inspection.short_run import short_run, surface_of
 from polarguide.options import ComputeOptions
 from polarguide.scene_frame import scene_frame

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import ViewTarget, metrics, record, scores, table
+from polarguide.evaluation import metrics, record, scores, table
 from polarguide.evaluation.table import HIGHEST_PSNR, VIEW_METRICS
+from polarguide.evaluation.target import ViewTarget
 
 VIEW_KEYS = {metric.key for metric in VIEW_METRICS}
 AGAINST_GROUND_TRUTH = (

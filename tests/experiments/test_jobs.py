@@ -15,6 +15,7 @@ import pytest
 
 from polarguide.experiments.jobs import Job, last_line, run_jobs
 from polarguide.experiments.worker import Scoring
+from polarguide.options import ComputeOptions
 from polarguide.progress import Advance, Reporter
 from polarguide.system import signals_as_interrupts
 
@@ -22,9 +23,9 @@ from polarguide.system import signals_as_interrupts
 PROGRAM = """
 import json, os, pathlib, signal, sys, time
 task = json.load(sys.stdin)
-verb, folder = task["device"], pathlib.Path(task["folder"])
+verb, folder = task["compute"]["device"], pathlib.Path(task["folder"])
 with open(folder / "did", "a") as did:
-    print(verb, task["threads"], os.environ["OMP_NUM_THREADS"], file=did)
+    print(verb, task["compute"]["threads"], os.environ["OMP_NUM_THREADS"], file=did)
 if verb == "fail":
     print("a warning\\n" + folder.name + " is broken.\\n", file=sys.stderr)
     sys.exit(2)
@@ -55,7 +56,7 @@ def job(tmp_path: Path) -> Callable[..., Job]:
 
     def make(name: str, *verbs: str) -> Job:
         folder = tmp_path / name
-        tasks = [Scoring(folder=str(folder), speed=False, device=verb, threads=3) for verb in verbs]  # type: ignore[arg-type]
+        tasks = [Scoring(folder=str(folder), speed=False, compute=ComputeOptions(3, verb)) for verb in verbs]  # type: ignore[arg-type]
         return Job(name, folder, tuple(tasks), 10)
 
     return make

@@ -19,7 +19,6 @@ from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
 from polarguide.options import SceneOptions
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
-from polarguide.runs.folder import recipe_data
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
 
@@ -79,10 +78,10 @@ def test_seeds_count_up_from_that_of_the_settings() -> None:
 
 def test_another_scene_recipe_value_or_program_has_another_key(monkeypatch: pytest.MonkeyPatch) -> None:
     def key(scene: str = "s", recipe: dict[str, Any] | None = None, code: str = "c", seed: int = 0) -> str:
-        data = recipe_data(RECIPES["3dgs"]) if recipe is None else recipe
+        data = RECIPES["3dgs"].data() if recipe is None else recipe
         return run_key(scene, data, TrainSettings(40, seed), SceneOptions(), code=code)
 
-    changed = recipe_data(dataclasses.replace(RECIPES["3dgs"], ssim_weight=0.3))
+    changed = dataclasses.replace(RECIPES["3dgs"], ssim_weight=0.3).data()
     keys = [key(), key(scene="t"), key(recipe=changed), key(code="d"), key(seed=1)]
     assert len(set(keys)) == len(keys)
     assert key() == key()

@@ -17,6 +17,7 @@ from polarguide.experiments.jobs import Job
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
 from polarguide.experiments.worker import Scoring, Training
+from polarguide.options import ComputeOptions, SceneOptions
 from polarguide.progress import Reporter
 from polarguide.recipes import recipe_named
 from polarguide.runs.opened import OpenedRun
@@ -52,9 +53,9 @@ def test_a_new_run_is_trained_and_scored(planned: Planned) -> None:
     train, scoring = comparing._job(question, only, alone=True).tasks
     assert isinstance(train, Training)
     assert (train.scene, train.folder) == (str(question.scenes[0]), str(only.folder))
-    assert (train.settings, train.downscale, train.transfer) == (question.settings, 4, "linear")
+    assert (train.settings, train.reading) == (question.settings, SceneOptions(4, "linear"))
     assert not train.resume
-    assert scoring == Scoring(folder=str(only.folder), speed=True, device="cpu", threads=1)
+    assert scoring == Scoring(folder=str(only.folder), speed=True, compute=ComputeOptions(1, "cpu"))
     assert not only.folder.exists()
 
 
@@ -120,6 +121,6 @@ def test_speed_times_what_was_not_timed(
     assert asked == []
     score(only.folder)
     comparing._time(question, [only], reporter)
-    scoring = Scoring(folder=str(only.folder), speed=True, device="cpu", threads=1)
+    scoring = Scoring(folder=str(only.folder), speed=True, compute=ComputeOptions(1, "cpu"))
     assert [job.tasks for job in asked] == [(scoring,)]
     assert [text[:19] for text in reporter.said] == ["no speed for 1 runs"]

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from polarguide.experiments.worker import COMMAND, Scoring, Training, encoded
+from polarguide.options import ComputeOptions, SceneOptions
 from polarguide.records import decode
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
@@ -25,10 +26,8 @@ def training(scene: Path, folder: Path, steps: int = 20) -> Training:
         folder=str(folder),
         recipe="3dgs",
         settings=TrainSettings(steps, 0),
-        downscale=8,
-        transfer="linear",
-        device="cpu",
-        threads=1,
+        reading=SceneOptions(8),
+        compute=ComputeOptions(1, "cpu"),
         resume=False,
     )
 
@@ -38,7 +37,7 @@ def work(data: bytes, folder: Path) -> subprocess.CompletedProcess[bytes]:
 
 
 def test_a_task_survives_its_way(tmp_path: Path) -> None:
-    for task in (training(tmp_path, tmp_path / "out"), Scoring("run", True, "cpu", 2)):
+    for task in (training(tmp_path, tmp_path / "out"), Scoring("run", True, ComputeOptions(2, "cpu"))):
         assert decode(encoded(task), Training | Scoring, "task") == task  # type: ignore[arg-type]
 
 
@@ -59,7 +58,7 @@ def test_nothing_is_imported_from_the_current_folder(demo_scene: Path, tmp_path:
     ("change", "said"),
     [
         ({"settings": {"steps": "many", "seed": 0}}, "task (settings.steps): expected a whole number"),
-        ({"transfer": "gamma"}, "task (transfer): expected"),
+        ({"reading": {"transfer": "gamma"}}, "task (reading.transfer): expected"),
         ({"surprise": 1}, "task"),
         ({"type": "dance"}, "task"),
         ({"scene": "no-such-scene"}, "no-such-scene: expected"),

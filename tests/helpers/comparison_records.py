@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from polarguide.evaluation.table import COLUMNS
-from polarguide.experiments.results import make_results
+from polarguide.experiments.aggregate import aggregate
+from polarguide.experiments.results import FORMAT, Results, validate_results
 
 
 def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:
@@ -33,7 +34,8 @@ def unfinished(scene: str, recipe: str, seed: int, error: str | None = None) -> 
 def results(runs: list[dict[str, Any]], **provenance: Any) -> dict[str, Any]:
     """A record of these runs."""
     scenes, recipes = (list(dict.fromkeys(r[key] for r in runs)) for key in ("scene", "recipe"))
-    return make_results(
+    record = Results(
+        format=FORMAT,
         provenance={
             "version": "1",
             "commit": None,
@@ -54,4 +56,6 @@ def results(runs: list[dict[str, Any]], **provenance: Any) -> dict[str, Any]:
         scenes=[{"name": name, "digest": "d" * 64, "views": 3, "test_views": ["v0"]} for name in scenes],
         recipes=[{"name": name, "about": f"about {name}", "data": {}} for name in recipes],
         runs=runs,
+        table=aggregate(runs, scenes, recipes),
     )
+    return validate_results(record)

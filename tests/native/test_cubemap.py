@@ -1,7 +1,5 @@
 """The cubemap: kernel against reference implementation, seams, orientation, finite differences."""
 
-import math
-
 import pytest
 import torch
 from torch import Tensor
@@ -12,7 +10,6 @@ from polarguide import _native
 from polarguide.shading.cubemap import (
     cubemap_lookup,
     cubemap_lookup_reference,
-    cubemap_to_equirectangular,
     texel_directions,
 )
 
@@ -190,16 +187,6 @@ def test_gradients_on_request_only(simd: str) -> None:
     directions.requires_grad_()
     out = (cubemap_lookup(texture.detach(), directions) * weights).sum()
     assert torch.equal(torch.autograd.grad(out, directions)[0], both[2])
-
-
-def test_panorama() -> None:
-    """The y component of the direction itself, as a texture, is the sine of the latitude; -z lies in the middle."""
-    panorama = cubemap_to_equirectangular(texel_directions(64), 32)
-    assert panorama.shape == (32, 64, 3)
-    latitude = math.pi * (0.5 - (torch.arange(32) + 0.5) / 32)
-    assert_close(panorama[..., 1], latitude.sin()[:, None].expand(32, 64), rtol=0, atol=2e-3)
-    assert float(panorama[16, 32, 2]) < -0.99
-    assert float(panorama[16, 48, 0]) > 0.99
 
 
 def test_errors_name_what_was_expected() -> None:

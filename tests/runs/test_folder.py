@@ -21,7 +21,6 @@ from polarguide.runs.folder import (
     RunConfiguration,
     RunLog,
     load_checkpoint,
-    recipe_data,
     save_checkpoint,
 )
 from polarguide.training.recipe import Recipe
@@ -139,7 +138,7 @@ def configuration() -> RunConfiguration:
         scene="/some/scene",
         scene_digest="abc",
         recipe=recipe.name,
-        recipe_data=recipe_data(recipe),
+        recipe_data=recipe.data(),
         settings=TrainSettings(100, 5, 1.4),
         downscale=2,
         transfer="linear",
@@ -156,12 +155,12 @@ def test_the_configuration_survives_its_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", RECIPES)
 def test_every_value_of_a_recipe_is_on_record(name: str) -> None:
     recipe = RECIPES[name]
-    data = recipe_data(recipe)
+    data = recipe.data()
     assert json.loads(json.dumps(data)) == data
     changed = replace(recipe, means_decay=recipe.means_decay / 2)
-    assert recipe_data(changed) != data
+    assert changed.data() != data
     first = replace(recipe.stages[0], densify=not recipe.stages[0].densify)
-    assert recipe_data(replace(recipe, stages=(first, *recipe.stages[1:]))) != data
+    assert replace(recipe, stages=(first, *recipe.stages[1:])).data() != data
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.raster import choose_backend
 from polarguide.recipes import ablations_of, recipe_named
 from polarguide.rendering.relight import needs_radiance
-from polarguide.runs.folder import load_checkpoint, recipe_data, save_checkpoint
+from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.point_cloud import write_run_ply
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.gbuffer import render
@@ -85,10 +85,10 @@ def test_it_trains_and_resumes_to_the_same_bits(trained: Trainer, toy: Recipe, t
 
 
 def test_a_run_records_its_values_and_no_place_of_code(toy: Recipe) -> None:
-    data = recipe_data(toy)
+    data = toy.data()
     assert data["shading"] == {"model": "SkyShading", "first_gloss": 0.2, "sky_rate": 0.02}
     assert "toy_shading" not in json.dumps(data)
-    assert recipe_data(recipe_named("toy:dull")) != data
+    assert recipe_named("toy:dull").data() != data
     assert ablations_of("toy") == (recipe_named("toy:dull"),)
 
 

@@ -10,6 +10,7 @@ import torch
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.visualization import figures
+from polarguide.visualization.sheet import contact_sheet
 
 # A camera that looks along world +x, with world +z up: its right is world -y.
 ROTATION = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
@@ -114,14 +115,14 @@ def boxes(sheet, color):
 
 def test_sheet_enlarges_small_tiles_by_a_whole_factor():
     fine = np.random.default_rng(1).integers(0, 256, (60, 100, 3)).astype(np.uint8)
-    sheet = figures.contact_sheet([[fine]], [""], [""], gutter=8)
+    sheet = contact_sheet([[fine]], [""], [""], gutter=8)
     assert sheet.shape == (180 + 16, 300 + 16, 3)
     assert (sheet[8:-8, 8:-8] == fine.repeat(3, 0).repeat(3, 1)).all()
 
 
 def test_sheet_places_rows_and_columns():
     rows = [[flat(RED, 96, 128), flat(GREEN, 96, 128)], [None, flat(BLUE, 96, 128)]]
-    sheet = figures.contact_sheet(rows, ["first", "second"], ["a", "b"])
+    sheet = contact_sheet(rows, ["first", "second"], ["a", "b"])
     red, green, blue = (boxes(sheet, color) for color in (RED, GREEN, BLUE))
     assert red[2:] == green[2:] == blue[2:] == (192, 256)
     assert (green[0], green[1]) == (red[0], red[1] + 256 + 8)
@@ -129,12 +130,12 @@ def test_sheet_places_rows_and_columns():
     assert sheet.shape == (blue[0] + 192 + 8, blue[1] + 256 + 8, 3)
     blank = sheet[blue[0] : blue[0] + 192, red[1] : red[1] + 256]
     assert (blank == 255).all()
-    assert (figures.contact_sheet([rows[0], []], ["first", "second"], ["a", "b"]).shape) == sheet.shape
+    assert (contact_sheet([rows[0], []], ["first", "second"], ["a", "b"]).shape) == sheet.shape
 
 
 def test_sheet_reduces_large_pictures_and_fits_odd_ones():
     rows = [[flat(RED, 500, 1000), flat(GREEN, 100, 100)]]
-    sheet = figures.contact_sheet(rows, [""], ["", ""], maximum_width=400)
+    sheet = contact_sheet(rows, [""], ["", ""], maximum_width=400)
     assert boxes(sheet, RED)[2:] == (200, 400)
     top, left, height, width = boxes(sheet, GREEN)
     assert (height, width) == (400, 400)
@@ -144,7 +145,7 @@ def test_sheet_reduces_large_pictures_and_fits_odd_ones():
 
 def test_labels_are_drawn_beside_the_tiles_they_name():
     def sheet(row, column):
-        return figures.contact_sheet([[flat(RED, 96, 128)]], [row], [column]).astype(int)
+        return contact_sheet([[flat(RED, 96, 128)]], [row], [column]).astype(int)
 
     plain, other = sheet("view", "normal"), sheet("view", "depth")
     _, left, _, _ = boxes(plain, RED)
@@ -161,8 +162,8 @@ def test_labels_are_drawn_beside_the_tiles_they_name():
 def test_sheet_refuses_labels_that_do_not_fit():
     tile = flat(RED, 4, 4)
     with pytest.raises(ValueError, match=r"expected 1 rows of at most 1 pictures, found rows of \[2\]"):
-        figures.contact_sheet([[tile, tile]], ["a"], ["b"])
+        contact_sheet([[tile, tile]], ["a"], ["b"])
     with pytest.raises(ValueError, match="expected at least one picture"):
-        figures.contact_sheet([[None]], ["a"], ["b"])
+        contact_sheet([[None]], ["a"], ["b"])
     with pytest.raises(ValueError, match=r"found float32 \[4, 4, 3\]"):
-        figures.contact_sheet([[tile.astype(np.float32)]], ["a"], ["b"])
+        contact_sheet([[tile.astype(np.float32)]], ["a"], ["b"])

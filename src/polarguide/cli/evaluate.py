@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from rich.table import Table
 
-import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import ConsoleReporter
-from polarguide.cli.threads import use_threads
+from polarguide.cli.runs import RunFolder, opened
 from polarguide.options import ComputeOptions
 
 
 def evaluate(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: RunFolder,
     /,
     *,
     speed: bool = True,
@@ -29,11 +25,11 @@ def evaluate(
         run: Run folder.
         speed: Measure frames a second; --speed makes sense only while nothing else runs.
     """
-    use_threads(compute.threads)
-    reporter = ConsoleReporter()
-    opened = polarguide.open_run(run, device=compute.device, reporter=reporter)
-    record = opened.evaluate(speed=speed, reporter=reporter)
-    title = f"{opened.configuration.recipe} on {opened.scene.name}: mean of {len(record['views'])} test views"
+    trained, reporter = opened(run, compute)
+    record = trained.evaluate(speed=speed, reporter=reporter)
+    title = (
+        f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
+    )
     console.print(_table(record, title))
     console.print(f"metrics: {run / 'metrics.json'}")
 

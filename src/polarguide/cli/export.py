@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import ConsoleReporter
-from polarguide.cli.threads import use_threads
+from polarguide.cli.runs import RunFolder, opened
 from polarguide.options import ExportFormat, ThreadOptions
 
 
 def export(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: RunFolder,
     /,
     *,
     format: ExportFormat,
@@ -35,9 +30,7 @@ def export(
         out: Folder to write; RUN/export by default.
         resolution: Voxels of the mesh along its longest side.
     """
-    use_threads(machine.threads)
-    reporter = ConsoleReporter()
-    opened = polarguide.open_run(run, device="cpu", reporter=reporter)
-    for path in opened.export(format, out, resolution=resolution, reporter=reporter):
+    trained, reporter = opened(run, machine)
+    for path in trained.export(format, out, resolution=resolution, reporter=reporter):
         size = f" ({path.stat().st_size / 1e6:.1f} MB)" if path.is_file() else ""
         console.print(f"{format}: {path}{size}", markup=False)

@@ -5,10 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-from polarguide.cli.console import console
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.progress import ConsoleReporter, bars
 from polarguide.progress import Advance
 
 # Trainings log every tenth step and recipes differ in speed: a long memory keeps the time left from jumping.
@@ -20,16 +17,7 @@ class JobReporter(ConsoleReporter):
 
     def __init__(self) -> None:
         self._open = 0
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}", markup=False),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            speed_estimate_period=MEMORY_SECONDS,
-        )
+        self._progress = bars(MEMORY_SECONDS)
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:

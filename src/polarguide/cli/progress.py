@@ -11,6 +11,20 @@ from polarguide.cli.console import console, warn
 from polarguide.progress import Advance, Reporter
 
 
+def bars(memory_seconds: float = 30.0) -> Progress:
+    """A display of progress bars; the time left follows from the speed of the last seconds."""
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        speed_estimate_period=memory_seconds,
+    )
+
+
 class ConsoleReporter(Reporter):
     """What work reports, printed. Bars disappear at the end, but for those with a note."""
 
@@ -25,14 +39,7 @@ class ConsoleReporter(Reporter):
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
         """A progress bar."""
-        columns = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}", markup=False),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=console, transient=True) as progress:
+        with bars() as progress:
             task = progress.add_task(label, total=total, note="")
 
             def advance(done: int, *, total: int | None = None, note: str = "") -> None:

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import ConsoleReporter
-from polarguide.cli.threads import use_threads
+from polarguide.cli.runs import RunFolder, opened
 from polarguide.errors import PolarguideError
 from polarguide.options import ComputeOptions
 
 
 def render(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: RunFolder,
     /,
     *,
     views: str = "test",
@@ -53,13 +48,12 @@ def render(
             remedy="Write for example --path orbit --video film.mp4.",
         )
     names = [name.strip() for name in layers.split(",") if name.strip()]
-    use_threads(compute.threads)
-    reporter = ConsoleReporter()
-    opened = polarguide.open_run(run, device=compute.device, reporter=reporter)
-    opened.relight(environment, rotate_environment, reporter=reporter)
-    folder = out or run / "render"
+    trained, reporter = opened(run, compute)
+    trained.relight(environment, rotate_environment, reporter=reporter)
     if path:
-        opened.write_film(video or folder, path=path, layers=names, frames=frames, reporter=reporter)
+        trained.write_film(
+            video or out or run / "render", path=path, layers=names, frames=frames, reporter=reporter
+        )
         return
-    sheet = opened.write_pictures(folder, views=views, layers=names, reporter=reporter)
-    console.print(f"pictures: {folder}   contact sheet: {sheet}")
+    sheet = trained.write_pictures(out, views=views, layers=names, reporter=reporter)
+    console.print(f"pictures: {sheet.parent}   contact sheet: {sheet}")

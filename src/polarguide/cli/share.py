@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-import polarguide
 from polarguide.cli.console import console
-from polarguide.cli.progress import ConsoleReporter
-from polarguide.cli.threads import use_threads
+from polarguide.cli.runs import RunFolder, opened
 from polarguide.options import ThreadOptions
 
 
 def share(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: RunFolder,
     /,
     *,
     out: Path | None = None,
@@ -31,9 +26,7 @@ def share(
         title: Heading of the page; the scene's name by default.
         caption: Text below it; the recipe and its steps by default.
     """
-    use_threads(machine.threads)
-    reporter = ConsoleReporter()
-    opened = polarguide.open_run(run, device="cpu", reporter=reporter)
-    path = opened.share(out, title=title, caption=caption)
-    size = f"{path.stat().st_size / 1e6:.1f} MB, {len(opened.model):,} Gaussians"
+    trained, _ = opened(run, machine)
+    path = trained.share(out, title=title, caption=caption)
+    size = f"{path.stat().st_size / 1e6:.1f} MB, {len(trained.model):,} Gaussians"
     console.print(f"page: {path} ({size})", markup=False)

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
-import tyro
-
-import polarguide
-from polarguide.cli.progress import ConsoleReporter
-from polarguide.cli.threads import use_threads
+from polarguide.cli.runs import RunFolder, opened
 from polarguide.options import LOOPBACK, ComputeOptions
 
 
 def view(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: RunFolder,
     /,
     *,
     host: str = LOOPBACK[0],
@@ -28,7 +21,5 @@ def view(
         host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
         port: To listen at; the next free one is taken if it is in use.
     """
-    use_threads(compute.threads)
-    reporter = ConsoleReporter()
-    opened = polarguide.open_run(run, device=compute.device, reporter=reporter)
-    opened.view(host=host, port=port, reporter=reporter)
+    trained, reporter = opened(run, compute)
+    trained.view(host=host, port=port, reporter=reporter)

@@ -10,10 +10,11 @@ import torch
 import polarguide
 from polarguide import _native
 from polarguide.capture import View
-from polarguide.evaluation import ViewTarget, score_view, write_metrics
-from polarguide.evaluation.record import METRICS_FILE
+from polarguide.evaluation.record import METRICS_FILE, write_metrics
+from polarguide.evaluation.scores import score_view
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.speed import frames_per_second
+from polarguide.evaluation.target import ViewTarget
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.folder import RunLog
 from polarguide.runs.opened import OpenedRun

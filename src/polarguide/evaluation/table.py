@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from torch import Tensor
@@ -67,48 +68,42 @@ class Metric:
         return f"{number} {self.unit if self.factor == 1.0 else ''}".rstrip()
 
 
-def _picture(region: str) -> Measure:
-    """The squared error of the final picture over a region of the target."""
+def _compared(compare: Callable[..., Tensor], layer: str, true: str, region: str, *more: str) -> Measure:
+    """A comparison of a rendered layer with what the target knows, over one of its regions.
+
+    Args:
+        compare: takes the layer, what is true of it, the region, and further attributes of the target by name.
+    """
 
     def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
-        pixels, final = getattr(target, region), layers["final"]
-        return None if pixels is None or final is None else squared_error(final, target.photograph, pixels)
+        given = [layers[layer], *(getattr(target, name) for name in (true, region, *more))]
+        return None if any(values is None for values in given) else compare(*given)
 
     return measure
 
 
-def _similarity(target: ViewTarget, layers: Layers) -> Tensor | None:
-    final = layers["final"]
-    return None if final is None else ssim(final, target.photograph, target.valid, target.windows)
+def _picture(region: str) -> Measure:
+    """The squared error of the final picture over a region of the target."""
+    return _compared(squared_error, "final", "photograph", region)
 
 
 def _normal(compare: Callable[..., Tensor]) -> Measure:
     """A comparison of rendered and true normals on the foreground."""
-
-    def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
-        found, true = layers["normal"], target.normal
-        return None if found is None or true is None else compare(found, true, target.surface)
-
-    return measure
+    return _compared(compare, "normal", "normal", "surface")
 
 
 def _layer(name: str, *, aligned: bool = False) -> Measure:
     """The squared error of a layer against its true lobe on the foreground."""
-
-    def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
-        found, true = layers[name], getattr(target, name)
-        if found is None or true is None:
-            return None
-        return layer_error(found, true, target.foreground, aligned=aligned)
-
-    return measure
+    return _compared(partial(layer_error, aligned=aligned), name, name, "foreground")
 
 
 METRICS: tuple[Metric, ...] = (
     Metric("psnr", "PSNR", "dB", 2, "higher", measure=_picture("valid")),
     Metric("psnr_foreground", "PSNR foreground", "dB", 2, "higher", measure=_picture("foreground")),
     Metric("psnr_reflective", "PSNR reflective", "dB", 2, "higher", measure=_picture("reflective")),
-    Metric("ssim", "SSIM", "", 3, "higher", measure=_similarity),
+    Metric(
+        "ssim", "SSIM", "", 3, "higher", measure=_compared(ssim, "final", "photograph", "valid", "windows")
+    ),
     Metric("lpips", "LPIPS", "", 3, "lower"),
     Metric("normal_mae_deg", "normal error", "deg", 1, "lower", measure=_normal(normal_mae_deg)),
     Metric(

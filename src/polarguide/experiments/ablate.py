@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 
 from polarguide.errors import PolarguideError
 from polarguide.experiments.compare import compare
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.results import Results
+from polarguide.options import PathLike, check_choice
 from polarguide.progress import SILENT, Reporter
 from polarguide.recipes import ABLATIONS
 from polarguide.training.recipe import Recipe
@@ -16,9 +16,9 @@ from polarguide.training.settings import TrainSettings
 
 
 def ablate(
-    scenes: Sequence[str | os.PathLike[str]],
+    scenes: Sequence[PathLike],
     base: str,
-    out: str | os.PathLike[str],
+    out: PathLike,
     *,
     only: Sequence[str] = (),
     reference: Sequence[str | Recipe] = (),
@@ -52,20 +52,11 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
         PolarguideError: a recipe without ablations, or an ablation that it does not have.
     """
     if base not in ABLATIONS:
-        raise PolarguideError(
-            "base",
-            expected="a recipe with ablations: " + ", ".join(ABLATIONS),
-            found=base,
-            remedy="Take one of these, or use compare.",
-        )
+        expected = "a recipe with ablations: " + ", ".join(ABLATIONS)
+        remedy = "Take one of these, or use compare."
+        raise PolarguideError("base", expected=expected, found=base, remedy=remedy)
     names = [recipe.name for recipe in ABLATIONS[base]]
     wanted = [name if name.startswith(f"{base}:") else f"{base}:{name}" for name in only]
-    for name, full in zip(only, wanted, strict=True):
-        if full not in names:
-            raise PolarguideError(
-                "only",
-                expected="one of " + ", ".join(n.partition(":")[2] for n in names),
-                found=name,
-                remedy="Correct the name.",
-            )
+    for name in only:
+        check_choice("only", name.removeprefix(f"{base}:"), [n.partition(":")[2] for n in names])
     return (base, *(name for name in names if not only or name in wanted))

@@ -9,12 +9,11 @@ from pathlib import Path
 from polarguide import __version__
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.table import COLUMNS
-from polarguide.experiments.aggregate import RunRecord
+from polarguide.experiments.aggregate import RunRecord, aggregate
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
-from polarguide.experiments.results import Results, make_results, write_results
+from polarguide.experiments.results import FORMAT, Results, validate_results, write_results
 from polarguide.experiments.tables import csv_text, latex, markdown
 from polarguide.files import write_text
-from polarguide.runs.folder import recipe_data
 
 BESIDE_OTHERS = "beside_others.txt"
 """Marks a run folder whose training shared the machine, so that its seconds do not count."""
@@ -34,7 +33,10 @@ def collect(
         comparison, scenes, plan: what was asked for.
         failures: last words of runs that failed, by their folders.
     """
-    return make_results(
+    runs = [_run_record(comparison, run, failures.get(run.folder)) for run in plan]
+    recipes = [recipe.name for recipe in comparison.recipes]
+    record = Results(
+        format=FORMAT,
         provenance={
             "version": __version__,
             "commit": commit(),
@@ -56,11 +58,13 @@ def collect(
             for s in scenes
         ],
         recipes=[
-            {"name": recipe.name, "about": recipe.about, "data": recipe_data(recipe)}
+            {"name": recipe.name, "about": recipe.about, "data": recipe.data()}
             for recipe in comparison.recipes
         ],
-        runs=[_run_record(comparison, run, failures.get(run.folder)) for run in plan],
+        runs=runs,
+        table=aggregate(runs, [scene.name for scene in scenes], recipes),
     )
+    return validate_results(record)
 
 
 def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) -> RunRecord:

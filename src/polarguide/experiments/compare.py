@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from polarguide.experiments.results import Results
 from polarguide.experiments.study import write_study
 from polarguide.experiments.worker import Scoring, Task, Training
 from polarguide.files import make_folder
+from polarguide.options import ComputeOptions, PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
@@ -29,9 +29,9 @@ LOCK = ".lock"
 
 
 def compare(
-    scenes: Sequence[str | os.PathLike[str]],
+    scenes: Sequence[PathLike],
     recipes: Sequence[str | Recipe],
-    out: str | os.PathLike[str],
+    out: PathLike,
     *,
     settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
@@ -133,7 +133,7 @@ def _train(
 
 def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
     """The tasks that finish a run."""
-    state, options = run.state(), comparison.options
+    state, compute = run.state(), _compute(comparison)
     tasks: list[Task] = []
     if state in ("new", "begun"):
         if not alone:
@@ -145,20 +145,17 @@ def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
                 folder=str(run.folder),
                 recipe=run.recipe.name,
                 settings=run.settings,
-                downscale=run.reading.downscale,
-                transfer=run.reading.transfer,
-                device=options.device,
-                threads=options.threads,
+                reading=run.reading,
+                compute=compute,
                 resume=state == "begun",
             )
         )
-    tasks.append(_scoring(comparison, run, speed=alone))
+    tasks.append(Scoring(str(run.folder), alone, compute))
     return Job(run.label, run.folder, tuple(tasks), run.settings.steps)
 
 
-def _scoring(comparison: Comparison, run: PlannedRun, *, speed: bool) -> Scoring:
-    options = comparison.options
-    return Scoring(folder=str(run.folder), speed=speed, device=options.device, threads=options.threads)
+def _compute(comparison: Comparison) -> ComputeOptions:
+    return ComputeOptions(comparison.options.threads, comparison.options.device)
 
 
 def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter) -> None:
@@ -168,7 +165,9 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
         return
     reporter.say(f"timing the pictures of {len(untimed)} runs, one after the other")
     jobs = [
-        Job(run.label, run.folder, (_scoring(comparison, run, speed=True),), run.settings.steps)
+        Job(
+            run.label, run.folder, (Scoring(str(run.folder), True, _compute(comparison)),), run.settings.steps
+        )
         for run in untimed
     ]
     run_jobs(jobs, parallel=1, reporter=reporter)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.runs.folder import LOG
+from polarguide.runs.folder import RunLog
 
 Numbers = NDArray[np.float64]
 
@@ -38,20 +37,12 @@ class Curve:
 
 def read_curve(run: Path, name: str) -> Curve | None:
     """The curve of a run by its log, at most ``POINTS`` points; None where there is no line to draw."""
-    rows = []
-    try:
-        lines = (run / LOG).read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return None
-    for line in lines:
-        try:
-            row = json.loads(line)
-            rows.append((float(row["step"]) + 1, float(row["seconds"]), float(row["psnr"])))
-        except (ValueError, KeyError, TypeError):
-            continue  # a line cut short by a kill
+    found = [(row["step"], row.get("seconds"), row.get("psnr")) for row in RunLog(run).rows()]
+    rows = [row for row in found if None not in row]
     if len(rows) < 2:
         return None
     steps, seconds, psnr = np.array(rows, np.float64).T
+    steps += 1
     keep = np.unique(np.linspace(0, len(rows) - 1, POINTS).round().astype(int))
     return Curve(name, steps[keep], seconds[keep], smoothed(psnr, SMOOTHED_SHARE)[keep])
 

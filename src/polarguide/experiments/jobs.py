@@ -63,7 +63,11 @@ class Child:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
-                env={"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "OMP_NUM_THREADS": str(self._task.threads)},
+                env={
+                    "OMP_WAIT_POLICY": "PASSIVE",
+                    **os.environ,
+                    "OMP_NUM_THREADS": str(self._task.compute.threads),
+                },
                 # A session of its own: Ctrl-C in the terminal reaches it through the parent alone, once. The lock of
                 # the output folder, which it inherits, outlives a parent that is killed.
                 start_new_session=True,

@@ -16,12 +16,12 @@ from typing import Any, Literal
 
 from polarguide import __version__
 from polarguide.errors import PolarguideError
-from polarguide.evaluation import read_metrics
+from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import scoring_digest, training_digest
 from polarguide.experiments.options import CompareOptions
 from polarguide.options import SceneOptions
 from polarguide.progress import SILENT, Reporter
-from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration, recipe_data
+from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration
 from polarguide.runs.opened import read_scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
@@ -116,7 +116,7 @@ class PlannedRun:
             return None
         same = (
             found.scene_digest == self.scene.digest
-            and found.recipe_data == recipe_data(self.recipe)
+            and found.recipe_data == self.recipe.data()
             and found.settings == self.settings
             and (found.recipe, found.downscale, found.transfer)
             == (self.recipe.name, self.reading.downscale, self.reading.transfer)
@@ -161,13 +161,8 @@ def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[Plan
 def _planned(comparison: Comparison, scene: SceneEntry, recipe: Recipe, seed: int) -> PlannedRun:
     settings, options = replace(comparison.settings, seed=seed), comparison.options
     reading = SceneOptions(options.downscale, options.transfer)
-    key = run_key(
-        scene.digest,
-        recipe_data(recipe),
-        settings,
-        reading,
-        code=f"{__version__} {training_digest()}",
-    )
+    code = f"{__version__} {training_digest()}"
+    key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     folder = comparison.out / RUNS / scene.name / recipe.name.replace(":", "__") / f"{seed}-{key}"
     return PlannedRun(scene, recipe, settings, reading, folder)
 

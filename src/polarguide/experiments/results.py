@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypedDict, TypeVar
 import msgspec
 
 from polarguide.errors import PolarguideError
-from polarguide.experiments.aggregate import Row, RunRecord, aggregate
+from polarguide.experiments.aggregate import Row, RunRecord
 from polarguide.files import write_text
 from polarguide.records import decode, read_record, shortened
 
@@ -70,32 +70,6 @@ class Results(TypedDict):
     recipes: _Filled[RecipeRecord]
     runs: _Filled[RunRecord]
     table: _Filled[Row]
-
-
-def make_results(
-    *,
-    provenance: Provenance,
-    settings: Settings,
-    scenes: list[SceneRecord],
-    recipes: list[RecipeRecord],
-    runs: list[RunRecord],
-) -> Results:
-    """The record of a comparison, with the table over its runs.
-
-    Raises:
-        PolarguideError: something that does not pass ``validate_results``.
-    """
-    record = Results(
-        format=FORMAT,
-        provenance=provenance,
-        settings=settings,
-        scenes=scenes,
-        recipes=recipes,
-        runs=runs,
-        table=aggregate(runs, [s["name"] for s in scenes], [r["name"] for r in recipes]),
-    )
-    validate_results(record)
-    return record
 
 
 def write_results(path: Path, record: Results) -> None:

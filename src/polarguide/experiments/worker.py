@@ -11,7 +11,7 @@ import msgspec
 
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.evaluate import evaluate
-from polarguide.options import DeviceName, SceneOptions, SessionOptions, Transfer
+from polarguide.options import ComputeOptions, SceneOptions, SessionOptions
 from polarguide.raster import use_threads
 from polarguide.records import decode, to_json
 from polarguide.runs.opened import OpenedRun
@@ -37,10 +37,8 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="tra
     folder: str
     recipe: str
     settings: TrainSettings
-    downscale: int
-    transfer: Transfer
-    device: DeviceName
-    threads: int
+    reading: SceneOptions
+    compute: ComputeOptions
     resume: bool
 
 
@@ -49,8 +47,7 @@ class Scoring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="scor
 
     folder: str
     speed: bool
-    device: DeviceName
-    threads: int
+    compute: ComputeOptions
 
 
 Task = Training | Scoring
@@ -86,9 +83,9 @@ def do(task: Task) -> None:
         PolarguideError: the input is wrong, or the training has diverged.
         KeyboardInterrupt: stopped by SIGINT; a training has saved its state.
     """
-    use_threads(task.threads)
+    use_threads(task.compute.threads)
     if isinstance(task, Scoring):
-        evaluate(OpenedRun.open(task.folder, device=task.device), speed=task.speed)
+        evaluate(OpenedRun.open(task.folder, device=task.compute.device), speed=task.speed)
         return
     with StopSignals() as should_stop:
         train(
@@ -96,8 +93,8 @@ def do(task: Task) -> None:
             task.folder,
             recipe=task.recipe,
             settings=task.settings,
-            session=SessionOptions(task.threads, task.device),
-            reading=SceneOptions(task.downscale, task.transfer),
+            session=SessionOptions(task.compute.threads, task.compute.device),
+            reading=task.reading,
             resume=task.resume,
             should_stop=should_stop,
         )

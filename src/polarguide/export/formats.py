@@ -16,7 +16,7 @@ from polarguide.export.share import share_page, write_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
 from polarguide.files import make_folder
-from polarguide.options import ExportFormat
+from polarguide.options import ExportFormat, PathLike, check_choice, check_range
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.relight import needs_radiance, panorama, write_exr
 from polarguide.runs.opened import OpenedRun
@@ -30,7 +30,7 @@ PANORAMA_HEIGHT = 512
 def export(
     run: OpenedRun,
     format: ExportFormat,
-    out: Path | None = None,
+    out: PathLike | None = None,
     *,
     resolution: int = 192,
     reporter: Reporter = SILENT,
@@ -53,7 +53,7 @@ def export(
     Raises:
         PolarguideError: an optional package is missing, or the recipe has nothing of this kind.
     """
-    folder = run.folder / "export" if out is None else out
+    folder = run.folder / "export" if out is None else Path(out)
     writers: dict[str, Callable[[], list[Path]]] = {
         "ply": lambda: [_ply(run, folder / "splats.ply")],
         "spz": lambda: [_compressed(run, folder / "splats.spz", write_spz)],
@@ -63,20 +63,14 @@ def export(
         "environment": lambda: _environment(run, folder),
         "cameras": lambda: _cameras(run, folder),
     }
-    if format not in writers:
-        raise PolarguideError(
-            "format", expected="one of " + ", ".join(writers), found=format, remedy="Correct the name."
-        )
-    if not 16 <= resolution <= 1024:
-        raise PolarguideError(
-            "resolution", expected="16 to 1024", found=str(resolution), remedy="Choose such a number."
-        )
+    check_choice("format", format, writers)
+    check_range("resolution", resolution, 16, 1024)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return writers[format]()
 
 
-def share(run: OpenedRun, path: Path | None = None, *, title: str = "", caption: str = "") -> Path:
+def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", caption: str = "") -> Path:
     """Write a run as one web page that renders it with its reflections, and needs nothing beside itself.
 
     The photographs' poses are its views; the first test view is where it begins.
@@ -93,7 +87,7 @@ def share(run: OpenedRun, path: Path | None = None, *, title: str = "", caption:
     Raises:
         PolarguideError: a name that ends in something else, or scores that cannot be read.
     """
-    path = run.folder / "share.html" if path is None else path
+    path = run.folder / "share.html" if path is None else Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
         raise PolarguideError(
             "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."

@@ -18,6 +18,7 @@ from polarguide.export.fusion import TRUNCATION, Box, Surface, box_around, fuse,
 from polarguide.files import atomic
 from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.result import RenderResult
+from polarguide.shading.visibility import seen_at
 from polarguide.vectors import dot, unit
 
 OPAQUE = 0.8
@@ -81,16 +82,12 @@ def painted(surface: Surface, views: list[tuple[Camera, Seen]], box: Box) -> Col
     color, normal = torch.zeros_like(vertices), torch.zeros_like(vertices)
     total = torch.zeros(len(vertices), dtype=torch.float64)
     for camera, seen in views:
-        x, y, z = camera.to_camera(vertices - camera.center).unbind(-1)
-        safe = z.clamp(min=1e-6)
-        column, row = (camera.fx * x / safe + camera.cx).floor(), (camera.fy * y / safe + camera.cy).floor()
-        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        column, row = column.clamp(0, camera.width - 1).long(), row.clamp(0, camera.height - 1).long()
-        near = (seen.depth[row, column] - z).abs() < TRUNCATION * box.size
+        pixel, z, inside = seen_at(vertices - camera.center, camera)
+        near = (seen.depth[pixel] - z).abs() < TRUNCATION * box.size
         squarely = dot(unit(camera.center - vertices), own).clamp(min=0)
-        weight = (inside & near & seen.mask[row, column]) * squarely
-        color += weight[:, None] * seen.diffuse[row, column]
-        normal += weight[:, None] * seen.normal[row, column]
+        weight = (inside & near & seen.mask[pixel]) * squarely
+        color += weight[:, None] * seen.diffuse[pixel]
+        normal += weight[:, None] * seen.normal[pixel]
         total += weight
     # What no view sees squarely keeps the normal of its surface, and the color gray.
     learned = unit(normal, 1e-9)

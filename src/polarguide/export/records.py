@@ -133,9 +133,14 @@ def curve_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     if not len(means):
         return np.zeros(0, dtype=np.int64)
     low, high = np.quantile(means, 0.01, axis=0), np.quantile(means, 0.99, axis=0)
-    cells = np.clip((means - low) / np.maximum(high - low, 1e-12) * 1023, 0, 1023).astype(np.uint64)
-    code = np.zeros(len(means), dtype=np.uint64)
+    cells = np.clip((means - low) / np.maximum(high - low, 1e-12) * 1023, 0, 1023).astype(np.int64)
+    return curve_places(torch.from_numpy(cells)).argsort(stable=True).numpy()
+
+
+def curve_places(cells: Tensor) -> Tensor:
+    """Places [N] of cells [N, 3], int64 below 1,024, along a Z curve."""
+    code = torch.zeros(len(cells), dtype=torch.int64)
     for bit in range(10):
         for axis in range(3):
-            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from polarguide.export.records import curve_places
 from polarguide.files import atomic
 from polarguide.gaussians.ply import read_ply
 
@@ -167,12 +168,6 @@ def _nearest(points: Tensor, means: Tensor) -> Tensor:
 
 def _morton_order(means: Tensor) -> Tensor:
     """Indices that put neighbors in space side by side, so that the pictures compress."""
-    ranks = means.argsort(dim=0).argsort(
-        dim=0
-    )  # ranks, not places: far Gaussians would squeeze all others into one cell
-    cells = (ranks * 1024) // max(1, len(means))
-    code = torch.zeros(len(means), dtype=torch.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return code.argsort(stable=True)
+    # Ranks, not places: far Gaussians would squeeze all others into one cell.
+    ranks = means.argsort(dim=0).argsort(dim=0)
+    return curve_places((ranks * 1024) // max(1, len(means))).argsort(stable=True)

@@ -7,6 +7,7 @@ out of step.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -26,25 +27,90 @@ CORE_SHAPES = {
 ORIENTED_SHAPES = {"outward": (3,)}
 
 
-class Gaussians:
-    """Named per-Gaussian tensors with their Adam moments (Kingma and Ba 2015, epsilon 1e-15 as in 3DGS).
+Own = TypeVar("Own", bound="Trained")
+
+
+class Trained:
+    """Named tensors with an Adam optimizer (Kingma and Ba 2015, epsilon 1e-15 as in 3DGS).
 
     Args:
-        tensors: all with the same first axis; those of ``CORE_SHAPES`` and any others.
+        tensors: by name.
         rates: learning rate by name; a name without one is not trained.
     """
+
+    kind = ""
+    """What the names in a checkpoint begin with."""
 
     def __init__(self, tensors: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
         self._tensors = {
             name: t.detach().clone().contiguous().requires_grad_() for name, t in tensors.items()
         }
-        self._check()
         groups = [
             {"params": [self._tensors[name]], "lr": rate, "name": name}
             for name, rate in rates.items()
             if name in self._tensors
         ]
         self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+    def trained(self) -> list[Tensor]:
+        """The tensors that are trained, in the order of their rates."""
+        return [group["params"][0] for group in self._optimizer.param_groups]
+
+    def set_betas(self, betas: tuple[float, float]) -> None:
+        """Set the decay of Adam's moments; torch's default otherwise."""
+        for group in self._optimizer.param_groups:
+            group["betas"] = betas
+
+    def set_rate(self, name: str, rate: float) -> None:
+        """Set the learning rate of one tensor."""
+        for group in self._optimizer.param_groups:
+            if group["name"] == name:
+                group["lr"] = rate
+
+    def step(self) -> None:
+        """One Adam step on every tensor that has a gradient; then the gradients are dropped."""
+        self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything needed to go on: ``KIND.NAME``, and the moments ``exp_avg``, ``exp_avg_sq`` and ``step``."""
+        out = {f"{self.kind}.{name}": t.detach().contiguous() for name, t in self._tensors.items()}
+        for group in self._optimizer.param_groups:
+            for key, value in self._optimizer.state.get(group["params"][0], {}).items():
+                out[self._moments(group["name"]) + key] = value.detach().contiguous()
+        return out
+
+    @classmethod
+    def from_state(cls: type[Own], state: Mapping[str, Tensor], rates: Mapping[str, float]) -> Own:
+        """The inverse of ``state``."""
+        named = {tuple(key.split(".")): value for key, value in state.items()}
+        loaded = cls({k[1]: value for k, value in named.items() if k[0] == cls.kind and len(k) == 2}, rates)
+        for group in loaded._optimizer.param_groups:
+            keys = {key: cls._moments(group["name"]) + key for key in ("step", "exp_avg", "exp_avg_sq")}
+            moments = {key: state[full].clone() for key, full in keys.items() if full in state}
+            if moments:
+                loaded._optimizer.state[group["params"][0]] = moments
+        return loaded
+
+    @staticmethod
+    def _moments(name: str) -> str:
+        """What the names of a tensor's moments begin with."""
+        return f"adam.{name}."
+
+
+class Gaussians(Trained):
+    """Named per-Gaussian tensors with their Adam moments.
+
+    Args:
+        tensors: all with the same first axis; those of ``CORE_SHAPES`` and any others.
+        rates: learning rate by name; a name without one is not trained.
+    """
+
+    kind = "gaussians"
+
+    def __init__(self, tensors: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
+        super().__init__(tensors, rates)
+        self._check()
 
     def _check(self) -> None:
         counts = {name: t.shape[0] for name, t in self._tensors.items()}
@@ -74,26 +140,6 @@ class Gaussians:
     def snapshot(self) -> dict[str, Tensor]:
         """Detached copies of all tensors."""
         return {name: t.detach().clone() for name, t in self._tensors.items()}
-
-    def trained(self) -> list[Tensor]:
-        """The tensors that are trained, in the order of their rates."""
-        return [group["params"][0] for group in self._optimizer.param_groups]
-
-    def set_betas(self, betas: tuple[float, float]) -> None:
-        """Set the decay of Adam's moments; torch's default otherwise."""
-        for group in self._optimizer.param_groups:
-            group["betas"] = betas
-
-    def set_rate(self, name: str, rate: float) -> None:
-        """Set the learning rate of one tensor."""
-        for group in self._optimizer.param_groups:
-            if group["name"] == name:
-                group["lr"] = rate
-
-    def step(self) -> None:
-        """One Adam step on every tensor that has a gradient; then the gradients are dropped."""
-        self._optimizer.step()
-        self._optimizer.zero_grad(set_to_none=True)
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor) -> None:
@@ -127,27 +173,3 @@ class Gaussians:
                 moments = {key: follow(state[key]).contiguous() for key in ("exp_avg", "exp_avg_sq")}
                 self._optimizer.state[new] = {**state, **moments}
         self._check()
-
-    def state(self) -> dict[str, Tensor]:
-        """Everything needed to go on: ``gaussians.NAME`` and ``adam.NAME.{exp_avg,exp_avg_sq,step}``."""
-        out = {f"gaussians.{name}": t.detach().contiguous() for name, t in self._tensors.items()}
-        for group in self._optimizer.param_groups:
-            for key, value in self._optimizer.state.get(group["params"][0], {}).items():
-                out[f"adam.{group['name']}.{key}"] = value.detach().contiguous()
-        return out
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Tensor], rates: Mapping[str, float]) -> Gaussians:
-        """The inverse of ``state``."""
-        tensors = {
-            key.removeprefix("gaussians."): value
-            for key, value in state.items()
-            if key.startswith("gaussians.")
-        }
-        gaussians = cls(tensors, rates)
-        for group in gaussians._optimizer.param_groups:
-            prefix = f"adam.{group['name']}."
-            moments = {key[len(prefix) :]: v.clone() for key, v in state.items() if key.startswith(prefix)}
-            if moments:
-                gaussians._optimizer.state[group["params"][0]] = moments
-        return gaussians

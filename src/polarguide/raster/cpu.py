@@ -10,7 +10,6 @@ from torch.autograd.function import once_differentiable
 
 from polarguide import _native
 from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
 from polarguide.raster.interface import (
     NEAR_PLANE,
     Rasterized,
@@ -18,6 +17,7 @@ from polarguide.raster.interface import (
     Splats,
     check_shapes,
     not_finite,
+    refusal,
 )
 
 
@@ -40,24 +40,18 @@ def native_rasterizer(camera: Camera, channels: int, statistic: ScreenStatistic 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        means: Tensor,
-        rotations: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        features: Tensor,
-        camera: Camera,
-        statistic: ScreenStatistic | None,
+        ctx: Any, camera: Camera, statistic: ScreenStatistic | None, *splats: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = [t.detach().contiguous() for t in (means, rotations, scales, opacities, features)]
+        inputs = [t.detach().contiguous() for t in splats]
         for name, tensor in zip(Splats._fields, inputs, strict=True):
             bad = _native.first_not_finite(tensor)
             if bad >= 0:
                 raise not_finite(name, bad // max(1, tensor[0].numel()))
-        rasterizer = native_rasterizer(camera, features.shape[1], statistic)
-        out = torch.empty(camera.height, camera.width, features.shape[1])
+        count, channels = inputs[-1].shape
+        rasterizer = native_rasterizer(camera, channels, statistic)
+        out = torch.empty(camera.height, camera.width, channels)
         alpha = torch.empty(camera.height, camera.width)
-        radii = torch.empty(means.shape[0])
+        radii = torch.empty(count)
         rasterizer.forward(*inputs, out, alpha, radii)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(*inputs, out)
@@ -76,7 +70,7 @@ class _Rasterize(torch.autograd.Function):
         )
         if ctx.statistic:
             ctx.statistic.gradient = screen
-        return (*gradients, None, None)
+        return (None, None, *gradients)
 
 
 def rasterize_cpu(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
@@ -84,10 +78,6 @@ def rasterize_cpu(splats: Splats, camera: Camera, *, statistic: ScreenStatistic 
     check_shapes(splats, statistic)
     for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise PolarguideError(
-                f"rasterize({name})",
-                expected="float32 on the CPU",
-                found=f"{tensor.dtype} on {tensor.device}",
-                remedy="Convert it, or use rasterize_reference.",
-            )
-    return Rasterized(*_Rasterize.apply(*splats, camera, statistic))
+            found, remedy = f"{tensor.dtype} on {tensor.device}", "Convert it, or use rasterize_reference."
+            raise refusal(name, "float32 on the CPU", found, remedy)
+    return Rasterized(*_Rasterize.apply(camera, statistic, *splats))

@@ -107,34 +107,22 @@ def check_shapes(splats: Splats, statistic: ScreenStatistic | None) -> None:
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, channels))
     for name, tensor, shape in zip(Splats._fields, splats, shapes, strict=True):
         if tuple(tensor.shape) != shape:
-            raise PolarguideError(
-                f"rasterize({name})",
-                expected=f"shape {list(shape)}",
-                found=str(list(tensor.shape)),
-                remedy="Give every tensor one entry for each Gaussian.",
-            )
+            remedy = "Give every tensor one entry for each Gaussian."
+            raise refusal(name, f"shape {list(shape)}", str(list(tensor.shape)), remedy)
     if not 1 <= channels <= 32:
-        raise PolarguideError(
-            "rasterize(features)",
-            expected="1 to 32 channels",
-            found=str(channels),
-            remedy="Split the channels.",
-        )
+        raise refusal("features", "1 to 32 channels", str(channels), "Split the channels.")
     chosen = statistic.channels if statistic else ()
     if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):
-        raise PolarguideError(
-            "rasterize(statistic)",
-            expected=f"different channels below {channels}",
-            found=str(chosen),
-            remedy="Name channels that exist, each once.",
-        )
+        remedy = "Name channels that exist, each once."
+        raise refusal("statistic", f"different channels below {channels}", str(chosen), remedy)
 
 
 def not_finite(name: str, index: int) -> PolarguideError:
     """The error for a NaN or an infinity in the tensor ``name`` of the Gaussian ``index``."""
-    return PolarguideError(
-        f"rasterize({name})",
-        expected="finite numbers",
-        found=f"NaN or infinity in Gaussian {index}",
-        remedy="A diverged optimization: lower the learning rate or resume from an earlier checkpoint.",
-    )
+    remedy = "A diverged optimization: lower the learning rate or resume from an earlier checkpoint."
+    return refusal(name, "finite numbers", f"NaN or infinity in Gaussian {index}", remedy)
+
+
+def refusal(name: str, expected: str, found: str, remedy: str) -> PolarguideError:
+    """The error for the argument ``name`` of a rasterizer."""
+    return PolarguideError(f"rasterize({name})", expected=expected, found=found, remedy=remedy)

@@ -11,6 +11,7 @@ import torch
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
+from polarguide.options import PathLike, check_range
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.video import write_video
 from polarguide.runs.opened import OpenedRun, checked_layers
@@ -33,10 +34,7 @@ def path_cameras(run: OpenedRun, path: str, frames: int) -> tuple[list[Camera], 
     Raises:
         PolarguideError: too many frames, or a file that cannot be read.
     """
-    if not 1 <= frames <= 100_000:
-        raise PolarguideError(
-            "frames", expected="1 to 100000", found=str(frames), remedy="Choose such a number."
-        )
+    check_range("frames", frames, 1, 100_000)
     if path in PATHS:
         return PATHS[path](list(run.cameras.values()), frames), FRAMES_PER_SECOND
     return read_path(Path(path))
@@ -44,7 +42,7 @@ def path_cameras(run: OpenedRun, path: str, frames: int) -> tuple[list[Camera], 
 
 def write_film(
     run: OpenedRun,
-    out: Path,
+    out: PathLike,
     *,
     path: str = "orbit",
     layers: Sequence[str] = ("final",),
@@ -62,7 +60,7 @@ def write_film(
     Raises:
         PolarguideError: a layer that the recipe has not, cameras of several sizes, or a video that cannot be encoded.
     """
-    names = checked_layers(list(layers))
+    out, names = Path(out), checked_layers(list(layers))
     cameras, speed = path_cameras(run, path, frames)
     pictures = _pictures(run, names, cameras, reporter)
     if out.suffix.lower() == ".mp4":
@@ -101,16 +99,9 @@ def _picture(
 ) -> Picture:
     """Layers side by side."""
     result = run.model.render(camera, depth="depth" in layers)
-    found = {name: layer_picture(result, name, camera, depths) for name in layers}
-    absent = [name for name, picture in found.items() if picture is None]
-    if absent:
-        raise PolarguideError(
-            "layers",
-            expected="layers of this recipe",
-            found=f"{', '.join(absent)}, which it has not",
-            remedy="Leave them out.",
-        )
-    return np.concatenate([p for p in found.values() if p is not None], axis=1)
+    run.chosen_layers(result, layers)
+    pictures = [layer_picture(result, name, camera, depths) for name in layers]
+    return np.concatenate([picture for picture in pictures if picture is not None], axis=1)
 
 
 def _depths(run: OpenedRun, cameras: list[Camera]) -> tuple[float, float]:

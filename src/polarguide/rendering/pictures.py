@@ -8,10 +8,12 @@ from pathlib import Path
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
+from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.visualization import figures
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture, true_depth_range
+from polarguide.visualization.sheet import contact_sheet
 
 SHEET_VIEWS = 8
 CONTACT_SHEET = "contact_sheet.png"
@@ -35,19 +37,20 @@ def select_views(scene: Scene, choice: str) -> tuple[View, ...]:
 
 def write_pictures(
     run: OpenedRun,
-    out: Path,
+    out: PathLike | None = None,
     *,
     views: str = "test",
-    layers: Sequence[str],
+    layers: Sequence[str] | None = None,
     reporter: Reporter = SILENT,
 ) -> Path:
     """Write layers of some views, one PNG each, and a contact sheet of them and the ground truth.
 
     Args:
         run: the run; its scene is read.
-        out: folder to write.
+        out: folder to write; ``render`` in the run's folder by default.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        layers: names of layers; one that the recipe has not is left out, and named to the reporter.
+        layers: names of layers, all of the run's by default; one that the recipe has not is left out, and named to
+            the reporter.
 
     Returns:
         The path of the contact sheet.
@@ -55,9 +58,10 @@ def write_pictures(
     Raises:
         PolarguideError: there is no such view or layer.
     """
-    names = checked_layers(list(layers))
+    folder = run.folder / "render" if out is None else Path(out)
+    names = checked_layers(list(run.layers if layers is None else layers))
     chosen = select_views(run.scene, views)
-    make_folder(out)
+    make_folder(folder)
     rows: list[list[Picture | None]] = []
     labels: list[str] = []
     missing: set[str] = set()
@@ -70,15 +74,15 @@ def write_pictures(
                 if picture is None:
                     missing.add(name)
                 else:
-                    figures.write_png(out / f"{view.name}_{name}.png", picture)
+                    figures.write_png(folder / f"{view.name}_{name}.png", picture)
             ground_truth = ground_truth_pictures(view)
             if len(rows) < 2 * SHEET_VIEWS:
                 rows.append([pictures[name] for name in names])
                 rows.append([ground_truth.get(name) for name in names])
                 labels += [view.name, f"{view.name} true"]
             advance(number + 1)
-    sheet = out / CONTACT_SHEET
-    figures.write_png(sheet, figures.contact_sheet(rows, labels, names))
+    sheet = folder / CONTACT_SHEET
+    figures.write_png(sheet, contact_sheet(rows, labels, names))
     if missing:
         reporter.say(f"this recipe has no layer {', '.join(sorted(missing))}")
     return sheet

@@ -4,32 +4,31 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
+from polarguide.options import PathLike, SceneOptions
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
-from polarguide.runs.opened import OpenedRun
+from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.priors import facing_chromatic, guide_normals
 from polarguide.visualization import figures
-
-Picture = NDArray[np.uint8]
+from polarguide.visualization.sheet import Picture, contact_sheet
 
 
 def write_priors(
-    scene: Scene,
-    out: Path,
+    scene: Scene | PathLike,
+    out: PathLike,
     *,
     run: OpenedRun | None = None,
     views: str = "test",
     refractive_index: float = 1.5,
     threshold: float = 0.05,
+    reading: SceneOptions = SceneOptions(),
     reporter: Reporter = SILENT,
 ) -> Path:
     """Pictures of what polarization says about a scene, one PNG each, and a contact sheet of them.
@@ -39,7 +38,7 @@ def write_priors(
     with their ambiguity resolved only by the surface facing the camera.
 
     Args:
-        scene: the scene.
+        scene: a scene, or the folder of one, which is read as ``reading`` says.
         out: folder to write.
         run: a run trained on this scene at this size, whose normals resolve the ambiguity.
         views: ``test``, ``train``, ``all``, or names separated by commas.
@@ -52,6 +51,8 @@ def write_priors(
     Raises:
         PolarguideError: there is no such view, or the run was trained at another size.
     """
+    if not isinstance(scene, Scene):
+        scene = read_scene(scene, reading, reporter)
     if run is not None and run.configuration.downscale != scene.downscale:
         raise PolarguideError(
             "downscale",
@@ -60,7 +61,7 @@ def write_priors(
             remedy="Give the same factor.",
         )
     chosen = select_views(scene, views)
-    make_folder(out)
+    make_folder(out := Path(out))
     rows: list[list[Picture]] = []
     labels: list[str] = []
     names: list[str] = []
@@ -75,7 +76,7 @@ def write_priors(
                 labels.append(view.name)
             advance(number + 1)
     sheet = out / CONTACT_SHEET
-    figures.write_png(sheet, figures.contact_sheet(rows, labels, names))
+    figures.write_png(sheet, contact_sheet(rows, labels, names))
     return sheet
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from polarguide.errors import PolarguideError, optional_import
+from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
 from polarguide.scene_frame import SceneFrame, scene_frame
@@ -29,7 +30,7 @@ RELIT_RESOLUTION = 128
 
 
 def relight(
-    run: OpenedRun, panorama: Path | None = None, degrees: float = 0.0, *, reporter: Reporter = SILENT
+    run: OpenedRun, panorama: PathLike | None = None, degrees: float = 0.0, *, reporter: Reporter = SILENT
 ) -> None:
     """Put a panorama in the learned environment's place, or turn it, in the run as it is in memory.
 
@@ -51,7 +52,7 @@ def relight(
     light = run.model.light
     around = scene_frame(list(run.cameras.values()))
     if panorama is not None:
-        texels = texels_of(read_panorama(panorama), cubemap, around, RELIT_RESOLUTION)
+        texels = texels_of(read_panorama(Path(panorama)), cubemap, around, RELIT_RESOLUTION)
         light[cubemap.name] = texels.to(light[cubemap.name].device)
     light[cubemap.name] = turned_cubemap(light[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION)
     if run.model.shading.local_note:

@@ -6,12 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.files import atomic
-
-Picture = NDArray[np.uint8]
+from polarguide.visualization.sheet import Picture
 
 
 def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:

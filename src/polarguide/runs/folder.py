@@ -8,6 +8,7 @@ RUN/point_cloud.ply     for other viewers, at the end
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from dataclasses import dataclass
@@ -67,7 +68,7 @@ class RunConfiguration:
             scene=str(scene.root.resolve()),
             scene_digest=scene.digest,
             recipe=recipe.name,
-            recipe_data=recipe_data(recipe),
+            recipe_data=recipe.data(),
             settings=settings,
             downscale=scene.downscale,
             transfer="srgb" if scene.transfer == "srgb" else "linear",
@@ -119,11 +120,6 @@ def _series(version: str) -> str:
     return ".".join(version.split(".")[:2])
 
 
-def recipe_data(recipe: Recipe) -> dict[str, Any]:
-    """All values of a recipe as plain JSON types."""
-    return recipe.data()
-
-
 def save_checkpoint(run: Path, state: TrainingState) -> None:
     """Write the state so that a kill at any moment leaves either the old checkpoint or the new one."""
     with atomic(run / CHECKPOINT) as path:
@@ -171,21 +167,20 @@ class RunLog:
 
     def cut(self, step: int) -> None:
         """Drop lines at or after a step: they will be written again after a resume."""
-        if not self._path.exists():
-            return
-        lines = [line for line in self._path.read_text().splitlines() if line]
-        kept = []
-        for line in lines:
-            try:
-                if json.loads(line)["step"] < step:
-                    kept.append(line)
-            except (json.JSONDecodeError, KeyError):
-                continue  # a line cut short by a kill
-        write_text(self._path, "".join(line + "\n" for line in kept))
+        if self._path.exists():
+            kept = [row for row in self.rows() if row["step"] < step]
+            write_text(self._path, "".join(json.dumps(row) + "\n" for row in kept))
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The lines that are whole, none where there is no log; a kill can cut one short."""
+        rows = []
+        for line in self._path.read_text().splitlines() if self._path.exists() else ():
+            with contextlib.suppress(json.JSONDecodeError):
+                row = json.loads(line)
+                rows += [row] if isinstance(row, dict) and "step" in row else []
+        return rows
 
     def elapsed(self) -> tuple[float, bool]:
         """Training seconds that the log accounts for, and whether the machine worked for nobody else."""
-        if not self._path.exists():
-            return 0.0, True
-        rows = [json.loads(line) for line in self._path.read_text().splitlines() if line]
+        rows = self.rows()
         return (float(rows[-1]["seconds"]), bool(rows[-1]["alone"])) if rows else (0.0, True)

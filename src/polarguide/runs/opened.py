@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -16,11 +15,11 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError, PolarguideWarning
-from polarguide.options import DeviceName, SceneOptions
+from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend, choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.runs.folder import RunConfiguration, load_checkpoint, recipe_data
+from polarguide.runs.folder import RunConfiguration, load_checkpoint
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
@@ -28,30 +27,9 @@ from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
 
 
-class Model(Protocol):
-    """What was learned, for whoever scores or shows it: layers, however they are made.
-
-    Attributes:
-        device: where layers are rendered.
-    """
-
-    @property
-    def device(self) -> torch.device: ...
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the layers that it renders, in the order of ``LAYERS``."""
-
-    def __len__(self) -> int:
-        """How many primitives (Gaussians) it has."""
-
-    def render(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
-        """All layers; ``normals`` where the model can do without them, and ``depth``, only if asked for."""
-
-
 @dataclass(frozen=True, eq=False)
 class GaussianModel:
-    """Gaussians, their learned light, and how they are shaded."""
+    """What was learned, for whoever scores or shows it: Gaussians, their light, and how they are shaded."""
 
     state: TrainingState
     shading: ShadingModel
@@ -73,11 +51,12 @@ class GaussianModel:
         return tuple(name for name in LAYERS if name in self.shading.layers)
 
     def __len__(self) -> int:
+        """How many Gaussians it has."""
         return len(self.state.gaussians)
 
     @torch.no_grad()
     def render(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
-        """All layers; see ``Model``."""
+        """All layers; ``normals`` where the model can do without them, and ``depth``, only if asked for."""
         return render(
             self.state.gaussians,
             camera,
@@ -110,7 +89,7 @@ class OpenedRun:
         recipe: Recipe,
         model: GaussianModel,
         *,
-        scene: Scene | str | os.PathLike[str] | None = None,
+        scene: Scene | PathLike | None = None,
         reporter: Reporter = SILENT,
     ) -> None:
         self.folder, self.configuration, self.recipe, self.model = folder, configuration, recipe, model
@@ -123,10 +102,10 @@ class OpenedRun:
     @classmethod
     def open(
         cls: type[Opened],
-        folder: str | os.PathLike[str],
+        folder: PathLike,
         *,
         recipe: Recipe | None = None,
-        scene: Scene | str | os.PathLike[str] | None = None,
+        scene: Scene | PathLike | None = None,
         device: DeviceName = "auto",
         reporter: Reporter = SILENT,
     ) -> Opened:
@@ -147,13 +126,19 @@ class OpenedRun:
         recipe = recipe or recipe_named(configuration.recipe)
         backend = choose_backend(device, say=reporter.say)
         state = load_checkpoint(folder, recipe, backend.device)
-        if recipe_data(recipe) != configuration.recipe_data:
+        if recipe.data() != configuration.recipe_data:
             _warn(
                 f"{folder} was trained with other values of the recipe {recipe.name} than this version has; its "
                 "pictures are shaded with this version's."
             )
         model = GaussianModel(state, recipe.shading.bind(configuration.settings.refractive_index), backend)
         return cls(folder, configuration, recipe, model, scene=scene, reporter=reporter)
+
+    @classmethod
+    def of(cls: type[Opened], run: OpenedRun) -> Opened:
+        """Another run as one of this class, with the same scene and in the same memory."""
+        scene, reporter = run._scene_source, run._reporter
+        return cls(run.folder, run.configuration, run.recipe, run.model, scene=scene, reporter=reporter)
 
     @property
     def steps(self) -> int:
@@ -222,19 +207,24 @@ class OpenedRun:
             PolarguideError: there is no such layer, or this recipe has not got it.
         """
         names = checked_layers([layers] if isinstance(layers, str) else list(layers))
-        result = self.result(camera)
-        found: dict[str, Tensor] = {}
-        for name in names:
-            values = getattr(result, name)
-            if values is None:
-                raise PolarguideError(
-                    "layers",
-                    expected=f"layers of the recipe {self.recipe.name}",
-                    found=f"{name}, which it has not",
-                    remedy="Leave it out.",
-                )
-            found[name] = values
-        return found
+        return self.chosen_layers(self.result(camera), names)
+
+    def chosen_layers(self, result: RenderResult, names: Iterable[str]) -> dict[str, Tensor]:
+        """Layers of a picture by name.
+
+        Raises:
+            PolarguideError: this recipe has not got one of them.
+        """
+        layers = {name: getattr(result, name) for name in names}
+        absent = [name for name, values in layers.items() if values is None]
+        if absent:
+            raise PolarguideError(
+                "layers",
+                expected=f"layers of the recipe {self.recipe.name}",
+                found=f"{', '.join(absent)}, which it has not",
+                remedy="Leave out what it has not.",
+            )
+        return layers
 
 
 def checked_layers(names: list[str]) -> list[str]:
@@ -244,15 +234,12 @@ def checked_layers(names: list[str]) -> list[str]:
         PolarguideError: otherwise.
     """
     for name in names or ["none"]:
-        if name not in LAYERS:
-            raise PolarguideError(
-                "layers", expected="any of " + ", ".join(LAYERS), found=name, remedy="Correct the name."
-            )
+        check_choice("layers", name, LAYERS)
     return names
 
 
 def read_scene(
-    folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(), reporter: Reporter = SILENT
+    folder: PathLike, options: SceneOptions = SceneOptions(), reporter: Reporter = SILENT
 ) -> Scene:
     """Load a scene, with progress, and hand on its warnings.
 

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from polarguide.color import srgb_encode
-from polarguide.files import atomic
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display, write_ply
 from polarguide.shading.model import Light, Parameters, ShadingModel
@@ -60,14 +59,6 @@ def write_run_ply(path: Path, state: TrainingState, shading: ShadingModel) -> No
         name: gaussians[name].detach().cpu()
         for name in ("means", "log_scales", "quaternions", "opacity_logits")
     }
-    with atomic(path) as temporary:
-        write_ply(
-            temporary,
-            means=plain["means"],
-            log_scales=plain["log_scales"],
-            quaternions=torch.nn.functional.normalize(plain["quaternions"], dim=-1),
-            opacity_logits=plain["opacity_logits"],
-            sh_dc=dc,
-            sh_rest=rest,
-            extra={name: field.detach().cpu() for name, field in shading.fields(gaussians).items()},
-        )
+    plain["quaternions"] = torch.nn.functional.normalize(plain["quaternions"], dim=-1)
+    extra = {name: field.detach().cpu() for name, field in shading.fields(gaussians).items()}
+    write_ply(path, **plain, sh_dc=dc, sh_rest=rest, extra=extra)

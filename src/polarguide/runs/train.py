@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -16,7 +15,7 @@ import torch
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
-from polarguide.options import SceneOptions, SessionOptions
+from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import use_threads
 from polarguide.recipes import recipe_named
@@ -58,8 +57,8 @@ class TrainingStopped(KeyboardInterrupt):
 
 
 def train(
-    scene: Scene | str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    scene: Scene | PathLike,
+    out: PathLike,
     *,
     recipe: Recipe | str = "polarguide-stokes",
     settings: TrainSettings = TrainSettings(),
@@ -254,22 +253,14 @@ def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
 
 
 def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
-    has_run = (out / CONFIGURATION).exists()
-    if resume and not has_run:
-        return PolarguideError(
-            out,
-            expected="a run to resume",
-            found="no run.json",
-            remedy="Train without --resume, or name the folder of a run.",
-        )
-    if not resume and has_run:
-        return PolarguideError(
-            out,
-            expected="a new folder",
-            found="a run",
-            remedy="Add --resume (resume=True) to go on with it, or name another folder.",
-        )
-    return None
+    if (out / CONFIGURATION).exists() == resume:
+        return None
+    expected, found, remedy = (
+        ("a run to resume", "no run.json", "Train without --resume, or name the folder of a run.")
+        if resume
+        else ("a new folder", "a run", "Add --resume (resume=True) to go on with it, or name another folder.")
+    )
+    return PolarguideError(out, expected=expected, found=found, remedy=remedy)
 
 
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:

@@ -21,7 +21,6 @@ float32 it is a native kernel; ``cubemap_lookup_reference`` is its reference imp
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -212,26 +211,3 @@ def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
         result: Tensor = _Lookup.apply(texture, directions)
         return result
     return cubemap_lookup_reference(texture, directions)
-
-
-def cubemap_to_equirectangular(texture: Tensor, height: int) -> Tensor:
-    """The cubemap as a panorama, for looking at: +y is up, -z in the middle, +x to its right.
-
-    Row i, column j look at latitude ``pi (1/2 - (i + 1/2) / H)`` and longitude ``2 pi ((j + 1/2) / 2H - 1/2)``, with
-    direction ``(cos lat sin lon, sin lat, -cos lat cos lon)``.
-
-    Args:
-        texture: [6, R, R, C].
-        height: H, at least 1.
-
-    Returns:
-        [H, 2 H, C], differentiable.
-    """
-    steps = torch.arange(2 * height, dtype=texture.dtype, device=texture.device) + 0.5
-    latitude = math.pi * (0.5 - steps[:height, None] / height)
-    longitude = math.pi * (steps[None, :] / height - 1)
-    x, y, z = torch.broadcast_tensors(
-        latitude.cos() * longitude.sin(), latitude.sin(), -latitude.cos() * longitude.cos()
-    )
-    directions = torch.stack((x, y, z), dim=-1)
-    return cubemap_lookup(texture, directions.reshape(-1, 3)).reshape(height, 2 * height, -1)

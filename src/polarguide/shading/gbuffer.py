@@ -62,11 +62,8 @@ def render(
     layers = shading.shade(GBuffer(picture.features, picture.alpha), light, camera)
     return RenderResult(
         final=layers["final"],
-        specular=layers.get("specular"),
-        diffuse=layers.get("diffuse"),
         base=picture.features[..., :3],
-        reflection=layers.get("reflection"),
-        strength=layers.get("strength"),
+        **{name: layers.get(name) for name in ("specular", "diffuse", "reflection", "strength")},
         normal=picture.features[..., 3:6] if normals else None,
         depth=picture.features[..., -1] / picture.alpha.clamp(min=1e-6) if depth else None,
         alpha=picture.alpha,

@@ -31,23 +31,10 @@ class _Reflect(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         features, rays, texels, directions, seen = ctx.saved_tensors
-        fresnel, local, ior = ctx.model
-        final, specular, diffuse, reflection = (None if g is None else g.contiguous() for g in grads)
+        to_layers = (None if g is None else g.contiguous() for g in grads)
         to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
-        _native.reflect_backward_layers(
-            features,
-            rays,
-            seen,
-            fresnel,
-            local,
-            ior,
-            final,
-            specular,
-            diffuse,
-            reflection,
-            to_seen,
-            to_features,
-        )
+        given: list[Any] = [features, rays, seen, *ctx.model, *to_layers, to_seen, to_features]
+        _native.reflect_backward_layers(*given)
         to_texels, to_directions = torch.empty_like(texels), torch.empty_like(directions)
         _native.cubemap_backward(texels, directions, to_seen, to_texels, to_directions)
         _native.reflect_backward_directions(features, rays, to_directions, to_features)

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
@@ -15,6 +16,21 @@ from polarguide.vectors import unit
 
 # A Gaussian at most this much behind the rendered surface, relative to its depth, is seen.
 DEPTH_SLACK = 0.02
+
+
+def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
+    """Where a camera sees points: the nearest pixel (row, column), the depth, and whether it lies in the picture.
+
+    Args:
+        offsets: [N, 3] from the camera's center to the points, world axes.
+        camera: the view.
+    """
+    x, y, z = camera.to_camera(offsets).unbind(-1)
+    safe = z.clamp(min=1e-6)
+    column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()
+    row = (camera.fy * y / safe + camera.cy).floor().clamp(-1, camera.height).long()
+    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return (row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)), z, inside
 
 
 @torch.no_grad()
@@ -36,12 +52,7 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
         depth = render(gaussians, camera, rasterize, sh_degree=0, normals=False, depth=True).depth
         assert depth is not None
         center = camera.pose(means.dtype, means.device).center
-        x, y, z = camera.to_camera(means - center).unbind(-1)
-        safe = z.clamp(min=1e-6)
-        column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()
-        row = (camera.fy * y / safe + camera.cy).floor().clamp(-1, camera.height).long()
-        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        surface = depth[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
-        seen = inside & (z < surface * (1 + DEPTH_SLACK))
+        pixel, z, inside = seen_at(means - center, camera)
+        seen = inside & (z < depth[pixel] * (1 + DEPTH_SLACK))
         total += seen[:, None] * unit(center - means)
     return total

@@ -58,6 +58,3 @@ def propagate_normals(
     grow = (strength >= settings.glossy)[:, None] * longer * torch.log(torch.tensor(settings.widen))
     gaussians.overwrite("log_scales", scales + grow)
     state.opacity_frozen_until = state.step + rest
-
-
-__all__ = ["OPACITY_REST", "propagate_normals", "reset_opacity"]

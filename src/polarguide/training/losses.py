@@ -166,18 +166,17 @@ def refuse_diverged(total: Tensor) -> None:
 def _prior_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssim_weight: float) -> Tensor:
     """The weighted sum of the terms that compare with a view's priors."""
     total = result.final.new_zeros(())
-    if weights.specular and result.specular is not None:
-        total = total + weights.specular * photometric_loss(
-            result.specular, priors.specular, priors.separated, ssim_weight
-        )
-    if weights.diffuse and result.diffuse is not None:
-        total = total + weights.diffuse * photometric_loss(
-            result.diffuse, priors.diffuse, priors.separated, ssim_weight
-        )
-    if weights.normal and result.normal is not None:
-        total = total + weights.normal * normal_loss(result.normal, priors)
-    if weights.azimuth and result.normal is not None:
-        total = total + weights.azimuth * azimuth_loss(result.normal, priors)
-    if weights.chromatic and result.normal is not None:
-        total = total + weights.chromatic * chromatic_loss(result.normal, priors)
+    for weight, layer, target in (
+        (weights.specular, result.specular, priors.specular),
+        (weights.diffuse, result.diffuse, priors.diffuse),
+    ):
+        if weight and layer is not None:
+            total = total + weight * photometric_loss(layer, target, priors.separated, ssim_weight)
+    for weight, loss in (
+        (weights.normal, normal_loss),
+        (weights.azimuth, azimuth_loss),
+        (weights.chromatic, chromatic_loss),
+    ):
+        if weight and result.normal is not None:
+            total = total + weight * loss(result.normal, priors)
     return total

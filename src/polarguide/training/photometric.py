@@ -89,7 +89,7 @@ class _Photometric(torch.autograd.Function):
         return gradient * grad, None, None, None
 
 
-class _Explicit(torch.autograd.Function):
+class _Explicit(_Photometric):
     """The loss with its gradient, computed in the forward pass; for any device."""
 
     @staticmethod
@@ -126,12 +126,6 @@ class _Explicit(torch.autograd.Function):
             stuck = ((prediction < 0) & (gradient > 0)) | ((prediction > 1) & (gradient < 0))
             ctx.save_for_backward(gradient.masked_fill(stuck, 0.0))
         return loss
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None, None]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * grad, None, None, None
 
 
 def photometric_loss_explicit(

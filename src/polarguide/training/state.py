@@ -11,14 +11,14 @@ from torch import Tensor
 from polarguide.capture import Scene
 from polarguide.color import srgb_decode
 from polarguide.gaussians.densify import DensityStatistics
-from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians
+from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians, Trained
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import initial_parameters
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
 
-class Environment:
+class Environment(Trained):
     """The learned light: named parameters with their own Adam state.
 
     Args:
@@ -29,47 +29,20 @@ class Environment:
         KeyError: a parameter without a rate.
     """
 
+    kind = "environment"
+
     def __init__(self, parameters: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
-        self.parameters = {
-            name: t.detach().clone().contiguous().requires_grad_() for name, t in parameters.items()
-        }
-        groups = [{"params": [t], "lr": rates[name]} for name, t in self.parameters.items()]
-        self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        super().__init__(parameters, {name: rates[name] for name in parameters})
 
-    def retune(self, rates: Mapping[str, float], betas: tuple[float, float]) -> None:
-        """Set the learning rate of each parameter, and the decay of all moments."""
-        for name, group in zip(self.parameters, self._optimizer.param_groups, strict=True):
-            group["lr"], group["betas"] = rates[name], betas
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """The parameters by name."""
+        return self._tensors
 
-    def step(self) -> None:
-        """One Adam step on what has a gradient."""
-        if any(t.grad is not None for t in self.parameters.values()):
-            self._optimizer.step()
-            self._optimizer.zero_grad(set_to_none=True)
-
-    def state(self) -> dict[str, Tensor]:
-        """``environment.NAME`` and their moments."""
-        out = {f"environment.{name}": t.detach() for name, t in self.parameters.items()}
-        for name, t in self.parameters.items():
-            for key, value in self._optimizer.state.get(t, {}).items():
-                out[_moments(name) + key] = value.detach()
-        return out
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Tensor], rates: Mapping[str, float]) -> Environment:
-        """The inverse of ``state``; the names are those of ``rates``."""
-        environment = cls({name: state[f"environment.{name}"] for name in rates}, rates)
-        for name, t in environment.parameters.items():
-            keys = {key: _moments(name) + key for key in ("step", "exp_avg", "exp_avg_sq")}
-            moments = {key: state[full].clone() for key, full in keys.items() if full in state}
-            if moments:
-                environment._optimizer.state[t] = moments
-        return environment
-
-
-def _moments(name: str) -> str:
-    """Prefix of a parameter's moments; the texels' had it to themselves in the first checkpoints."""
-    return "environment.adam." if name == "texels" else f"environment.adam.{name}."
+    @staticmethod
+    def _moments(name: str) -> str:
+        """The texels' had the prefix to themselves in the first checkpoints."""
+        return "environment.adam." if name == "texels" else f"environment.adam.{name}."
 
 
 @dataclass

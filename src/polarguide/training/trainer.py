@@ -31,8 +31,6 @@ from polarguide.training.schedule import Schedule
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState, first_state, seeded
 
-__all__ = ["StepReport", "TrainSettings", "Trainer", "first_state"]
-
 
 class _Shown(NamedTuple):
     """A training view's photograph [H, W, 3] as shown, and 1 where it counts [H, W] (None: everywhere)."""
@@ -184,8 +182,9 @@ class Trainer:
         betas = (0.9**views, 0.999**views)
         self.state.gaussians.set_betas(betas)
         if self.state.environment is not None:
-            rates = {name: rate * self._rate for name, rate in self.recipe.light_rates.items()}
-            self.state.environment.retune(rates, betas)
+            self.state.environment.set_betas(betas)
+            for name, rate in self.recipe.light_rates.items():
+                self.state.environment.set_rate(name, rate * self._rate)
 
     def _optimize(self) -> None:
         state = self.state

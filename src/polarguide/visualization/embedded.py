@@ -69,12 +69,8 @@ def embed(scene: str, view: str, tiles: Sequence[Tile], limit: int) -> tuple[Emb
             for t in tiles
         )
         if sum(len(uri) for _, uris, _ in encoded for uri in uris.values()) <= limit:
-            note = (
-                f"{scene}, {view}: pictures reduced from {longest} to {side} pixels."
-                if side < longest
-                else None
-            )
-            return EmbeddedView(scene, view, width, height, encoded), note
+            note = f"{scene}, {view}: pictures reduced from {longest} to {side} pixels."
+            return EmbeddedView(scene, view, width, height, encoded), note if side < longest else None
     return None, f"{scene}, {view}: pictures left out, they would make the file too large."
 
 

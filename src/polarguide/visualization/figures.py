@@ -14,21 +14,7 @@ from polarguide.camera import Camera
 from polarguide.color import shown
 from polarguide.errors import PolarguideError
 from polarguide.files import write_whole
-from polarguide.visualization.sheet import Picture, check_picture, contact_sheet
-
-__all__ = [
-    "COLOR_MAPS",
-    "Picture",
-    "aolp_to_rgb",
-    "contact_sheet",
-    "dolp_to_rgb",
-    "error_to_rgb",
-    "normal_to_rgb",
-    "png_bytes",
-    "radiance_to_rgb",
-    "scalar_to_rgb",
-    "write_png",
-]
+from polarguide.visualization.sheet import Picture, check_picture
 
 COLOR_MAPS = {
     "viridis": cv2.COLORMAP_VIRIDIS,

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
-
-Picture = NDArray[np.uint8]
+from polarguide.visualization.sheet import Picture
 
 
 def layer_picture(
