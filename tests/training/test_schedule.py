@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from typing import Any
 
 import pytest
 
@@ -104,9 +105,24 @@ def test_a_stage_changes_the_rates_that_it_names_while_it_lasts() -> None:
 
 @pytest.mark.parametrize("share", [0.4, 0.6])
 def test_stages_that_do_not_cover_the_steps_are_refused(share: float) -> None:
-    broken = replace(RECIPE, stages=(replace(RECIPE.stages[0], fraction=share), *RECIPE.stages[1:]))
-    with pytest.raises(ValueError, match="not 1"):
-        Schedule(broken, 100)
+    stages = (replace(RECIPE.stages[0], fraction=share), *RECIPE.stages[1:])
+    with pytest.raises(PolarguideError, match="fractions add up to 1"):
+        replace(RECIPE, stages=stages)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"rates": {"sh_dc": 1.0}}, "a rate of the means"),
+        (
+            {"stages": (replace(RECIPE.stages[0], fraction=1.0, rate_factors={"quaternion": 0.2}),)},
+            "rate factors of learned parameters",
+        ),
+    ],
+)
+def test_rates_that_name_nothing_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(PolarguideError, match=message):
+        replace(RECIPE, **fields)
 
 
 @EVERY_RECIPE

@@ -35,9 +35,9 @@ def train(
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
             model in sparse/0.
         out: Run folder to write (configuration, checkpoint, log, PLY).
-        recipe: Which method: polarguide-stokes (renders the measured polarization, too), polarguide (the paper's stages
-            with repaired physics), polarguide-paper, 3dgs, 3dgs-dr, ref-gs (these three ignore polarization), or an
-            ablation of one, such as polarguide:without-normals.
+        recipe: Which method: polarguide-stokes (renders the measured polarization, too), polarguide (PolarGuide-GSDR's
+            stages with repaired physics), polarguide-paper; 3dgs, 3dgs-dr and ref-gs, which ignore polarization; an
+            ablation of one, such as polarguide:without-normals; or a recipe of an installed package.
         resume: Go on with the run in --out.
     """
     with StopSignals() as should_stop:

@@ -103,12 +103,12 @@ ABLATIONS_POLARGUIDE = varied(
     ("without-normals", "Separated layers alone: no term on the normals.", _NORMAL_TERMS_OFF),
     (
         "paper-candidates",
-        "The paper's four candidates in place of the six that physics allows.",
+        "PolarGuide-GSDR's four candidates in place of the six that physics allows.",
         priors(candidates="paper"),
     ),
     (
         "paper-separation",
-        "The paper's separation cue in place of the exact solution.",
+        "PolarGuide-GSDR's separation cue in place of the exact solution.",
         priors(separation="paper"),
     ),
     (

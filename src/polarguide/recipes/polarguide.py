@@ -1,4 +1,4 @@
-"""Our recipes: the paper's three stages on 3DGS-DR's machinery, by the letter and with the physics repaired.
+"""Our recipes: PolarGuide-GSDR's three stages (Shan et al. 2026), by the letter and with the physics repaired.
 
 What they share with ``3dgs-dr`` (rates, first strength, environment, SH schedule) is taken from it, so that a
 difference between the two is a difference of supervision.
@@ -24,7 +24,7 @@ def _stages(
     final_rates: Mapping[str, float] | None = None,
     oriented: bool = False,
 ) -> tuple[Stage, ...]:
-    """The paper's three stages; the guided one first with, then without density control."""
+    """The three stages of PolarGuide-GSDR; the guided one first with, then without density control."""
     enter: tuple[Action, ...] = ("refresh_priors",)
     orient: tuple[Action, ...] = ("orient_normals",) if oriented else ()
     return (
@@ -60,7 +60,7 @@ _SLOW = {"quaternions": 0.2}
 RECIPE_POLARGUIDE: Recipe = replace(
     RECIPE_3DGS_DR,
     name="polarguide",
-    about="The paper's three stages with repaired physics: physical candidates, azimuth, exact separation.",
+    about="PolarGuide-GSDR's three stages with repaired physics: physical candidates, azimuth, exact separation.",
     stages=_stages(
         replace(_GUIDED, specular=0.5, diffuse=0.2),
         _FINAL,
@@ -89,7 +89,7 @@ RECIPE_POLARGUIDE_STOKES: Recipe = replace(
 RECIPE_POLARGUIDE_PAPER: Recipe = replace(
     RECIPE_POLARGUIDE,
     name="polarguide-paper",
-    about="The paper to the letter: its four candidates and its separation cue; kept for comparison.",
+    about="PolarGuide-GSDR to the letter: its four candidates and its separation cue; kept for comparison.",
     stages=_stages(Weights(specular=0.5, diffuse=0.2, normal=0.2), Weights(normal=0.2)),
     priors=Priors(candidates="paper", separation="paper", azimuth_weight=0.0),
 )

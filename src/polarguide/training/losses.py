@@ -51,7 +51,7 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
 
 
 def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Mean of 1 - cos(normal, target) over the weighted pixels (the paper's normal term).
+    """Mean of 1 - cos(normal, target) over the weighted pixels (the normal term of Shan et al. 2026).
 
     Args:
         normal: [H, W, 3] blended normals, world axes, any length.

@@ -1,7 +1,7 @@
 """Polarization priors of a view, from its Stokes vectors and the normals of frozen Gaussians.
 
-This is the coupling of the paper: the Gaussians' normals resolve the ambiguity of the polarization normals and the
-separation, and what comes out supervises the Gaussians until the next refresh.
+This is the coupling of PolarGuide-GSDR (Shan et al. 2026): the Gaussians' normals resolve the ambiguity of the
+polarization normals and the separation, and what comes out supervises the Gaussians until the next refresh.
 """
 
 from __future__ import annotations

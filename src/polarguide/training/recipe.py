@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from polarguide.errors import PolarguideError
 from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization
@@ -70,6 +71,11 @@ class Weights:
     def normals(self) -> bool:
         """Whether a term reads the rendered normals."""
         return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.consistency))
+
+    @property
+    def depth(self) -> bool:
+        """Whether a term looks at the rendered depth."""
+        return self.consistency > 0
 
 
 @dataclass(frozen=True)
@@ -152,6 +158,9 @@ class Recipe:
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
+
+    Raises:
+        PolarguideError: stages that do not add up, or rates that are missing or name nothing that is learned.
     """
 
     name: str
@@ -167,6 +176,22 @@ class Recipe:
     initialization: Initialization = field(default_factory=Initialization)
     priors: Priors = field(default_factory=Priors)
     propagation: Propagation = field(default_factory=Propagation)
+
+    def __post_init__(self) -> None:
+        share = sum(stage.fraction for stage in self.stages)
+        named = {name for stage in self.stages for name in stage.rate_factors}
+        where, remedy = f"recipe {self.name}", "Correct the recipe."
+        for wrong, expected, found in (
+            (abs(share - 1) > 1e-6, "stages whose fractions add up to 1", f"{share:g}"),
+            ("means" not in self.rates, "a rate of the means", f"{[*self.rates]}"),
+            (
+                not named <= self.learning_rates.keys(),
+                "rate factors of learned parameters",
+                f"{sorted(named)}",
+            ),
+        ):
+            if wrong:
+                raise PolarguideError(where, expected=expected, found=found, remedy=remedy)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:

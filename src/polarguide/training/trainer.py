@@ -138,7 +138,7 @@ class Trainer:
             shading=shading,
             light=state.light,
             normals=stage.weights.normals,
-            depth=stage.weights.consistency > 0,
+            depth=stage.weights.depth,
             statistic=statistic,
         )
         shown = self._shown_photograph(view)
