@@ -160,13 +160,13 @@ def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSp
         synthesize(spec, tmp_path / "new", SynthSettings(samples=0), Reporter())
 
 
-@COMPILED
 def polarguide(*arguments: str) -> str:
     """What a command line prints."""
     command = [sys.executable, "-m", "polarguide", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
+@COMPILED
 @pytest.mark.parametrize("sensor", ["imx250mzr", "imx250myr"])
 def test_mosaics_come_back_through_prepare(sensor: str, variant: Variant, tmp_path: Path) -> None:
     """As a user goes: by the command that ``synth`` prints at its end; compared with the truth of the same paths."""
