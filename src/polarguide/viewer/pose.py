@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from polarguide.camera import quaternion
 from polarguide.capture import View
 from polarguide.scene_frame import SceneFrame
 from polarguide.viewer.viewport import window_fov
@@ -55,4 +56,5 @@ def move_to_view(client: Any, view: View, scene_frame: SceneFrame, now: float) -
         camera.up_direction = (-target.rotation[1]).numpy()
         camera.position = center.numpy()
         camera.look_at = (center + distance * ahead).numpy()
-    return ViewPose(view, np.array(camera.wxyz), np.array(camera.position), now)
+    # Not what viser has stored by now: a message of the browser may have replaced it.
+    return ViewPose(view, np.array(quaternion(target.rotation.T)), center.numpy(), now)
