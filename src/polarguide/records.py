@@ -55,6 +55,9 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         value = json.loads(data) if isinstance(data, bytes) else data
         record = msgspec.convert(value, kind)
         _require_finite(msgspec.to_builtins(record, enc_hook=str), where, remedy)
+    except PolarguideError as error:  # of a type's own check
+        place = f"{where} ({error.where})"
+        raise PolarguideError(place, expected=error.expected, found=error.found, remedy=remedy) from None
     except msgspec.ValidationError as error:
         field, expected, found = _fault(str(error), value, kind)
         raise PolarguideError(

@@ -19,7 +19,8 @@ from browsers import PATIENCE, chromium
 from random_runs import KINDS, random_state, ring
 
 from polarguide.camera import Camera
-from polarguide.export.share import share_page, write_page
+from polarguide.export.share import share_page
+from polarguide.files import write_text
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.gbuffer import render
 from polarguide.visualization.layers import layer_picture
@@ -88,7 +89,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 def written(recipe: str, folder: Path) -> Path:
     state, shading = random_state(recipe)
     path = folder / f"{recipe}.html"
-    write_page(
+    write_text(
         path,
         share_page(
             state.gaussians, state.light, shading, ring(), first="v0", title="<b>title</b>", caption="&"

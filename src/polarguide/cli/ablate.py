@@ -6,6 +6,7 @@ from pathlib import Path
 
 import polarguide
 from polarguide.cli.compare import Options, Scenes, Settings, print_results
+from polarguide.cli.console import use_threads
 from polarguide.cli.job_progress import JobReporter
 from polarguide.system import signals_as_interrupts
 
@@ -32,6 +33,7 @@ def ablate(
         only: Names of the ablations to take, such as without-normals; all if none is given.
         reference: Recipes to add as first rows, such as 3dgs-dr.
     """
+    use_threads(options.threads)
     with signals_as_interrupts():
         results = polarguide.ablate(
             scenes,

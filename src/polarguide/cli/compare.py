@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import console
+from polarguide.cli.console import console, use_threads
 from polarguide.cli.job_progress import JobReporter
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
@@ -25,9 +25,8 @@ def compared_settings(
     return TrainSettings(steps=steps, refractive_index=refractive_index)
 
 
-compared_settings.__doc__ = (
-    TrainSettings.__doc__
-)  # of these options; the seeds are counted, the others are fixed
+# Of these options; the seeds are counted, the others are fixed.
+compared_settings.__doc__ = TrainSettings.__doc__
 Scenes = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE ...")]
 Settings = Annotated[TrainSettings, tyro.conf.arg(name="", constructor=compared_settings)]
 Options = Annotated[CompareOptions, tyro.conf.arg(name="")]
@@ -52,6 +51,7 @@ def compare(
         recipes: The recipes to compare, by name: 3dgs, 3dgs-dr, polarguide, polarguide:without-normals, ...
         out: Folder to write.
     """
+    use_threads(options.threads)
     with signals_as_interrupts():
         results = polarguide.compare(
             scenes, recipes, out, settings=settings, options=options, reporter=JobReporter()

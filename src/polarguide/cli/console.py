@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -37,3 +38,10 @@ def warnings_printed() -> Iterator[None]:
 
         warnings.showwarning = show
         yield
+
+
+def use_threads(threads: int) -> None:
+    """Let our kernels, torch and OpenCV use this many threads; 0 leaves their defaults."""
+    if threads:
+        importlib.import_module("polarguide.raster").use_threads(threads)
+        importlib.import_module("cv2").setNumThreads(threads)

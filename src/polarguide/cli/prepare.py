@@ -9,9 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import console
+from polarguide.cli.console import console, use_threads
 from polarguide.cli.progress import ConsoleReporter
-from polarguide.cli.threads import use_threads
 from polarguide.options import ThreadOptions
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 

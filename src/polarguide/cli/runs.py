@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 import polarguide
+from polarguide.cli.console import use_threads
 from polarguide.cli.progress import ConsoleReporter
-from polarguide.cli.threads import use_threads
 from polarguide.options import ComputeOptions, ThreadOptions
 
 if TYPE_CHECKING:

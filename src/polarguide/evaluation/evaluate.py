@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -13,12 +16,14 @@ from polarguide.capture import View
 from polarguide.evaluation.record import METRICS_FILE, write_metrics
 from polarguide.evaluation.scores import score_view
 from polarguide.evaluation.sources import commit, scoring_digest
-from polarguide.evaluation.speed import frames_per_second
 from polarguide.evaluation.target import ViewTarget
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.folder import RunLog
 from polarguide.runs.opened import OpenedRun
 from polarguide.system import peak_memory_mib
+from polarguide.training.stopwatch import Stopwatch
+
+MINIMUM_SECONDS = 1.5
 
 
 def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT) -> dict[str, Any]:
@@ -91,3 +96,27 @@ def _provenance(run: OpenedRun) -> dict[str, Any]:
         "scene": run.scene.name,
         "refractive_index": configuration.settings.refractive_index,
     }
+
+
+def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> float | None:
+    """Median over views of 1 / seconds for ``draw``, after one warm-up of each; nothing is waited for but the call.
+
+    Args:
+        draw: renders one view and returns when it is done.
+        views: what to render; each is timed at least three times.
+
+    Returns:
+        Frames a second, or None where other work ran on the machine meanwhile.
+    """
+    for view in views:
+        draw(view)
+    stopwatch = Stopwatch()
+    times: dict[int, list[float]] = {index: [] for index in range(len(views))}
+    begin = time.perf_counter()
+    while len(times[0]) < 3 or time.perf_counter() - begin < MINIMUM_SECONDS:
+        for index, view in enumerate(views):
+            start = time.perf_counter()
+            draw(view)
+            times[index].append(time.perf_counter() - start)
+    _, alone = stopwatch.read()
+    return 1 / statistics.median(statistics.median(t) for t in times.values()) if alone else None

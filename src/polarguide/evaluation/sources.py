@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import inspect
 import subprocess
 from collections.abc import Iterator
 from functools import lru_cache
@@ -36,6 +37,12 @@ def training_digest(package: Path = PACKAGE) -> str:
 def scoring_digest(package: Path = PACKAGE) -> str:
     """The same for the code that renders and scores."""
     return digest_of(package, imported_files(package, TRAINED_BY + SCORED_BY))
+
+
+def model_digest(kind: type) -> str:
+    """Digest of the file that defines a plug-in's shading model; empty for models of this package."""
+    file = Path(inspect.getfile(kind))
+    return "" if PACKAGE in file.parents else digest_of(file.parent, (file.name,))
 
 
 def commit(package: Path = PACKAGE) -> str | None:

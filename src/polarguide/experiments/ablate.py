@@ -10,7 +10,7 @@ from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.results import Results
 from polarguide.options import PathLike, check_choice
 from polarguide.progress import SILENT, Reporter
-from polarguide.recipes import ABLATIONS
+from polarguide.recipes.registry import ABLATIONS, ablations_of
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
@@ -51,11 +51,12 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
     Raises:
         PolarguideError: a recipe without ablations, or an ablation that it does not have.
     """
-    if base not in ABLATIONS:
+    variations = ablations_of(base)
+    if not variations:
         expected = "a recipe with ablations: " + ", ".join(ABLATIONS)
         remedy = "Take one of these, or use compare."
         raise PolarguideError("base", expected=expected, found=base, remedy=remedy)
-    names = [recipe.name for recipe in ABLATIONS[base]]
+    names = [recipe.name for recipe in variations]
     wanted = [name if name.startswith(f"{base}:") else f"{base}:{name}" for name in only]
     for name in only:
         check_choice("only", name.removeprefix(f"{base}:"), [n.partition(":")[2] for n in names])

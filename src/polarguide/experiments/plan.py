@@ -17,7 +17,7 @@ from typing import Any, Literal
 from polarguide import __version__
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import read_metrics
-from polarguide.evaluation.sources import scoring_digest, training_digest
+from polarguide.evaluation.sources import model_digest, scoring_digest, training_digest
 from polarguide.experiments.options import CompareOptions
 from polarguide.options import SceneOptions
 from polarguide.progress import SILENT, Reporter
@@ -161,7 +161,7 @@ def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[Plan
 def _planned(comparison: Comparison, scene: SceneEntry, recipe: Recipe, seed: int) -> PlannedRun:
     settings, options = replace(comparison.settings, seed=seed), comparison.options
     reading = SceneOptions(options.downscale, options.transfer)
-    code = f"{__version__} {training_digest()}"
+    code = f"{__version__} {training_digest()}{model_digest(type(recipe.shading))}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     folder = comparison.out / RUNS / scene.name / recipe.name.replace(":", "__") / f"{seed}-{key}"
     return PlannedRun(scene, recipe, settings, reading, folder)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from importlib import resources
 from string import Template
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +21,15 @@ from polarguide.files import write_text
 from polarguide.progress import Reporter
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import LAYERS, EmbeddedView, Tile, chosen_views, embed
+from polarguide.visualization.embedded import (
+    LAYERS,
+    EmbeddedView,
+    Tile,
+    chosen_views,
+    embed,
+    page_part,
+    script_json,
+)
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
 
 REPORT = "report.html"
@@ -158,27 +164,23 @@ def report_html(
         HTML; all names and texts in it are escaped, and it asks for nothing from outside.
     """
     scenes = ", ".join(scene["name"] for scene in results["scenes"])
-    return Template(_page("report.html")).substitute(
+    return Template(page_part(__package__, "report.html")).substitute(
         title=html.escape(f"Comparison on {scenes}"),
-        style=_page("report.css"),
-        script=_page("report.js"),
+        style=page_part(__package__, "report.css"),
+        script=page_part(__package__, "report.js"),
         summary=html.escape(_summary(results)),
         tables=_tables(results),
         notes=_list(notes(results)),
         pictures_hidden="" if views else "hidden",
         remarks=_list(remarks),
         gradient=figures.color_gradient("inferno"),
-        legend=_script_data(LEGEND),
-        data=_script_data([vars(view) for view in views]),
-        layers=_script_data(LAYERS),
+        legend=script_json(LEGEND),
+        data=script_json([vars(view) for view in views]),
+        layers=script_json(LAYERS),
         curves=_curves(results, curves),
         recipes=_recipes(results),
         provenance=_provenance(results),
     )
-
-
-def _page(name: str) -> str:
-    return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")
 
 
 def _summary(results: Results) -> str:
@@ -195,11 +197,6 @@ def _summary(results: Results) -> str:
             f"{settings['steps']:,} steps a run",
         )
     )
-
-
-def _script_data(data: Any) -> str:
-    """JSON that cannot end the script element that holds it."""
-    return json.dumps(data).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _list(texts: Sequence[str]) -> str:

@@ -21,8 +21,7 @@ from polarguide.training.settings import TrainSettings
 
 PACKAGE = Path(__file__).parents[1]
 PROLOGUE = (
-    "import os, sys; "  # already loaded, from wherever Python itself is
-    "sys.path[:] = [path for path in sys.path if path not in ('', os.getcwd())]; "
+    "import sys; sys.path[:] = [path for path in sys.path if path]; "  # what is empty is the current folder
     "sys.path[:0] = [path for path in sys.argv[1:] if path not in sys.path]; "
     "from polarguide.experiments.worker import main; sys.exit(main())"
 )

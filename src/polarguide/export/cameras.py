@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.files import atomic
+from polarguide.files import write_text
 
 # nerfstudio's cameras look along -z with y up: OpenGL's axes, not OpenCV's.
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
@@ -63,5 +63,4 @@ def transforms(cameras: Mapping[str, Camera], suffix: str = ".png") -> dict[str,
 
 def write_transforms(path: Path, cameras: Mapping[str, Camera]) -> None:
     """Write ``transforms.json``."""
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(transforms(cameras), indent=1) + "\n")
+    write_text(path, json.dumps(transforms(cameras), indent=1) + "\n")

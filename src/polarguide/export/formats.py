@@ -12,10 +12,10 @@ from polarguide.evaluation.table import shown_metrics
 from polarguide.export.cameras import write_colmap, write_transforms
 from polarguide.export.mesh import scene_mesh, write_mesh
 from polarguide.export.points import surface_points, write_points
-from polarguide.export.share import share_page, write_page
+from polarguide.export.share import share_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
-from polarguide.files import make_folder
+from polarguide.files import make_folder, write_text
 from polarguide.options import ExportFormat, PathLike, check_choice, check_range
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.relight import needs_radiance, panorama, write_exr
@@ -109,7 +109,7 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         ],
     )
     make_folder(path.parent)
-    write_page(path, page)
+    write_text(path, page)
     return path
 
 

@@ -15,7 +15,7 @@ from polarguide.camera import Camera
 from polarguide.color import srgb_encode
 from polarguide.errors import optional_import
 from polarguide.export.fusion import TRUNCATION, Box, Surface, box_around, fuse, seen_points, surface_of
-from polarguide.files import atomic
+from polarguide.files import write_whole
 from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.result import RenderResult
 from polarguide.shading.visibility import seen_at
@@ -123,5 +123,4 @@ def write_mesh(path: Path, mesh: ColoredMesh, around: SceneFrame) -> None:
         data = scene.export(file_type="glb", include_normals=True)
     else:
         data = made.export(file_type="ply", vertex_normal=True)
-    with atomic(path) as temporary:
-        temporary.write_bytes(data)
+    write_whole(path, data)

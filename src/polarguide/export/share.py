@@ -6,25 +6,26 @@ import base64
 import gzip
 import hashlib
 import html
-import json
 from collections.abc import Mapping, Sequence
-from importlib import resources
-from pathlib import Path
 from string import Template
 from typing import Any
 
+import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import pad
 
 from polarguide import __version__
 from polarguide.camera import Camera
-from polarguide.export.page_light import light_numbers, network_numbers, viridis
 from polarguide.export.records import TEXEL, planes, records
-from polarguide.files import atomic
 from polarguide.gaussians.ply import refit_sh_to_display
 from polarguide.runs.point_cloud import gaussian_colors
 from polarguide.scene_frame import scene_frame
+from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
+from polarguide.visualization.embedded import page_part, script_json
 
 SCRIPTS = ("algebra.js", "sorter.js", "renderer.js", "navigation.js", "controls.js", "unpack.js", "main.js")
 SHADERS = {
@@ -88,10 +89,8 @@ def share_page(
         "network": network_numbers(page.network) if page.network else None,
         "viridis": viridis(),
     }
-    script = "\n".join(
-        f'"use strict";\n{_page(name)}' if not i else _page(name) for i, name in enumerate(SCRIPTS)
-    )
-    return Template(_page("page.html")).substitute(
+    script = '"use strict";\n' + "\n".join(page_part(__package__, name) for name in SCRIPTS)
+    return Template(page_part(__package__, "page.html")).substitute(
         policy=_policy(script),
         version=html.escape(__version__),
         title=html.escape(title),
@@ -100,10 +99,10 @@ def share_page(
         metrics="".join(
             f"<tr><th>{html.escape(label)}</th><td>{html.escape(value)}</td></tr>" for label, value in metrics
         ),
-        style=_page("page.css"),
+        style=page_part(__package__, "page.css"),
         script=script,
-        scene=_data(scene),
-        shaders=_data({name: _page(file) for name, file in SHADERS.items()}),
+        scene=script_json(scene),
+        shaders=script_json({name: page_part(__package__, file) for name, file in SHADERS.items()}),
         records=_packed(planes(quantized)),
         **{name: "" if values is None else _packed(values.tobytes()) for name, values in arrays.items()},
     )
@@ -116,12 +115,6 @@ def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> Pa
         lambda directions: gaussian_colors(gaussians, light, shading, directions).cpu(), count
     )
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
-
-
-def write_page(path: Path, page: str) -> None:
-    """Write a page in one step."""
-    with atomic(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
 
 
 def _frame(cameras: Mapping[str, Camera], first: str) -> dict[str, Any]:
@@ -151,15 +144,28 @@ def _policy(script: str) -> str:
     )
 
 
-def _page(name: str) -> str:
-    return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")
-
-
-def _data(data: Any) -> str:
-    """JSON that cannot end the script element that holds it."""
-    text = json.dumps(data, allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
 def _packed(raw: bytes) -> str:
     return base64.b64encode(gzip.compress(raw, 9, mtime=0)).decode()
+
+
+@torch.no_grad()
+def light_numbers(levels: Sequence[Tensor]) -> NDArray[np.float16]:
+    """Cubemaps [6, R, R, C] with their rings, one after the other, channels filled up to a multiple of four."""
+    numbers = []
+    for texture in levels:
+        texels = ringed_texels(texture.detach().clamp(-6e4, 6e4))
+        numbers.append(pad(texels, (0, -texels.shape[-1] % 4)).flatten())
+    return torch.cat(numbers).numpy().astype("<f2")
+
+
+@torch.no_grad()
+def network_numbers(matrices: Sequence[Tensor]) -> NDArray[np.float32]:
+    """Matrices [rows, columns] one after the other, columns filled up to a multiple of four."""
+    padded = [pad(matrix.detach(), (0, -matrix.shape[1] % 4)).flatten() for matrix in matrices]
+    return torch.cat(padded).numpy().astype("<f4")
+
+
+def viridis() -> NDArray[np.uint8]:
+    """The color map of scalar layers, [256, 3] RGB."""
+    colors = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_VIRIDIS)
+    return np.ascontiguousarray(colors[0, :, ::-1], dtype=np.uint8)

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from polarguide.errors import PolarguideError, optional_import
-from polarguide.files import atomic
+from polarguide.files import write_whole
 from polarguide.gaussians.ply import read_ply, write_ply
 
 # Signs of the harmonics of degree 1 to 3, in the order of a PLY, after half a turn about x: y and z change theirs.
@@ -35,8 +35,7 @@ def write_spz(path: Path, ply: Path) -> None:
             found=str(converted["error"]),
             remedy="Export them as ply.",
         )
-    with atomic(path) as temporary:
-        temporary.write_bytes(bytes(converted["data"]))
+    write_whole(path, bytes(converted["data"]))
 
 
 def _half_turned(ply: Path) -> Path:

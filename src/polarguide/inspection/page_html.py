@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import math
-from importlib import resources
 from string import Template
 
 import torch
@@ -16,6 +15,7 @@ from polarguide.inspection.measurements import ViewMeasurements
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.progress import SILENT, Reporter
 from polarguide.visualization import figures
+from polarguide.visualization.embedded import page_part
 
 FILE = "inspection.html"
 _CLASSES: dict[Verdict, str] = {"ok": "ok", "warning": "warning", "wrong": "wrong", "n/a": "na"}
@@ -37,9 +37,9 @@ def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
             advance(len(tiles))
     posed = f"{len(capture.posed)} with a pose" if capture.model is not None else "no poses"
     width, height = capture.size
-    return Template(_part("inspection.html")).substitute(
+    return Template(page_part(__package__, "inspection.html")).substitute(
         title=html.escape(f"Inspection of {capture.name}"),
-        style=Template(_part("inspection.css")).substitute(switching=_switching()),
+        style=Template(page_part(__package__, "inspection.css")).substitute(switching=_switching()),
         summary=html.escape(f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}"),
         overall=found.verdict,
         overall_class=_CLASSES[found.verdict],
@@ -55,10 +55,6 @@ def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
         figures=_figures(found.measurements),
         facts=_facts(found),
     )  # fmt: skip
-
-
-def _part(name: str) -> str:
-    return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")
 
 
 def _switching() -> str:

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import torch
 
+from polarguide import __version__
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic
+from polarguide.files import write_text
 from polarguide.inspection.surfaces import Surface
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
@@ -66,21 +67,26 @@ def short_run(
         on_step: called after every step.
     """
     recipe = recipe_named(RECIPE)
-    wanted = {"photographs": photograph_digest(scene), "steps": steps, "recipe": RECIPE}
+    wanted = {
+        "photographs": photograph_digest(scene),
+        "steps": steps,
+        "recipe": RECIPE,
+        "version": __version__,
+    }
     state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
     trainer = Trainer(scene, recipe, TrainSettings(steps, 0), backend, state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)
-        with atomic(folder / KEY) as path:
-            path.write_text(json.dumps(wanted))
+        write_text(folder / KEY, json.dumps(wanted))
     try:
         while trainer.state.step < steps:
             on_step(trainer.step())
             if trainer.state.step % SAVE_EVERY == 0 or trainer.state.step == steps:
                 save_checkpoint(folder, trainer.state)
     except KeyboardInterrupt:
-        save_checkpoint(folder, trainer.state)
+        if trainer.whole:
+            save_checkpoint(folder, trainer.state)
         raise
     return trainer.state
 

@@ -50,6 +50,11 @@ class GaussianModel:
         """Names of the layers that it renders, in the order of ``LAYERS``."""
         return tuple(name for name in LAYERS if name in self.shading.layers)
 
+    @property
+    def steps(self) -> int:
+        """How many steps it has been trained for."""
+        return self.state.step
+
     def __len__(self) -> int:
         """How many Gaussians it has."""
         return len(self.state.gaussians)
@@ -104,7 +109,7 @@ class OpenedRun:
         cls: type[Opened],
         folder: PathLike,
         *,
-        recipe: Recipe | None = None,
+        recipe: Recipe | str | None = None,
         scene: Scene | PathLike | None = None,
         device: DeviceName = "auto",
         reporter: Reporter = SILENT,
@@ -113,7 +118,7 @@ class OpenedRun:
 
         Args:
             folder: what a training wrote.
-            recipe: the recipe it was trained with, where that is not one of ours.
+            recipe: the recipe it was trained with, or its name, where that is not one of ours.
             scene: the scene or its folder, where that has moved since; read when it is first asked for.
             device: what to compute on.
             reporter: told what takes long.
@@ -123,7 +128,11 @@ class OpenedRun:
         """
         folder = Path(folder)
         configuration = RunConfiguration.load(folder)
-        recipe = recipe or recipe_named(configuration.recipe)
+        if not isinstance(recipe, Recipe):
+            recipe = recipe_named(recipe or configuration.recipe)
+        if recipe.name != configuration.recipe:
+            expected, remedy = f"{configuration.recipe}, which {folder} was trained with", "Give that recipe."
+            raise PolarguideError("recipe", expected=expected, found=recipe.name, remedy=remedy)
         backend = choose_backend(device, say=reporter.say)
         state = load_checkpoint(folder, recipe, backend.device)
         if recipe.data() != configuration.recipe_data:
@@ -143,7 +152,7 @@ class OpenedRun:
     @property
     def steps(self) -> int:
         """How many steps it has been trained for."""
-        return self.model.state.step
+        return self.model.steps
 
     @property
     def gaussians(self) -> dict[str, Tensor]:
@@ -161,13 +170,18 @@ class OpenedRun:
         """The scene it was trained on, read when it is first asked for. Warns if it has changed since.
 
         Raises:
-            PolarguideError: it is not there any more, or cannot be read.
+            PolarguideError: it is not there any more, cannot be read, or was read otherwise than for the training.
         """
-        configuration = self.configuration
-        found = self._scene_source
+        configuration, found = self.configuration, self._scene_source
+        options = SceneOptions(configuration.downscale, configuration.transfer)
         if not isinstance(found, Scene):
-            options = SceneOptions(configuration.downscale, configuration.transfer)
             found = read_scene(configuration.scene if found is None else found, options, self._reporter)
+        if (found.downscale, found.transfer) != (options.downscale, options.transfer):
+            expected = (
+                f"downscale {options.downscale}, transfer {options.transfer}, as {self.folder} was trained"
+            )
+            given = f"downscale {found.downscale}, transfer {found.transfer}"
+            raise PolarguideError("scene", expected=expected, found=given, remedy="Load it like that.")
         if found.digest != configuration.scene_digest:
             _warn(f"{found.root} has changed since {self.folder} was trained on it.")
         return found

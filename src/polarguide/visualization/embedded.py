@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
+from typing import Any
 
 import cv2
 
@@ -97,3 +100,14 @@ def chosen_views(names: Sequence[str], count: int) -> list[str]:
     if count >= len(names):
         return list(names)
     return [names[index * len(names) // count] for index in range(count)]
+
+
+def page_part(package: str | None, name: str) -> str:
+    """A file of the page that a package brings in its folder ``page``."""
+    return (resources.files(package or "") / "page" / name).read_text(encoding="utf-8")
+
+
+def script_json(data: Any) -> str:
+    """JSON that cannot end the script element that holds it."""
+    text = json.dumps(data, allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

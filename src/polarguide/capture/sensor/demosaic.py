@@ -20,7 +20,6 @@ from polarguide.capture.view import ANGLES
 
 DEMOSAIC_MODES = {"half": 2, "quarter": 4, "full": 1}
 """Modes, and the sensor pixels that become one picture pixel, each way."""
-INTERPOLATIONS = ("bilinear", "guided")
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -58,7 +57,7 @@ def demosaic(
         bad: unusable samples, [H, W].
         pattern: of the top-left pixel, which starts a whole polarizer cell.
         mode: a key of ``DEMOSAIC_MODES``.
-        interpolation: one of ``INTERPOLATIONS``; ``quarter`` and a monochrome ``half`` interpolate no colors.
+        interpolation: ``bilinear`` or ``guided``; ``quarter`` and a monochrome ``half`` interpolate no colors.
         registered: whether ``half`` brings the four angles to one place.
 
     Returns:

@@ -1,0 +1,44 @@
+"""A plug-in's recipe through the public interface: trained, opened, scored, exported and ablated by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from plugins import install
+from toy_shading import TOY, SkyShading
+
+import polarguide
+from polarguide.errors import PolarguideError
+from polarguide.evaluation.sources import model_digest
+from polarguide.experiments.ablate import ablated
+from polarguide.shading.deferred import DeferredShading
+
+
+def test_a_recipe_object_goes_all_the_way(tmp_path: Path, demo_scene: Path) -> None:
+    scene = polarguide.load_scene(demo_scene, downscale=8)
+    settings = polarguide.TrainSettings(steps=4)
+    polarguide.train(scene, tmp_path / "run", recipe=TOY, settings=settings)
+    run = polarguide.open_run(tmp_path / "run", recipe=TOY, scene=scene)
+    assert run.evaluate()["psnr"] > 5
+    assert run.export("ply", tmp_path)[0].stat().st_size > 1000
+    with pytest.raises(PolarguideError, match="one of"):
+        polarguide.open_run(tmp_path / "run")
+    with pytest.raises(PolarguideError, match="expected toy, which"):
+        polarguide.open_run(tmp_path / "run", recipe="3dgs")
+
+
+def test_a_scene_of_another_size_is_refused(trained: Path, demo_scene: Path) -> None:
+    other = polarguide.load_scene(demo_scene, downscale=8)
+    with pytest.raises(PolarguideError, match=r"expected downscale 4, transfer linear.*found downscale 8"):
+        polarguide.open_run(trained, scene=other).evaluate()
+
+
+def test_the_code_of_a_plugins_model_counts() -> None:
+    assert model_digest(DeferredShading) == ""
+    assert len(model_digest(SkyShading)) == 16
+
+
+def test_ablations_of_a_plugin_are_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    install(monkeypatch, tmp_path / "site", toy="toy_shading:recipes")
+    assert ablated("toy") == ("toy", "toy:dull")
