@@ -54,7 +54,6 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
     try:
         value = json.loads(data) if isinstance(data, bytes) else data
         record = msgspec.convert(value, kind)
-        _require_finite(msgspec.to_builtins(record, enc_hook=str), where, remedy)
     except PolarguideError as error:  # of a type's own check
         place = f"{where} ({error.where})"
         raise PolarguideError(place, expected=error.expected, found=error.found, remedy=remedy) from None
@@ -67,6 +66,7 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         raise PolarguideError(
             where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
         ) from None
+    _require_finite(msgspec.to_builtins(record, enc_hook=str), where, remedy)
     return record
 
 
