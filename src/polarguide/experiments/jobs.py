@@ -110,7 +110,8 @@ class Child:
 
     def wait(self) -> None:
         """Until it has stopped."""
-        self._process.wait()
+        # With a time limit it polls: a second Ctrl-C that the system hands to another thread is noticed, too.
+        self._process.wait(timeout=1e9)
 
     def kill(self) -> None:
         """Stop it at once; its last checkpoint stays."""
