@@ -18,6 +18,8 @@ using namespace polarguide;
 
 namespace {
 
+constexpr int largest_side = 1 << 16;
+
 GaussianInputs inputs(const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
                       const Array &features) {
     int64_t n = int64_t(means.ndim() ? means.shape(0) : 0);
@@ -33,9 +35,29 @@ GaussianInputs inputs(const Array &means, const Array &quaternions, const Array 
     return {n, d, means.data(), quaternions.data(), scales.data(), opacities.data(), features.data()};
 }
 
+// Every channel once; the rasterizer takes these at their word.
+void expect_permutation(const std::vector<int32_t> &permutation, int statistic_channels) {
+    const size_t count = permutation.size();
+    if (count < 1 || count > size_t(max_channels))
+        throw std::invalid_argument("permutation: expected 1 to " + std::to_string(max_channels) + " channels, found " +
+                                    std::to_string(count));
+    std::vector<bool> seen(count, false);
+    for (int32_t channel : permutation) {
+        if (channel < 0 || size_t(channel) >= count || seen[size_t(channel)])
+            throw std::invalid_argument("permutation: expected every channel once, found " + std::to_string(channel));
+        seen[size_t(channel)] = true;
+    }
+    if (statistic_channels < 0 || size_t(statistic_channels) > count)
+        throw std::invalid_argument("statistic_channels: expected 0 to " + std::to_string(count) + ", found " +
+                                    std::to_string(statistic_channels));
+}
+
+constexpr int64_t nothing_drawn = -1;
+
 struct Wrapped {
     Rasterizer rasterizer;
     int width, height, channels;
+    int64_t drawn; // Gaussians of the last forward pass
 };
 
 } // namespace
@@ -50,41 +72,54 @@ void bind_raster(nb::module_ &module) {
                 if (rotation.size() != 9 || translation.size() != 3 || intrinsics.size() != 4)
                     throw std::invalid_argument("camera: expected 9 + 3 + 4 numbers");
                 if (width < 1 || height < 1) throw std::invalid_argument("camera: expected a picture of at least one pixel");
+                if (width > largest_side || height > largest_side)
+                    throw std::invalid_argument("camera: expected at most " + std::to_string(largest_side) + " pixels each way");
+                expect_permutation(permutation, statistic_channels);
                 PinholeCamera c{};
                 for (size_t i = 0; i < 9; ++i) c.rotation[i] = rotation[i];
                 for (size_t i = 0; i < 3; ++i) c.translation[i] = translation[i];
                 c.fx = intrinsics[0], c.fy = intrinsics[1], c.cx = intrinsics[2], c.cy = intrinsics[3];
                 c.width = width, c.height = height, c.near_plane = near_plane;
-                new (self) Wrapped{Rasterizer(c, permutation, statistic_channels), width, height, int(permutation.size())};
+                new (self) Wrapped{Rasterizer(c, permutation, statistic_channels), width, height, int(permutation.size()), nothing_drawn};
             },
             nb::arg("rotation"), nb::arg("translation"), nb::arg("intrinsics"), nb::arg("width"), nb::arg("height"),
             nb::arg("near_plane"), nb::arg("permutation"), nb::arg("statistic_channels"))
         .def(
             "forward",
             [](Wrapped &self, const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
-               const Array &features, Array out, Array alpha, Array radius, bool count_pairs) {
+               const Array &features, Array out, Array alpha, Array radius, bool count_pairs, bool for_backward) {
                 GaussianInputs in = inputs(means, quaternions, scales, opacities, features);
                 expect_shape(features, "features", {in.count, self.channels});
                 expect_shape(out, "out", {self.height, self.width, self.channels});
                 expect_shape(alpha, "alpha", {self.height, self.width});
                 expect_shape(radius, "radius", {in.count});
+                self.drawn = nothing_drawn; // until it is whole
                 nb::gil_scoped_release release;
-                self.rasterizer.forward(in, out.data(), alpha.data(), radius.data(), count_pairs);
+                self.rasterizer.forward(in, out.data(), alpha.data(), radius.data(), count_pairs, for_backward);
+                self.drawn = in.count;
             },
             nb::arg("means"), nb::arg("quaternions"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
-            nb::arg("out"), nb::arg("alpha"), nb::arg("radius"), nb::arg("count_pairs") = false)
+            nb::arg("out"), nb::arg("alpha"), nb::arg("radius"), nb::arg("count_pairs") = false,
+            nb::arg("for_backward") = true)
         .def(
             "backward",
             [](Wrapped &self, const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
                const Array &features, const Array &out, const Array &grad_out, const Array &grad_alpha, Array d_means,
                Array d_quaternions, Array d_scales, Array d_opacities, Array d_features,
                std::optional<Array> statistic) {
+                if (!self.rasterizer.kept()) throw std::invalid_argument("backward: no forward pass was kept for it");
                 GaussianInputs in = inputs(means, quaternions, scales, opacities, features);
+                if (self.drawn == nothing_drawn) throw std::invalid_argument("backward: expected a forward pass before it");
+                if (in.count != self.drawn)
+                    throw std::invalid_argument("backward: expected " + std::to_string(self.drawn) +
+                                                " Gaussians as in the forward pass, found " + std::to_string(in.count));
+                expect_shape(features, "features", {in.count, self.channels});
                 for (const Array *a : {&out, &grad_out})
                     expect_shape(*a, "out or its gradient", {self.height, self.width, self.channels});
                 expect_shape(grad_alpha, "grad_alpha", {self.height, self.width});
                 inputs(d_means, d_quaternions, d_scales, d_opacities, d_features);
                 expect_shape(d_means, "d_means", {in.count, 3});
+                expect_shape(d_features, "d_features", {in.count, self.channels});
                 if (statistic) expect_shape(*statistic, "statistic", {in.count, 2});
                 nb::gil_scoped_release release;
                 self.rasterizer.backward(in, out.data(), grad_out.data(), grad_alpha.data(),

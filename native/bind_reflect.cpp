@@ -33,6 +33,21 @@ void run(void (*kernel)(const ReflectArgs &, int64_t, int64_t), const ReflectArg
     parallel_chunks(count, item_chunk, body);
 }
 
+void run(void (*kernel)(const GBufferArgs &, int64_t, int64_t), const GBufferArgs &a, int64_t count) {
+    nb::gil_scoped_release release;
+    auto body = [&](int64_t b, int64_t e, int) { kernel(a, b, e); };
+    parallel_chunks(count, item_chunk, body);
+}
+
+GBufferArgs gbuffer_args(const Array &alpha, int64_t channels) {
+    const int64_t n = alpha.ndim() == 1 ? int64_t(alpha.shape(0)) : 0;
+    expect_shape(alpha, "alpha", {n});
+    if (channels < 7) throw std::invalid_argument("features: expected color, normal and a further channel");
+    GBufferArgs a{};
+    a.channels = int(channels), a.alpha = alpha.data();
+    return a;
+}
+
 const float *optional_rows(const MaybeArray &array, const char *name, int64_t n) {
     if (!array) return nullptr;
     expect_shape(*array, name, {n, 3});
@@ -99,4 +114,39 @@ void bind_reflect(nb::module_ &module) {
         },
         nb::arg("features"), nb::arg("rays"), nb::arg("grad_directions"), nb::arg("grad_features"),
         "Adds the normals' gradient that comes through the look-up.");
+    module.def(
+        "gbuffer_split",
+        [](const Array &features, const Array &alpha, Array normal, std::optional<Array> depth) {
+            const int64_t channels = features.ndim() == 2 ? int64_t(features.shape(1)) : 0;
+            GBufferArgs a = gbuffer_args(alpha, channels);
+            const int64_t n = int64_t(alpha.shape(0));
+            expect_shape(features, "features", {n, channels}), expect_shape(normal, "normal", {n, 3});
+            if (depth) expect_shape(*depth, "depth", {n});
+            a.features = features.data(), a.normal = normal.data(), a.depth = depth ? depth->data() : nullptr;
+            run(POLARGUIDE_DISPATCH(gbuffer_split), a, n);
+        },
+        nb::arg("features"), nb::arg("alpha"), nb::arg("normal"), nb::arg("depth").none(),
+        "The blended normal, and the last channel over alpha.");
+    module.def(
+        "gbuffer_join",
+        [](const Array &alpha, MaybeArray depth, MaybeArray grad_features, MaybeArray grad_normal, MaybeArray grad_depth,
+           Array to_features, std::optional<Array> to_alpha) {
+            const int64_t channels = to_features.ndim() == 2 ? int64_t(to_features.shape(1)) : 0;
+            GBufferArgs a = gbuffer_args(alpha, channels);
+            const int64_t n = int64_t(alpha.shape(0));
+            expect_shape(to_features, "to_features", {n, channels});
+            if (grad_features) expect_shape(*grad_features, "grad_features", {n, channels});
+            if (grad_depth) {
+                if (!depth || !to_alpha) throw std::invalid_argument("grad_depth: expected with depth and to_alpha");
+                expect_shape(*grad_depth, "grad_depth", {n}), expect_shape(*depth, "depth", {n});
+                expect_shape(*to_alpha, "to_alpha", {n});
+                a.grad_depth = grad_depth->data(), a.depth = depth->data(), a.to_alpha = to_alpha->data();
+            }
+            a.grad_features = grad_features ? grad_features->data() : nullptr;
+            a.grad_normal = optional_rows(grad_normal, "grad_normal", n), a.to_features = to_features.data();
+            run(POLARGUIDE_DISPATCH(gbuffer_join), a, n);
+        },
+        nb::arg("alpha"), nb::arg("depth").none(), nb::arg("grad_features").none(), nb::arg("grad_normal").none(),
+        nb::arg("grad_depth").none(), nb::arg("to_features"), nb::arg("to_alpha").none(),
+        "Fills the gradients by features and, with a depth's, by alpha.");
 }

@@ -13,6 +13,7 @@ void bind_raster(nb::module_ &module);
 void bind_image(nb::module_ &module);
 void bind_axes(nb::module_ &module);
 void bind_reflect(nb::module_ &module);
+void bind_terms(nb::module_ &module);
 
 NB_MODULE(_native, module) {
     nb::set_leak_warnings(false); // autograd graphs may outlive the interpreter
@@ -33,4 +34,5 @@ NB_MODULE(_native, module) {
     bind_image(module);
     bind_axes(module);
     bind_reflect(module);
+    bind_terms(module);
 }

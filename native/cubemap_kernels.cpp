@@ -20,7 +20,6 @@ struct Cells {
     alignas(64) int32_t u[lanes], v[lanes], face[lanes];
 };
 
-typedef decltype(reg{} < reg{}) ireg;
 
 // Column (or row) and fraction of a coordinate in [0.5, R + 0.5]; NaN lands in cell 0 and stays in the fraction.
 POLARGUIDE_INLINE void split(reg u, float resolution, int32_t *cell, float *fraction) {

@@ -2,8 +2,6 @@
 #include "image.h"
 #include "simd.h"
 
-#include <math.h>
-
 namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
@@ -62,28 +60,11 @@ template <int D> POLARGUIDE_INLINE void basis_gradient(vf x, vf y, vf z, const v
     g[2] += xy * s9 + yz * s10 * 8.0f + (zz * 2.0f - xx - yy) * s11 + xz * s12 * 8.0f + (xx - yy) * s13;
 }
 
-// Sixteen rows of three floats, one vector a column; rows from n on are zero.
-POLARGUIDE_INLINE void load3(const float *rows, int n, vf *columns) {
-    alignas(64) float t[3][lanes] = {};
-    if (n == lanes) { // a constant count: the loop is unrolled
-        for (int l = 0; l < lanes; ++l)
-            for (int i = 0; i < 3; ++i) t[i][l] = rows[3 * l + i];
-    } else {
-        for (int l = 0; l < n; ++l)
-            for (int i = 0; i < 3; ++i) t[i][l] = rows[3 * l + i];
-    }
-    for (int i = 0; i < 3; ++i) columns[i] = load(t[i]);
-}
-POLARGUIDE_INLINE void store3(float *rows, int n, const vf *columns) {
-    alignas(64) float t[3][lanes];
-    for (int i = 0; i < 3; ++i) store(t[i], columns[i]);
-    if (n == lanes) {
-        for (int l = 0; l < lanes; ++l)
-            for (int i = 0; i < 3; ++i) rows[3 * l + i] = t[i][l];
-    } else {
-        for (int l = 0; l < n; ++l)
-            for (int i = 0; i < 3; ++i) rows[3 * l + i] = t[i][l];
-    }
+// Asks for the rows of `rest` two blocks of sixteen ahead (1: to write them): transposed, a block's 45 cache lines are
+// wanted at once, which the processor does not foresee by itself.
+template <int Write> POLARGUIDE_INLINE void ask_ahead(const float *rest) {
+    constexpr int block = lanes * rest_values;
+    for (int i = 2 * block; i < 3 * block; i += 16) __builtin_prefetch(rest + i, Write);
 }
 
 // The used columns of sixteen rows of `rest` as vectors, and back. `spare` holds sixteen rows for a last, short block.
@@ -93,6 +74,7 @@ template <int D> POLARGUIDE_INLINE void load_rest(const float *rest, int n, floa
         for (int i = n * rest_values; i < lanes * rest_values; ++i) spare[i] = 0.0f;
         rest = spare;
     }
+    ask_ahead<0>(rest);
     for (int t = 0; t < Columns<D>::tiles; ++t) {
         const int first = Columns<D>::first[t];
         transpose16(rest + first, rest_values, columns + first * lanes, lanes);
@@ -100,6 +82,7 @@ template <int D> POLARGUIDE_INLINE void load_rest(const float *rest, int n, floa
 }
 template <int D> POLARGUIDE_INLINE void store_rest(float *rest, int n, float *spare, const float *columns) {
     float *out = n < lanes ? spare : rest;
+    ask_ahead<1>(rest);
     for (int t = 0; t < Columns<D>::tiles; ++t) {
         const int first = Columns<D>::first[t];
         transpose16(columns + first * lanes, lanes, out + first, rest_values);
@@ -113,13 +96,10 @@ template <int D> POLARGUIDE_INLINE void store_rest(float *rest, int n, float *sp
 
 // Unit directions from the center; a Gaussian at the center has direction zero. Returns 1 / distance.
 POLARGUIDE_INLINE vf directions(const HarmonicsArgs &a, int64_t first, int n, vf *d) {
-    load3(a.means + 3 * first, n, d);
+    load_columns<3>(a.means + 3 * first, n, d);
     for (int i = 0; i < 3; ++i) d[i] -= a.center[i];
     const vf squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
-    alignas(64) float root[lanes];
-    store(root, squared);
-    for (int l = 0; l < lanes; ++l) root[l] = sqrtf(root[l]);
-    const vf inverse = squared <= 1e-24f ? vf{} : 1.0f / load(root);
+    const vf inverse = squared <= 1e-24f ? vf{} : 1.0f / square_root(squared);
     for (int i = 0; i < 3; ++i) d[i] *= inverse;
     return inverse;
 }
@@ -129,7 +109,7 @@ template <int D> void forward(const HarmonicsArgs &a, int64_t begin, int64_t end
     for (int64_t first = begin; first < end; first += lanes) {
         const int n = end - first < lanes ? int(end - first) : lanes;
         vf out[3];
-        load3(a.dc + 3 * first, n, out);
+        load_columns<3>(a.dc + 3 * first, n, out);
         for (int c = 0; c < 3; ++c) out[c] *= sh0;
         if (D > 0) {
             vf d[3], b[15];
@@ -139,7 +119,7 @@ template <int D> void forward(const HarmonicsArgs &a, int64_t begin, int64_t end
             for (int k = 0; k < Columns<D>::used; ++k)
                 for (int c = 0; c < 3; ++c) out[c] += b[k] * load(columns + (3 * k + c) * lanes);
         }
-        store3(a.out + 3 * first, n, out);
+        store_columns<3>(a.out + 3 * first, n, out);
     }
 }
 
@@ -148,25 +128,28 @@ template <int D> void backward(const HarmonicsArgs &a, int64_t begin, int64_t en
     for (int64_t first = begin; first < end; first += lanes) {
         const int n = end - first < lanes ? int(end - first) : lanes;
         vf g[3], to_dc[3], to_means[3] = {};
-        load3(a.grad_out + 3 * first, n, g);
+        load_columns<3>(a.grad_out + 3 * first, n, g);
         for (int c = 0; c < 3; ++c) to_dc[c] = g[c] * sh0;
         if (D > 0) {
-            vf d[3], b[15], s[15], by_direction[3];
+            vf d[3], b[15];
             const vf inverse = directions(a, first, n, d);
-            load_rest<D>(a.rest + rest_values * first, n, spare, columns);
-            for (int k = 0; k < Columns<D>::used; ++k) {
-                const float *at = columns + 3 * k * lanes;
-                s[k] = load(at) * g[0] + load(at + lanes) * g[1] + load(at + 2 * lanes) * g[2];
+            if (a.grad_means) {
+                vf s[15], by_direction[3];
+                load_rest<D>(a.rest + rest_values * first, n, spare, columns);
+                for (int k = 0; k < Columns<D>::used; ++k) {
+                    const float *at = columns + 3 * k * lanes;
+                    s[k] = load(at) * g[0] + load(at + lanes) * g[1] + load(at + 2 * lanes) * g[2];
+                }
+                basis_gradient<D>(d[0], d[1], d[2], s, by_direction);
+                const vf along = by_direction[0] * d[0] + by_direction[1] * d[1] + by_direction[2] * d[2];
+                for (int i = 0; i < 3; ++i) to_means[i] = (by_direction[i] - along * d[i]) * inverse;
             }
-            basis_gradient<D>(d[0], d[1], d[2], s, by_direction);
-            const vf along = by_direction[0] * d[0] + by_direction[1] * d[1] + by_direction[2] * d[2];
-            for (int i = 0; i < 3; ++i) to_means[i] = (by_direction[i] - along * d[i]) * inverse;
             basis<D>(d[0], d[1], d[2], b);
             for (int k = 0; k < Columns<D>::used; ++k)
                 for (int c = 0; c < 3; ++c) store(columns + (3 * k + c) * lanes, b[k] * g[c]);
         }
-        store3(a.grad_dc + 3 * first, n, to_dc);
-        store3(a.grad_means + 3 * first, n, to_means);
+        store_columns<3>(a.grad_dc + 3 * first, n, to_dc);
+        if (a.grad_means) store_columns<3>(a.grad_means + 3 * first, n, to_means);
         store_rest<D>(a.grad_rest + rest_values * first, n, spare, columns);
     }
 }

@@ -45,7 +45,7 @@ struct HarmonicsArgs {
     const float *means, *center, *dc, *rest; // [N,3] [3] [N,3] [N,15,3]
     float *out;                              // [N,3]
     const float *grad_out;
-    float *grad_means, *grad_dc, *grad_rest;
+    float *grad_means, *grad_dc, *grad_rest; // grad_means may be null: not wanted
 };
 POLARGUIDE_DECLARE(void harmonics_forward(const HarmonicsArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void harmonics_backward(const HarmonicsArgs &a, int64_t begin, int64_t end))
@@ -83,5 +83,17 @@ POLARGUIDE_DECLARE(void reflect_directions(const ReflectArgs &a, int64_t begin, 
 POLARGUIDE_DECLARE(void reflect_layers(const ReflectArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t end))
+
+// What a picture reads of its G-buffer beside the layers: the blended normal, channels 3 to 5, and the depth, the last
+// channel over alpha.
+struct GBufferArgs {
+    int channels;
+    const float *features, *alpha; // [P,D] [P]
+    float *normal, *depth;         // [P,3] [P]; depth may be null
+    const float *grad_features, *grad_normal, *grad_depth; // each may be null
+    float *to_features, *to_alpha;                         // [P,D]; [P], null without a depth
+};
+POLARGUIDE_DECLARE(void gbuffer_split(const GBufferArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void gbuffer_join(const GBufferArgs &a, int64_t begin, int64_t end))
 
 } // namespace polarguide

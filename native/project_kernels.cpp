@@ -12,71 +12,94 @@ constexpr float blur = 0.3f; // px^2, added to the projected covariance
 constexpr float natural = 0.693147181f;
 constexpr float minimum_opacity = 1.0f / 255.0f;
 
-// All that the forward and the backward projection of one Gaussian share.
+// All that the forward and the backward projection share, of as many Gaussians as a register has lanes. What a culled
+// one's lane holds has no meaning.
 struct Projection {
-    float t[3];          // camera-space mean
-    float tx, ty;        // its x and y, clamped for the Jacobian as far as the picture's surroundings reach
-    bool clamped_x, clamped_y;
-    float q[4], norm;    // unit quaternion (w, x, y, z), and the length it had
-    float r[9];          // rotation of the Gaussian
-    float s[3];
-    float w[9];          // camera rotation times r
-    float v[9];          // camera-space covariance
-    float j[4];          // Jacobian: j0 = fx/z, j1 = -fx tx/z^2, j2 = fy/z, j3 = -fy ty/z^2
-    float a, b, c;       // 2D covariance with the blur
-    float determinant;   // of it
+    ireg valid;             // before the near plane and opaque enough
+    reg t[3], opacity;          // camera-space mean
+    reg tx, ty;                 // its x and y, clamped for the Jacobian as far as the picture's surroundings reach
+    ireg clamped_x, clamped_y;
+    reg q[4], norm;             // unit quaternion (w, x, y, z), and the length it had
+    reg s[3];
+    reg w[9];                   // camera rotation times that of the Gaussian
+    reg v[9];                   // camera-space covariance
+    reg j[4];                   // Jacobian: j0 = fx/z, j1 = -fx tx/z^2, j2 = fy/z, j3 = -fy ty/z^2
+    reg a, b, c;                // 2D covariance with the blur
+    reg determinant;            // of it
 };
 
-POLARGUIDE_INLINE void multiply(const float *x, const float *y, float *out) { // 3 x 3
-    for (int i = 0; i < 3; ++i)
-        for (int k = 0; k < 3; ++k) out[3 * i + k] = x[3 * i] * y[k] + x[3 * i + 1] * y[3 + k] + x[3 * i + 2] * y[6 + k];
+POLARGUIDE_INLINE reg limited(reg x, float low, float high, ireg *clamped) {
+    *clamped = (x < low) | (x > high);
+    return clamp(x, reg_splat(low), reg_splat(high));
 }
 
-POLARGUIDE_INLINE float limited(float x, float low, float high, bool *clamped) {
-    *clamped = x < low || x > high;
-    return x < low ? low : x > high ? high : x;
-}
-
-POLARGUIDE_INLINE bool project_one(const ProjectArgs &p, int64_t g, Projection *o) {
+// Gaussians g to g + n, n at most a register's lanes.
+POLARGUIDE_INLINE void project_some(const ProjectArgs &p, int64_t g, int n, Projection *o) {
     const PinholeCamera &cam = p.camera;
-    const float *m = p.means + 3 * g, *R = cam.rotation;
+    const float *R = cam.rotation;
+    reg m[3], q[4];
+    load_columns<3>(p.means + 3 * g, n, m);
+    load_columns<4>(p.quaternions + 4 * g, n, q);
+    load_columns<3>(p.scales + 3 * g, n, o->s);
+    load_columns<1>(p.opacities + g, n, &o->opacity);
     for (int i = 0; i < 3; ++i)
         o->t[i] = R[3 * i] * m[0] + R[3 * i + 1] * m[1] + R[3 * i + 2] * m[2] + cam.translation[i];
-    const float z = o->t[2];
-    if (!(z > cam.near_plane) || !(p.opacities[g] >= minimum_opacity)) return false;
-    const float *q = p.quaternions + 4 * g;
-    o->norm = sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-    const float unit = 1.0f / (o->norm > 1e-12f ? o->norm : 1e-12f);
+    const reg z = o->t[2];
+    o->valid = (z > cam.near_plane) & (o->opacity >= minimum_opacity);
+    o->norm = max(square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), reg_splat(1e-12f));
+    const reg unit = 1.0f / o->norm;
     for (int i = 0; i < 4; ++i) o->q[i] = q[i] * unit;
-    const float w = o->q[0], x = o->q[1], y = o->q[2], k = o->q[3];
-    float *r = o->r;
-    r[0] = 1 - 2 * (y * y + k * k), r[1] = 2 * (x * y - w * k), r[2] = 2 * (x * k + w * y);
-    r[3] = 2 * (x * y + w * k), r[4] = 1 - 2 * (x * x + k * k), r[5] = 2 * (y * k - w * x);
-    r[6] = 2 * (x * k - w * y), r[7] = 2 * (y * k + w * x), r[8] = 1 - 2 * (x * x + y * y);
-    for (int i = 0; i < 3; ++i) o->s[i] = p.scales[3 * g + i];
-    multiply(R, r, o->w);
-    float n[9];
+    const reg w = o->q[0], x = o->q[1], y = o->q[2], k = o->q[3];
+    const reg r[9] = {1.0f - 2.0f * (y * y + k * k), 2.0f * (x * y - w * k), 2.0f * (x * k + w * y),
+                      2.0f * (x * y + w * k), 1.0f - 2.0f * (x * x + k * k), 2.0f * (y * k - w * x),
+                      2.0f * (x * k - w * y), 2.0f * (y * k + w * x), 1.0f - 2.0f * (x * x + y * y)};
+    reg e[9]; // w times the scales: the covariance is e e^T
     for (int i = 0; i < 3; ++i)
-        for (int c = 0; c < 3; ++c) n[3 * i + c] = o->w[3 * i + c] * o->s[c];
+        for (int c = 0; c < 3; ++c) {
+            o->w[3 * i + c] = R[3 * i] * r[c] + R[3 * i + 1] * r[3 + c] + R[3 * i + 2] * r[6 + c];
+            e[3 * i + c] = o->w[3 * i + c] * o->s[c];
+        }
     for (int i = 0; i < 3; ++i)
-        for (int c = 0; c < 3; ++c)
-            o->v[3 * i + c] = n[3 * i] * n[3 * c] + n[3 * i + 1] * n[3 * c + 1] + n[3 * i + 2] * n[3 * c + 2];
-    const float rz = 1.0f / z;
+        for (int c = i; c < 3; ++c)
+            o->v[3 * i + c] = o->v[3 * c + i] = e[3 * i] * e[3 * c] + e[3 * i + 1] * e[3 * c + 1] + e[3 * i + 2] * e[3 * c + 2];
+    const reg rz = 1.0f / z;
     const float margin_x = 0.15f * cam.width / cam.fx, margin_y = 0.15f * cam.height / cam.fy;
-    const float u = limited(o->t[0] * rz, -cam.cx / cam.fx - margin_x, (cam.width - cam.cx) / cam.fx + margin_x, &o->clamped_x);
-    const float h = limited(o->t[1] * rz, -cam.cy / cam.fy - margin_y, (cam.height - cam.cy) / cam.fy + margin_y, &o->clamped_y);
+    const reg u = limited(o->t[0] * rz, -cam.cx / cam.fx - margin_x, (cam.width - cam.cx) / cam.fx + margin_x, &o->clamped_x);
+    const reg h = limited(o->t[1] * rz, -cam.cy / cam.fy - margin_y, (cam.height - cam.cy) / cam.fy + margin_y, &o->clamped_y);
     o->tx = u * z, o->ty = h * z;
     o->j[0] = cam.fx * rz, o->j[1] = -cam.fx * u * rz, o->j[2] = cam.fy * rz, o->j[3] = -cam.fy * h * rz;
-    const float *j = o->j;
-    float p0[3], p1[3]; // rows of J N, whose products are the covariance
-    for (int c = 0; c < 3; ++c) p0[c] = j[0] * n[c] + j[1] * n[6 + c], p1[c] = j[2] * n[3 + c] + j[3] * n[6 + c];
-    const float a = p0[0] * p0[0] + p0[1] * p0[1] + p0[2] * p0[2], c = p1[0] * p1[0] + p1[1] * p1[1] + p1[2] * p1[2];
+    const reg *j = o->j;
+    reg p0[3], p1[3]; // rows of J e, whose products are the covariance
+    for (int c = 0; c < 3; ++c) p0[c] = j[0] * e[c] + j[1] * e[6 + c], p1[c] = j[2] * e[3 + c] + j[3] * e[6 + c];
+    const reg a = p0[0] * p0[0] + p0[1] * p0[1] + p0[2] * p0[2], c = p1[0] * p1[0] + p1[1] * p1[1] + p1[2] * p1[2];
     o->a = a + blur, o->c = c + blur;
     o->b = p0[0] * p1[0] + p0[1] * p1[1] + p0[2] * p1[2];
     // a c - b^2 would cancel for needles: a sum of squared minors does not.
-    const float m0 = p0[1] * p1[2] - p0[2] * p1[1], m1 = p0[2] * p1[0] - p0[0] * p1[2], m2 = p0[0] * p1[1] - p0[1] * p1[0];
+    const reg m0 = p0[1] * p1[2] - p0[2] * p1[1], m1 = p0[2] * p1[0] - p0[0] * p1[2], m2 = p0[0] * p1[1] - p0[1] * p1[0];
     o->determinant = m0 * m0 + m1 * m1 + m2 * m2 + blur * (a + c) + blur * blur;
-    return true;
+}
+
+// What the picture needs of each of them.
+struct Shown {
+    alignas(64) float screen[screen_values][reg_lanes], half_x[reg_lanes], half_y[reg_lanes], radius[reg_lanes], depth[reg_lanes];
+    alignas(64) int32_t kept[reg_lanes];
+};
+
+POLARGUIDE_INLINE void show(const PinholeCamera &cam, const Projection &o, Shown *out) {
+    const reg inverse = 1.0f / o.determinant, rz = 1.0f / o.t[2];
+    const reg x = cam.fx * o.t[0] * rz + cam.cx, y = cam.fy * o.t[1] * rz + cam.cy;
+    const reg level = log2(max(o.opacity, reg_splat(minimum_opacity)));
+    // alpha >= 1/255 inside the ellipse d^T conic d <= reach
+    const reg reach = max(2.0f * natural * (level + 7.99435344f), reg{});
+    const reg half_x = square_root(reach * o.a), half_y = square_root(reach * o.c);
+    const ireg kept = o.valid & (o.determinant > 0.0f) & (o.determinant < 1e30f) & (x + half_x > 0.0f) &
+                          (x - half_x < float(cam.width)) & (y + half_y > 0.0f) & (y - half_y < float(cam.height));
+    const reg middle = 0.5f * (o.a + o.c), spread = middle * middle - o.determinant;
+    const reg values[screen_values] = {x, y, -0.5f * o.c * inverse / natural, o.b * inverse / natural, -0.5f * o.a * inverse / natural, level};
+    for (int k = 0; k < screen_values; ++k) reg_store(out->screen[k], values[k]);
+    reg_store(out->half_x, half_x), reg_store(out->half_y, half_y), reg_store(out->depth, o.t[2]);
+    reg_store(out->radius, 3.0f * square_root(middle + square_root(max(spread, reg_splat(0.1f)))));
+    __builtin_memcpy(out->kept, &kept, sizeof kept);
 }
 
 POLARGUIDE_INLINE int clamp_tile(float pixel, int tiles) {
@@ -88,35 +111,26 @@ POLARGUIDE_INLINE int clamp_tile(float pixel, int tiles) {
 
 void project(const ProjectArgs &p, int64_t begin, int64_t end) {
     const int tiles_x = (p.camera.width + tile_size - 1) / tile_size, tiles_y = (p.camera.height + tile_size - 1) / tile_size;
-    for (int64_t g = begin; g < end; ++g) {
+    for (int64_t first = begin; first < end; first += reg_lanes) {
+        const int n = end - first < reg_lanes ? int(end - first) : reg_lanes;
         Projection o;
-        int32_t *box = p.box + 4 * g;
-        box[0] = box[1] = box[2] = box[3] = 0;
-        p.radius[g] = p.depth[g] = 0.0f;
-        if (!project_one(p, g, &o)) continue;
-        const float determinant = o.determinant;
-        if (!(determinant > 0.0f) || !(determinant < 1e30f)) continue;
-        const float inverse = 1.0f / determinant, rz = 1.0f / o.t[2];
-        float *screen = p.screen + g * screen_values;
-        screen[0] = p.camera.fx * o.t[0] * rz + p.camera.cx;
-        screen[1] = p.camera.fy * o.t[1] * rz + p.camera.cy;
-        screen[2] = -0.5f * o.c * inverse / natural;
-        screen[3] = o.b * inverse / natural;
-        screen[4] = -0.5f * o.a * inverse / natural;
-        screen[5] = log2f(p.opacities[g]);
-        // alpha >= 1/255 inside the ellipse d^T conic d <= reach
-        const float reach = 2.0f * natural * (screen[5] + 7.99435344f);
-        const float half_x = sqrtf(reach * o.a), half_y = sqrtf(reach * o.c);
-        if (!(screen[0] + half_x > 0.0f) || !(screen[0] - half_x < p.camera.width) || !(screen[1] + half_y > 0.0f) ||
-            !(screen[1] - half_y < p.camera.height))
-            continue;
-        const int x0 = clamp_tile(screen[0] - half_x, tiles_x), x1 = clamp_tile(screen[0] + half_x + tile_size, tiles_x);
-        const int y0 = clamp_tile(screen[1] - half_y, tiles_y), y1 = clamp_tile(screen[1] + half_y + tile_size, tiles_y);
-        if (x0 >= x1 || y0 >= y1) continue;
-        box[0] = x0, box[1] = x1, box[2] = y0, box[3] = y1;
-        p.depth[g] = o.t[2];
-        const float middle = 0.5f * (o.a + o.c), spread = middle * middle - determinant;
-        p.radius[g] = 3.0f * sqrtf(middle + sqrtf(spread > 0.1f ? spread : 0.1f));
+        Shown shown;
+        project_some(p, first, n, &o);
+        show(p.camera, o, &shown);
+        for (int l = 0; l < n; ++l) {
+            const int64_t g = first + l;
+            int32_t *box = p.box + 4 * g;
+            box[0] = box[1] = box[2] = box[3] = 0;
+            p.radius[g] = p.depth[g] = 0.0f;
+            if (!shown.kept[l]) continue;
+            const float x = shown.screen[0][l], y = shown.screen[1][l], half_x = shown.half_x[l], half_y = shown.half_y[l];
+            const int x0 = clamp_tile(x - half_x, tiles_x), x1 = clamp_tile(x + half_x + tile_size, tiles_x);
+            const int y0 = clamp_tile(y - half_y, tiles_y), y1 = clamp_tile(y + half_y + tile_size, tiles_y);
+            if (x0 >= x1 || y0 >= y1) continue;
+            box[0] = x0, box[1] = x1, box[2] = y0, box[3] = y1;
+            for (int k = 0; k < screen_values; ++k) p.screen[g * screen_values + k] = shown.screen[k][l];
+            p.depth[g] = shown.depth[l], p.radius[g] = shown.radius[l];
+        }
     }
 }
 
@@ -144,97 +158,111 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
 namespace {
 
 // From gradients of the 2D mean and conic to those of the 3D mean, quaternion and scales.
-POLARGUIDE_INLINE void project_one_backward(const PinholeCamera &cam, const Projection &o, const float *grad, float *mean,
-                                            float *quaternion, float *scale) {
+POLARGUIDE_INLINE void project_some_backward(const PinholeCamera &cam, const Projection &o, const reg *grad, reg *mean,
+                                             reg *quaternion, reg *scale) {
     // conic = inverse of [[a, b], [b, c]]: gradient of the covariance is -conic G conic.
-    const float inverse = 1.0f / o.determinant;
-    const float ka = o.c * inverse, kb = -o.b * inverse, kc = o.a * inverse;
-    const float ga = grad[2], gb = 0.5f * grad[3], gc = grad[4];
-    const float m00 = ka * ga + kb * gb, m01 = ka * gb + kb * gc, m10 = kb * ga + kc * gb, m11 = kb * gb + kc * gc;
-    const float d00 = -(m00 * ka + m01 * kb), d01 = -(m00 * kb + m01 * kc), d11 = -(m10 * kb + m11 * kc);
-    const float *j = o.j, *v = o.v;
-    // J rows: (j0, 0, j1), (0, j2, j3). Gradient of V = J^T D J (symmetric).
-    const float r0[3] = {j[0], 0.0f, j[1]}, r1[3] = {0.0f, j[2], j[3]};
-    float dv[9];
+    const reg inverse = 1.0f / o.determinant;
+    const reg ka = o.c * inverse, kb = -o.b * inverse, kc = o.a * inverse;
+    const reg ga = grad[2], gb = 0.5f * grad[3], gc = grad[4];
+    const reg m00 = ka * ga + kb * gb, m01 = ka * gb + kb * gc, m10 = kb * ga + kc * gb, m11 = kb * gb + kc * gc;
+    const reg d00 = -(m00 * ka + m01 * kb), d01 = -(m00 * kb + m01 * kc), d11 = -(m10 * kb + m11 * kc);
+    const reg *j = o.j, *v = o.v;
+    // Gradient of V = J^T D J (symmetric), J rows: (j0, 0, j1), (0, j2, j3).
+    const reg zero = {}, r0[3] = {j[0], zero, j[1]}, r1[3] = {zero, j[2], j[3]};
+    reg dv[9];
     for (int i = 0; i < 3; ++i)
-        for (int k = 0; k < 3; ++k)
-            dv[3 * i + k] = r0[i] * (d00 * r0[k] + d01 * r1[k]) + r1[i] * (d01 * r0[k] + d11 * r1[k]);
+        for (int k = i; k < 3; ++k)
+            dv[3 * i + k] = dv[3 * k + i] = r0[i] * (d00 * r0[k] + d01 * r1[k]) + r1[i] * (d01 * r0[k] + d11 * r1[k]);
     // Gradient of J = 2 D J V.
-    float jv0[3], jv1[3];
+    reg jv0[3], jv1[3];
     for (int k = 0; k < 3; ++k) {
         jv0[k] = j[0] * v[k] + j[1] * v[6 + k];
         jv1[k] = j[2] * v[3 + k] + j[3] * v[6 + k];
     }
-    const float dj0 = 2 * (d00 * jv0[0] + d01 * jv1[0]), dj1 = 2 * (d00 * jv0[2] + d01 * jv1[2]);
-    const float dj2 = 2 * (d01 * jv0[1] + d11 * jv1[1]), dj3 = 2 * (d01 * jv0[2] + d11 * jv1[2]);
-    const float rz = 1.0f / o.t[2], rz2 = rz * rz;
-    float dt[3];
+    const reg dj0 = 2.0f * (d00 * jv0[0] + d01 * jv1[0]), dj1 = 2.0f * (d00 * jv0[2] + d01 * jv1[2]);
+    const reg dj2 = 2.0f * (d01 * jv0[1] + d11 * jv1[1]), dj3 = 2.0f * (d01 * jv0[2] + d11 * jv1[2]);
+    const reg rz = 1.0f / o.t[2], rz2 = rz * rz;
+    reg dt[3];
     dt[0] = cam.fx * rz * grad[0], dt[1] = cam.fy * rz * grad[1];
     dt[2] = -(cam.fx * o.t[0] * grad[0] + cam.fy * o.t[1] * grad[1]) * rz2;
     // j0 = fx/z; j1 = -fx tx/z^2 where tx = x, or z times a constant where clamped.
     dt[2] -= rz2 * (cam.fx * dj0 + cam.fy * dj2);
-    if (o.clamped_x)
-        dt[2] += cam.fx * o.tx * rz2 * rz * dj1;
-    else
-        dt[0] -= cam.fx * rz2 * dj1, dt[2] += 2 * cam.fx * o.tx * rz2 * rz * dj1;
-    if (o.clamped_y)
-        dt[2] += cam.fy * o.ty * rz2 * rz * dj3;
-    else
-        dt[1] -= cam.fy * rz2 * dj3, dt[2] += 2 * cam.fy * o.ty * rz2 * rz * dj3;
+    const reg by_x = cam.fx * rz2 * dj1, by_y = cam.fy * rz2 * dj3;
+    const reg along_x = o.tx * rz * by_x, along_y = o.ty * rz * by_y;
+    dt[0] -= o.clamped_x ? zero : by_x, dt[1] -= o.clamped_y ? zero : by_y;
+    dt[2] += (o.clamped_x ? along_x : 2.0f * along_x) + (o.clamped_y ? along_y : 2.0f * along_y);
     const float *R = cam.rotation;
     for (int i = 0; i < 3; ++i) mean[i] = R[i] * dt[0] + R[3 + i] * dt[1] + R[6 + i] * dt[2];
     // V = N N^T, N = W S, W = camera rotation * r: dN = 2 dV N.
-    float dw[9];
+    reg dw[9];
     for (int c = 0; c < 3; ++c) {
-        float sum = 0.0f;
+        reg sum = zero;
         for (int i = 0; i < 3; ++i) {
-            const float dn = 2 * o.s[c] * (dv[3 * i] * o.w[c] + dv[3 * i + 1] * o.w[3 + c] + dv[3 * i + 2] * o.w[6 + c]);
+            const reg dn = 2.0f * o.s[c] * (dv[3 * i] * o.w[c] + dv[3 * i + 1] * o.w[3 + c] + dv[3 * i + 2] * o.w[6 + c]);
             sum += dn * o.w[3 * i + c];
             dw[3 * i + c] = dn * o.s[c];
         }
         scale[c] = sum;
     }
-    float dr[9];
+    reg dr[9];
     for (int i = 0; i < 3; ++i)
         for (int c = 0; c < 3; ++c) dr[3 * i + c] = R[i] * dw[c] + R[3 + i] * dw[3 + c] + R[6 + i] * dw[6 + c];
-    const float w = o.q[0], x = o.q[1], y = o.q[2], z = o.q[3];
-    float dq[4];
-    dq[0] = 2 * (x * (dr[7] - dr[5]) + y * (dr[2] - dr[6]) + z * (dr[3] - dr[1]));
-    dq[1] = 2 * (w * (dr[7] - dr[5]) - 2 * x * (dr[4] + dr[8]) + y * (dr[1] + dr[3]) + z * (dr[2] + dr[6]));
-    dq[2] = 2 * (w * (dr[2] - dr[6]) + x * (dr[1] + dr[3]) - 2 * y * (dr[0] + dr[8]) + z * (dr[5] + dr[7]));
-    dq[3] = 2 * (w * (dr[3] - dr[1]) + x * (dr[2] + dr[6]) + y * (dr[5] + dr[7]) - 2 * z * (dr[0] + dr[4]));
-    const float along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;
-    const float unit = 1.0f / (o.norm > 1e-12f ? o.norm : 1e-12f);
+    const reg w = o.q[0], x = o.q[1], y = o.q[2], z = o.q[3];
+    reg dq[4];
+    dq[0] = 2.0f * (x * (dr[7] - dr[5]) + y * (dr[2] - dr[6]) + z * (dr[3] - dr[1]));
+    dq[1] = 2.0f * (w * (dr[7] - dr[5]) - 2.0f * x * (dr[4] + dr[8]) + y * (dr[1] + dr[3]) + z * (dr[2] + dr[6]));
+    dq[2] = 2.0f * (w * (dr[2] - dr[6]) + x * (dr[1] + dr[3]) - 2.0f * y * (dr[0] + dr[8]) + z * (dr[5] + dr[7]));
+    dq[3] = 2.0f * (w * (dr[3] - dr[1]) + x * (dr[2] + dr[6]) + y * (dr[5] + dr[7]) - 2.0f * z * (dr[0] + dr[4]));
+    const reg along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z, unit = 1.0f / o.norm;
     for (int i = 0; i < 4; ++i) quaternion[i] = (dq[i] - along * o.q[i]) * unit;
+}
+
+// Sums the rows of one Gaussian's instances and writes what does not depend on its projection; false where it has none.
+// `sum` then holds, behind the features, the gradients of the 2D mean and conic.
+POLARGUIDE_INLINE bool sum_instances(const ProjectBackwardArgs &args, int64_t g, float *sum) {
+    const int d = args.channels, real = args.channels_real, stride = d + instance_extra;
+    const int64_t first = args.instance_begin[g], last = args.instance_begin[g + 1];
+    for (int i = 0; i < stride; i += lanes) { // rows have room for a whole vector behind the last
+        vf total = {};
+        for (int64_t n = first; n < last; ++n) total += load(args.grad_instances + n * stride + i);
+        store(sum + i, total);
+    }
+    float *features = args.grad_features + g * real;
+    for (int k = 0; k < real; ++k) features[args.permutation[k]] = sum[k];
+    const float *extra = sum + d;
+    args.grad_opacities[g] = first < last ? extra[5] / args.forward.opacities[g] : 0.0f;
+    if (args.statistic) args.statistic[2 * g] = extra[6], args.statistic[2 * g + 1] = extra[7];
+    return first < last;
 }
 
 } // namespace
 
 void project_backward(const ProjectBackwardArgs &args, int64_t begin, int64_t end) {
-    const ProjectArgs &p = args.forward;
-    const int d = args.channels, stride = d + instance_extra;
-    float sum[max_channels + instance_extra + lanes];
-    for (int64_t g = begin; g < end; ++g) {
-        float *mean = args.grad_means + 3 * g, *scale = args.grad_scales + 3 * g;
-        float *quaternion = args.grad_quaternions + 4 * g;
-        float *features = args.grad_features + g * args.channels_real;
-        const int64_t first = args.instance_begin[g], last = args.instance_begin[g + 1];
-        for (int i = 0; i < stride; ++i) sum[i] = 0.0f;
-        for (int64_t n = first; n < last; ++n) {
-            const float *row = args.grad_instances + n * stride;
-            for (int i = 0; i < stride; ++i) sum[i] += row[i];
+    alignas(64) float sum[max_channels + instance_extra + lanes], grads[5][reg_lanes];
+    alignas(64) int32_t seen[reg_lanes];
+    for (int64_t first = begin; first < end; first += reg_lanes) {
+        const int n = end - first < reg_lanes ? int(end - first) : reg_lanes;
+        reg mean[3] = {}, quaternion[4] = {}, scale[3] = {};
+        bool any_seen = false;
+        for (int l = 0; l < reg_lanes; ++l) {
+            seen[l] = l < n && sum_instances(args, first + l, sum) ? -1 : 0;
+            for (int k = 0; k < 5; ++k) grads[k][l] = seen[l] ? sum[args.channels + k] : 0.0f;
+            any_seen |= seen[l] != 0;
         }
-        for (int k = 0; k < args.channels_real; ++k) features[args.permutation[k]] = sum[k];
-        const float *grad = sum + d;
-        args.grad_opacities[g] = first < last ? grad[5] / p.opacities[g] : 0.0f;
-        if (args.statistic) args.statistic[2 * g] = grad[6], args.statistic[2 * g + 1] = grad[7];
-        Projection o;
-        if (first < last && project_one(p, g, &o)) {
-            project_one_backward(p.camera, o, grad, mean, quaternion, scale);
-            continue;
+        if (any_seen) {
+            Projection o;
+            reg grad[5];
+            ireg used;
+            __builtin_memcpy(grad, grads, sizeof grad), __builtin_memcpy(&used, seen, sizeof used);
+            project_some(args.forward, first, n, &o);
+            project_some_backward(args.forward.camera, o, grad, mean, quaternion, scale);
+            for (reg &value : mean) value = used ? value : reg{};
+            for (reg &value : quaternion) value = used ? value : reg{};
+            for (reg &value : scale) value = used ? value : reg{};
         }
-        for (int i = 0; i < 3; ++i) mean[i] = scale[i] = 0.0f;
-        for (int i = 0; i < 4; ++i) quaternion[i] = 0.0f;
+        store_columns<3>(args.grad_means + 3 * first, n, mean);
+        store_columns<4>(args.grad_quaternions + 4 * first, n, quaternion);
+        store_columns<3>(args.grad_scales + 3 * first, n, scale);
     }
 }
 

@@ -52,6 +52,9 @@ struct RasterArgs {
     const int64_t *tile_begin;      // [tiles + 1]
     const int32_t *gaussians;       // [instances] by tile, in depth order
     const int64_t *instances;       // [instances] row in the instance gradient buffer
+    // What the forward pass gathered, and the backward pass then reads; null: for this picture there is none.
+    float *rows;                    // [instances, channels + 6] by tile: x, y relative to its center, A, B, C, L, features
+    uint16_t *blocks;               // [instances] one bit for each of the tile's blocks that the Gaussian touches
     // Forward, out
     float *out;                     // [H,W,channels_real]
     float *alpha;                   // [H,W]
@@ -75,7 +78,7 @@ struct ProjectBackwardArgs {
 
 // Scratch of one worker, sized for the longest tile list.
 struct RasterScratch {
-    float *rows;      // [n, channels + 6] Gaussians of the tile
+    float *rows;      // [n, channels + 6] Gaussians of the tile, where they are not kept
     int32_t *lists;   // [16, n]
     float *moments;   // [n, channels + 9]
 };

@@ -85,7 +85,15 @@ void Rasterizer::bin(int64_t count) {
     instance_count_ = first[count];
     gaussians_.resize(instance_count_), instances_.resize(instance_count_);
     std::vector<int64_t> next(tile_begin, tile_begin + tile_count);
-    for (int32_t g : depth_order(depth_.get(), touched.get(), count)) {
+    const std::vector<int32_t> order = depth_order(depth_.get(), touched.get(), count);
+    constexpr size_t ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
+    for (size_t k = 0; k < order.size(); ++k) {
+        if (k + 2 * ahead < order.size()) {
+            const size_t later = size_t(order[k + 2 * ahead]);
+            __builtin_prefetch(&offset[later]), __builtin_prefetch(touched.get() + later), __builtin_prefetch(first + later);
+        }
+        if (k + ahead < order.size()) __builtin_prefetch(tiles.get() + offset[size_t(order[k + ahead])]);
+        const int32_t g = order[k];
         const int32_t *t = tiles.get() + offset[size_t(g)], n = touched.get()[g];
         for (int32_t i = 0; i < n; ++i) {
             int64_t slot = next[size_t(t[i])]++;
@@ -101,6 +109,7 @@ RasterArgs Rasterizer::raster_args(const GaussianInputs &in) const {
     a.screen = screen_.get(), a.features = in.features, a.permutation = permutation_.data();
     a.tile_begin = tile_begin_.get(), a.gaussians = gaussians_.get(), a.instances = instances_.get();
     a.transmittance = transmittance_.get();
+    if (kept_) a.rows = rows_.get(), a.blocks = blocks_.get();
     a.statistic_channels = statistic_channels_;
     return a;
 }
@@ -125,7 +134,8 @@ template <class F> void Rasterizer::for_tiles(F &&body) {
     parallel_chunks(int64_t(tiles_x_) * tiles_y_, 2, run);
 }
 
-void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs) {
+void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs,
+                         bool for_backward) {
     screen_.resize(in.count * screen_values), depth_.resize(in.count), box_.resize(in.count * 4);
     transmittance_.resize(int64_t(camera_.width) * camera_.height);
     ProjectArgs project_args{in.count, in.means, in.quaternions, in.scales, in.opacities, camera_,
@@ -133,6 +143,8 @@ void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, flo
     auto project_chunk = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(project)(project_args, b, e); };
     parallel_chunks(in.count, gaussian_chunk, project_chunk);
     bin(in.count);
+    kept_ = for_backward;
+    if (kept_) rows_.resize(instance_count_ * (channels_ + 6) + 16), blocks_.resize(instance_count_);
     RasterArgs args = raster_args(in);
     args.out = out, args.alpha = alpha;
     std::vector<int64_t> pairs;
@@ -145,7 +157,7 @@ void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, flo
 void Rasterizer::backward(const GaussianInputs &in, const float *out, const float *grad_out, const float *grad_alpha,
                           const Gradients &gradients) {
     Buffer<float> rows;
-    rows.resize(instance_count_ * (channels_ + instance_extra));
+    rows.resize(instance_count_ * (channels_ + instance_extra) + 16);
     RasterArgs args = raster_args(in);
     args.out = const_cast<float *>(out), args.grad_out = grad_out, args.grad_alpha = grad_alpha;
     args.grad_instances = rows.get();

@@ -30,7 +30,9 @@ class Rasterizer {
   public:
     // `permutation` lists the channels, those of the statistic first.
     Rasterizer(const PinholeCamera &camera, std::vector<int32_t> permutation, int statistic_channels);
-    void forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs);
+    // What a backward pass reads is kept only `for_backward`.
+    void forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs, bool for_backward);
+    bool kept() const { return kept_; }
     struct Gradients {
         float *means, *quaternions, *scales, *opacities, *features, *statistic; // statistic may be null
     };
@@ -47,8 +49,10 @@ class Rasterizer {
     PinholeCamera camera_;
     std::vector<int32_t> permutation_;
     int statistic_channels_, channels_, tiles_x_, tiles_y_;
+    bool kept_ = false;
     int64_t instance_count_ = 0, longest_ = 0, pairs_ = 0;
-    Buffer<float> screen_, depth_, transmittance_;
+    Buffer<float> screen_, depth_, transmittance_, rows_;
+    Buffer<uint16_t> blocks_;
     Buffer<int32_t> box_, gaussians_;
     Buffer<int64_t> instance_begin_, tile_begin_, instances_;
 };

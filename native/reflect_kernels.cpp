@@ -9,6 +9,7 @@ namespace POLARGUIDE_ISA {
 namespace {
 
 constexpr float shortest_normal = 1e-3f, brightest = 5.0f; // log of light
+constexpr float least_alpha = 1e-6f;
 
 struct Mirror {
     float normal[3], inverse; // unit, and 1 / length
@@ -133,6 +134,29 @@ void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t en
             radial += by_unit[k] * m.normal[k];
         }
         for (int k = 0; k < 3; ++k) to[k] += m.inverse * (by_unit[k] - (m.short_ ? 0.0f : radial * m.normal[k]));
+    }
+}
+
+void gbuffer_split(const GBufferArgs &a, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+        const float *from = a.features + a.channels * i;
+        for (int k = 0; k < 3; ++k) a.normal[3 * i + k] = from[3 + k];
+        if (a.depth) a.depth[i] = from[a.channels - 1] / (a.alpha[i] > least_alpha ? a.alpha[i] : least_alpha);
+    }
+}
+
+// The gradient of everything that was read of the features, in one pass.
+void gbuffer_join(const GBufferArgs &a, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+        const float *from = a.grad_features + a.channels * i;
+        float *to = a.to_features + a.channels * i;
+        for (int c = 0; c < a.channels; ++c) to[c] = a.grad_features ? from[c] : 0.0f;
+        for (int k = 0; a.grad_normal && k < 3; ++k) to[3 + k] += a.grad_normal[3 * i + k];
+        if (!a.grad_depth) continue;
+        const bool covered = a.alpha[i] >= least_alpha;
+        const float by_last = a.grad_depth[i] / (covered ? a.alpha[i] : least_alpha);
+        to[a.channels - 1] += by_last;
+        a.to_alpha[i] = covered ? -by_last * a.depth[i] : 0.0f;
     }
 }
 

@@ -3,7 +3,7 @@
 #pragma once
 #include <stdint.h>
 
-#if defined(__AVX512F__) || defined(__AVX2__)
+#if defined(__SSE2__)
 #if defined(__GNUC__) && !defined(__clang__)
 #pragma GCC diagnostic push
 #pragma GCC diagnostic ignored "-Wmaybe-uninitialized" // GCC 12 warns about its own "undefined" vectors
@@ -23,15 +23,12 @@ namespace {
 
 constexpr int lanes = 16;
 typedef float vf __attribute__((vector_size(64), may_alias));
-typedef int32_t vi __attribute__((vector_size(64), may_alias));
 typedef float vf_unaligned __attribute__((vector_size(64), aligned(4), may_alias));
 typedef float v4f __attribute__((vector_size(16), aligned(4), may_alias));
 
 POLARGUIDE_INLINE vf splat(float x) { return vf{} + x; }
 POLARGUIDE_INLINE vf load(const float *p) { return *reinterpret_cast<const vf_unaligned *>(p); }
 POLARGUIDE_INLINE void store(float *p, vf x) { *reinterpret_cast<vf_unaligned *>(p) = x; }
-POLARGUIDE_INLINE vf as_float(vi x) { return reinterpret_cast<vf &>(x); }
-POLARGUIDE_INLINE vi as_int(vf x) { return reinterpret_cast<vi &>(x); }
 template <class V> POLARGUIDE_INLINE V min(V a, V b) { return a < b ? a : b; }
 template <class V> POLARGUIDE_INLINE V max(V a, V b) { return a > b ? a : b; }
 template <class V> POLARGUIDE_INLINE V clamp(V x, V low, V high) { return max(low, min(x, high)); }
@@ -48,35 +45,42 @@ typedef float reg_unaligned __attribute__((vector_size(32), aligned(4), may_alia
 typedef float reg __attribute__((vector_size(16), may_alias));
 typedef v4f reg_unaligned;
 #endif
+typedef decltype(reg{} < reg{}) ireg; // of integers: what comparisons give
 constexpr int reg_lanes = sizeof(reg) / sizeof(float);
 POLARGUIDE_INLINE reg reg_splat(float x) { return reg{} + x; }
 POLARGUIDE_INLINE reg reg_load(const float *p) { return *reinterpret_cast<const reg_unaligned *>(p); }
 POLARGUIDE_INLINE void reg_store(float *p, reg x) { *reinterpret_cast<reg_unaligned *>(p) = x; }
 
 // Bit l is set where lane l of a comparison result is true.
-POLARGUIDE_INLINE uint32_t bits(vi mask) {
+POLARGUIDE_INLINE uint32_t bits(ireg mask) {
 #if defined(__AVX512F__)
-    return _mm512_cmplt_epi32_mask(reinterpret_cast<__m512i &>(mask), _mm512_setzero_si512());
+    return _mm512_movepi32_mask(reinterpret_cast<__m512i &>(mask));
 #elif defined(__AVX2__)
-    struct Halves {
-        __m256 low, high;
-    } h = reinterpret_cast<Halves &>(mask);
-    return uint32_t(_mm256_movemask_ps(h.low)) | uint32_t(_mm256_movemask_ps(h.high)) << 8;
+    return uint32_t(_mm256_movemask_ps(reinterpret_cast<__m256 &>(mask)));
+#elif defined(__SSE2__)
+    return uint32_t(_mm_movemask_ps(reinterpret_cast<__m128 &>(mask)));
 #else
     uint32_t result = 0;
-    for (int l = 0; l < lanes; ++l) result |= uint32_t(mask[l] != 0) << l;
+    for (int l = 0; l < reg_lanes; ++l) result |= uint32_t(mask[l] != 0) << l;
     return result;
 #endif
 }
-POLARGUIDE_INLINE bool any(vi mask) {
-#if defined(__AVX512F__) || defined(__AVX2__)
+POLARGUIDE_INLINE bool any(ireg mask) {
+#if defined(__SSE2__)
     return bits(mask) != 0;
 #else
     typedef int64_t v2l __attribute__((vector_size(16), may_alias));
-    const v2l *q = reinterpret_cast<const v2l *>(&mask);
-    v2l o = (q[0] | q[1]) | (q[2] | q[3]);
-    return (o[0] | o[1]) != 0;
+    const v2l halves = reinterpret_cast<const v2l &>(mask);
+    return (halves[0] | halves[1]) != 0;
 #endif
+}
+
+template <class V> POLARGUIDE_INLINE V square_root(V x) {
+    alignas(64) float t[sizeof(V) / sizeof(float)];
+    __builtin_memcpy(t, &x, sizeof x);
+    for (float &value : t) value = __builtin_sqrtf(value); // one instruction for the whole vector
+    __builtin_memcpy(&x, t, sizeof x);
+    return x;
 }
 
 // 1/x to about 1e-7 relative; x in a normal range.
@@ -111,6 +115,32 @@ template <class V> POLARGUIDE_INLINE V log2(V x) {
     V s = (m - 1.0f) * reciprocal(m + 1.0f), q = s * s; // log m = 2 artanh s
     V series = (((q * 0.111111111f + 0.142857143f) * q + 0.2f) * q + 0.333333333f) * q + 1.0f;
     return __builtin_convertvector(exponent, V) + s * series * 2.88539008f;
+}
+
+// As many rows of W floats as V has lanes, one vector a column, and back; rows from n on are zero, or left alone.
+template <int W, class V> POLARGUIDE_INLINE void load_columns(const float *rows, int n, V *columns) {
+    constexpr int count = sizeof(V) / sizeof(float);
+    alignas(64) float t[W][count] = {};
+    if (n == count) { // a constant count: the loop is unrolled
+        for (int l = 0; l < count; ++l)
+            for (int i = 0; i < W; ++i) t[i][l] = rows[W * l + i];
+    } else {
+        for (int l = 0; l < n; ++l)
+            for (int i = 0; i < W; ++i) t[i][l] = rows[W * l + i];
+    }
+    __builtin_memcpy(columns, t, sizeof t);
+}
+template <int W, class V> POLARGUIDE_INLINE void store_columns(float *rows, int n, const V *columns) {
+    constexpr int count = sizeof(V) / sizeof(float);
+    alignas(64) float t[W][count];
+    __builtin_memcpy(t, columns, sizeof t);
+    if (n == count) {
+        for (int l = 0; l < count; ++l)
+            for (int i = 0; i < W; ++i) rows[W * l + i] = t[i][l];
+    } else {
+        for (int l = 0; l < n; ++l)
+            for (int i = 0; i < W; ++i) rows[W * l + i] = t[i][l];
+    }
 }
 
 // out[c][r] = in[r][c] for 16 x 16 floats; rows are `in_stride` and `out_stride` apart.

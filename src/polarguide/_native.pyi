@@ -36,6 +36,7 @@ class Rasterizer:
         alpha: Tensor,
         radius: Tensor,
         count_pairs: bool = False,
+        for_backward: bool = True,
     ) -> None: ...
     def backward(
         self,
@@ -85,7 +86,7 @@ def harmonics_backward(
     dc: Tensor,
     rest: Tensor,
     grad_out: Tensor,
-    grad_means: Tensor,
+    grad_means: Tensor | None,
     grad_dc: Tensor,
     grad_rest: Tensor,
 ) -> None: ...
@@ -139,3 +140,47 @@ def reflect_backward_layers(
 def reflect_backward_directions(
     features: Tensor, rays: Tensor, grad_directions: Tensor, grad_features: Tensor
 ) -> None: ...
+def gbuffer_split(features: Tensor, alpha: Tensor, normal: Tensor, depth: Tensor | None) -> None: ...
+def gbuffer_join(
+    alpha: Tensor,
+    depth: Tensor | None,
+    grad_features: Tensor | None,
+    grad_normal: Tensor | None,
+    grad_depth: Tensor | None,
+    to_features: Tensor,
+    to_alpha: Tensor | None,
+) -> None: ...
+def polarization(
+    normal: Tensor,
+    rays: Tensor,
+    rotation: Tensor,
+    specular: Tensor,
+    diffuse: Tensor,
+    measured: Tensor,
+    analyzers: Tensor,
+    weight: Tensor | None,
+    factor: float,
+    refractive_index: float,
+    grad_normal: Tensor,
+    grad_specular: Tensor,
+    grad_diffuse: Tensor,
+) -> float: ...
+def direction(
+    normal: Tensor,
+    directions: Tensor,
+    weight: Tensor | None,
+    factor: float,
+    plane: bool,
+    grad_normal: Tensor,
+) -> float: ...
+def consistency(
+    normal: Tensor,
+    rays: Tensor,
+    rotation: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    weight: Tensor | None,
+    factor: float,
+    grad_normal: Tensor,
+    grad_depth: Tensor,
+) -> float: ...

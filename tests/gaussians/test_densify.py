@@ -13,7 +13,9 @@ from polarguide.gaussians.free_space import FreeSpace
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 from polarguide.gaussians.geometry import quaternions_to_rotations
 
-SETTINGS = Densification(gradient=1.0, dense_share=0.1, minimum_opacity=0.05, maximum_scale_share=0.5)
+SETTINGS = Densification(
+    gradient=1.0, dense_share=0.1, minimum_opacity=0.05, maximum_scale_share=0.5, far_scale_share=0.3
+)
 EXTENT = 2.0
 SMALL, LARGE = 0.05, 0.5  # the border is dense_share * extent = 0.2
 RATES = dict.fromkeys(CORE_SHAPES, 0.01)
@@ -120,14 +122,15 @@ def test_the_last_one_is_never_pruned() -> None:
 
 def test_huge_ones_are_pruned_only_when_asked_and_far_ones_are_exempt() -> None:
     def scene() -> Gaussians:
-        rows = rows_of([0.9, 1.1, 1.1])  # the border is maximum_scale_share * extent = 1 near the middle
-        rows.overwrite("means", torch.tensor([[0.1, 0, 0], [0.1, 0, 0], [0, 30.0, 0]]))
+        # The border is maximum_scale_share * extent = 1 near the middle, and far_scale_share * 10 = 3 far away.
+        rows = rows_of([0.9, 1.1, 2.9, 3.1])
+        rows.overwrite("means", torch.tensor([[0.1, 0, 0], [0.1, 0, 0], [0, 10.0, 0], [0, 10.0, 0]]))
         return rows
 
-    for prune_large, expected in ((False, [1, 1, 1]), (True, [1, 0, 1])):
+    for prune_large, expected in ((False, [1, 1, 1, 1]), (True, [1, 0, 1, 0])):
         rows = scene()
         before = rows.snapshot()
-        round_of(rows, pulled([0.0] * 3), prune_large=prune_large)
+        round_of(rows, pulled([0.0] * 4), prune_large=prune_large)
         assert counted(rows, before) == expected
 
 
@@ -193,3 +196,9 @@ def test_the_mean_gradient_is_over_the_pictures_in_which_it_was_seen() -> None:
     # In units of half a picture: x counts 10-fold and y 20-fold.
     expected = torch.tensor([math.hypot(30, 80), 10.0, 0.0])
     torch.testing.assert_close(statistics.mean(), expected)
+
+
+def test_huge_ones_are_pruned_from_a_share_of_the_steps_on_and_not_before_the_least() -> None:
+    settings = Densification(large_from=0.2, large_minimum=30)
+    assert [settings.prunes_large(step, 1000) for step in (199, 200, 999)] == [False, True, True]
+    assert [settings.prunes_large(step, 100) for step in (20, 29, 30)] == [False, False, True]

@@ -13,6 +13,7 @@ from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import (
     Initialization,
+    far_away,
     initial_parameters,
     neighbor_distance,
     scene_extent,
@@ -96,3 +97,12 @@ def test_points_at_one_place_have_a_positive_spacing() -> None:
 def test_the_extent_is_a_tenth_more_than_the_farthest_camera() -> None:
     centers = torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0], [2.0, -3.0, 0]])
     assert scene_extent(centers) == pytest.approx(3.3)
+
+
+def test_far_away_is_what_lies_beyond_the_cameras() -> None:
+    points, colors, centers = capture()
+    middle = points.median(dim=0).values
+    places = middle + torch.tensor([[0.0, 3.0, 0.0], [0.0, 0.0, -6.0], [5.5, 0.0, 0.0]])
+    assert far_away(places, points, centers).tolist() == [False, True, True]
+    rows = initial_parameters(points, colors, centers, SETTINGS, seed=0)
+    assert far_away(rows["means"], points, centers).tolist() == [False] * 30 + [True] * 40

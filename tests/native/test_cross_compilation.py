@@ -43,7 +43,7 @@ def test_the_kernels_compile_for_aarch64_without_warnings(tmp_path: Path) -> Non
     call("cmake", "--build", tmp_path, "--target", "polarguide_core")
     objects = list(tmp_path.rglob("*.o"))
     names = {path.name.split(".")[0] for path in objects}
-    assert {"raster_kernels", "project_kernels", "rasterizer", "dispatch"} <= names
+    assert {"raster_kernels", "raster_backward_kernels", "project_kernels", "rasterizer", "dispatch"} <= names
     for path in objects:
         machine = int.from_bytes(path.read_bytes()[18:20], "little")
         assert machine == ELF_MACHINE_AARCH64, path.name

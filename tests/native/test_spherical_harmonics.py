@@ -97,6 +97,17 @@ def test_threads_do_not_change_a_bit(simd: str) -> None:
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
+@degrees
+def test_directions_without_gradient_leave_the_others_as_they_are(simd: str, degree: int) -> None:
+    means, dc, rest = gaussians(37)
+    _, to_means, *expected = with_gradients(evaluate_sh, (means, dc, rest), degree)
+    assert bool(to_means.any()) == (degree > 0)
+    leaves = [dc.clone().requires_grad_(), rest.clone().requires_grad_()]
+    out = evaluate_sh(means, CENTER, *leaves, degree)
+    (out * torch.linspace(-1, 1, out.numel()).reshape(out.shape)).sum().backward()
+    assert all(torch.equal(leaf.grad, gradient) for leaf, gradient in zip(leaves, expected, strict=True))
+
+
 def test_gaussian_at_the_camera_center(simd: str) -> None:
     means, dc, rest = gaussians(2)
     means[1] = CENTER

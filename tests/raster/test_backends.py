@@ -10,7 +10,7 @@ from raster_scenes import Outcome, differences, in_view, outcome, posed, same_bi
 
 from polarguide import _native
 from polarguide.raster import Splats, choose_backend, rasterize_reference
-from polarguide.raster.cpu import rasterize_cpu
+from polarguide.raster.cpu import native_rasterizer, rasterize_cpu
 
 # Float32 against float64. Sums over some hundred pixels and some ten layers round off about 1e-6.
 TOLERANCE = 1e-5
@@ -127,6 +127,45 @@ def test_same_bits_in_repeated_runs(simd: str) -> None:
     gaussians = in_view(posed(40, 30), 60, 8, seed=2)
     first, *others = (outcome(rasterize_cpu, gaussians, posed(40, 30), (1, 4)) for _ in range(4))
     assert all(same_bits(other, first) for other in others)
+
+
+@pytest.mark.parametrize("culled", [1, 3, 4, 7, 8, 15, 16, 17])
+def test_same_bits_wherever_in_a_vector_a_gaussian_is(simd: str, culled: int) -> None:
+    camera = posed(30, 20)
+    gaussians = in_view(camera, 37, 4, seed=8)
+    expected = outcome(rasterize_cpu, gaussians, camera, (0,))
+    # Some behind the camera, one in its center, and one without extent or direction.
+    ahead = torch.cat((-gaussians.means[: culled - 1], -(camera.translation @ camera.rotation)[None].float()))
+    rotations, scales = gaussians.rotations[:culled].clone(), gaussians.scales[:culled].clone()
+    rotations[0], scales[0] = 0, 0
+    others = Splats(ahead, rotations, scales, gaussians.opacities[:culled], gaussians.features[:culled])
+    both = Splats(*(torch.cat(pair) for pair in zip(others, gaussians, strict=True)))
+    found = outcome(rasterize_cpu, both, camera, (0,))
+    assert not found.radii[:culled].any()
+    assert not any(gradient[:culled].any() for gradient in found.gradients)
+    assert found.statistic is not None
+    shifted = Splats(*(gradient[culled:] for gradient in found.gradients))
+    found = found._replace(radii=found.radii[culled:], gradients=shifted, statistic=found.statistic[culled:])
+    assert same_bits(found, expected)
+
+
+def test_a_picture_without_gradients_has_the_same_bits_and_nothing_to_go_back_to(simd: str) -> None:
+    camera = posed(40, 30)
+    gaussians = in_view(camera, 60, 7, seed=4)
+    expected = outcome(rasterize_cpu, gaussians, camera)
+    plain = rasterize_cpu(gaussians, camera)
+    assert torch.equal(plain.features, expected.features)
+    assert torch.equal(plain.alpha, expected.alpha)
+    assert torch.equal(plain.radii, expected.radii)
+    native = native_rasterizer(camera, 7, None)
+    inputs, picture = list(gaussians), [torch.empty_like(t) for t in plain]
+    arguments = (*inputs, plain.features, plain.features, plain.alpha, *map(torch.empty_like, inputs), None)
+    for forward in (lambda: None, lambda: native.forward(*inputs, *picture, for_backward=False)):
+        forward()
+        with pytest.raises(ValueError, match="no forward pass was kept"):
+            native.backward(*arguments)
+    native.forward(*inputs, *picture)
+    native.backward(*arguments)
 
 
 def test_unknown_instruction_set_is_refused() -> None:

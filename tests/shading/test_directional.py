@@ -16,7 +16,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
 from polarguide.shading.gbuffer import render
 from polarguide.shading.mips import box_mips, mip_lookup
-from polarguide.shading.model import MAXIMUM_LOG_LIGHT, GBuffer, mirrored
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, GBuffer, harmonic_colors, mirrored
 
 SHADING = DirectionalShading(width=8, environment_resolution=8, environment_spread=1.0)
 COUNT, RESOLUTION, LEVELS = 30, 8, 5
@@ -43,6 +43,8 @@ def gaussians() -> dict[str, Tensor]:
         "quaternions": normal(2, COUNT, 4),
         "log_scales": -1.5 + 0.5 * normal(3, COUNT, 3),
         "opacity_logits": normal(4, COUNT),
+        "sh_dc": 0.5 * normal(17, COUNT, 3),
+        "sh_rest": 0.1 * normal(18, COUNT, 15, 3),
     }
     return core | SHADING.initial_parameters(torch.rand(COUNT, 3), torch.Generator().manual_seed(5))
 
@@ -147,7 +149,8 @@ def test_degenerate_normals_and_features_stay_finite_with_gradients(scale: float
     size = (20, 24)
     albedo, alpha = torch.rand(*size, 3).requires_grad_(), torch.ones(size)
     direction = (scale * normalize(normal(13, *size, 3), dim=-1)).requires_grad_()
-    further = torch.cat((torch.rand(*size, 1), scale * normal(14, *size, FEATURES)), dim=-1).requires_grad_()
+    further = torch.cat((torch.rand(*size, 1), scale * normal(14, *size, FEATURES)), dim=-1)
+    further = torch.cat((further, torch.rand(*size, 1)), dim=-1).requires_grad_()
     values = {name: t.requires_grad_() for name, t in light().items()}
     layers = SHADING.shade(GBuffer(torch.cat((albedo, direction, further), dim=-1), alpha), values, camera())
     layers["final"].square().mean().backward()
@@ -157,9 +160,11 @@ def test_degenerate_normals_and_features_stay_finite_with_gradients(scale: float
 
 
 def test_every_parameter_gets_a_gradient(gaussians: dict[str, Tensor]) -> None:
+    surface = gaussians.pop("surface")
+    surface[::4] = 0
     trained = {name: t.clone().requires_grad_() for name, t in gaussians.items()}
     values = {name: t.requires_grad_() for name, t in light().items()}
-    result = render(trained, camera(), rasterize_cpu, shading=SHADING, light=values)
+    result = render(trained | {"surface": surface}, camera(), rasterize_cpu, shading=SHADING, light=values)
     result.final.square().mean().backward()
     for name, tensor in (trained | values).items():
         assert tensor.grad is not None, name
@@ -173,11 +178,47 @@ def test_a_gaussian_alone_is_its_albedo_and_the_light_in_its_mirror(gaussians: d
     normals = torch.where((normals * rays).sum(-1, keepdim=True) > 0, -normals, normals)
     fields = SHADING.fields(gaussians)
     assert {name: tuple(t.shape[1:]) for name, t in fields.items()} == {
+        "linear_dc": (3,),
+        "linear_rest": (45,),
         "albedo": (3,),
         "roughness": (),
         "feature": (FEATURES,),
+        "surface": (),
     }
     expected = fields["albedo"] + SHADING.radiance(
         light(), mirrored(rays, normals), fields["roughness"], fields["feature"]
     )
     assert_close(SHADING.colors(gaussians, light(), rays, normals), expected)
+
+
+def test_surroundings_are_their_harmonics_without_a_specular_layer(gaussians: dict[str, Tensor]) -> None:
+    gaussians["surface"] = torch.zeros(COUNT)
+    found = render(gaussians, camera(), rasterize_cpu, shading=SHADING, light=light())
+    plain = render(gaussians, camera(), rasterize_cpu, shading=PLAIN)
+    assert_close(found.final, plain.final)
+    assert found.specular is not None
+    assert not found.specular.any()
+    assert float(found.final.max()) > 0.1
+    rays = normalize(normal(15, COUNT, 3), dim=-1)
+    assert_close(SHADING.colors(gaussians, light(), rays, -rays), harmonic_colors(gaussians, rays))
+
+
+def test_a_pixel_reflects_by_the_share_of_its_alpha_that_has_a_surface() -> None:
+    size = (20, 24)
+    shown, further = torch.rand(*size, 6), torch.rand(*size, 1 + FEATURES)
+    alpha = torch.full(size, 0.8)
+
+    def specular(surface: float) -> Tensor:
+        splatted = torch.cat((shown, further, torch.full((*size, 1), surface)), dim=-1)
+        return SHADING.shade(GBuffer(splatted, alpha), light(), camera())["specular"]
+
+    whole = specular(0.8)
+    assert float(whole.min()) > 0
+    assert_close(specular(0.2), whole / 4)
+    assert_close(specular(0.0), torch.zeros(*size, 3))
+    assert_close(specular(0.81), whole)  # rounding of a blend
+
+
+def test_what_begins_beyond_the_cameras_has_no_surface() -> None:
+    far = torch.tensor([False, True])
+    assert SHADING.placed_parameters(far)["surface"].tolist() == [1.0, 0.0]

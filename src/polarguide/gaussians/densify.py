@@ -22,8 +22,11 @@ class Densification:
             which a Gaussian is cloned or split.
         dense_share: a Gaussian wider than this share of the scene's extent is split, a smaller one cloned.
         minimum_opacity: below it a Gaussian is pruned.
-        maximum_scale_share: wider than this share of the extent is pruned once opacities have been reset; far
-            surroundings are exempt in proportion to their distance.
+        maximum_scale_share: within the extent, wider than this share of it is pruned.
+        far_scale_share: beyond it, wider than this share of the distance; a little more than the widest of the shell
+            with which the surroundings begin (``Initialization``).
+        large_from: share of all steps after which huge Gaussians are pruned: 3,000 of 30,000 in the release, where it
+            is the interval of the opacity resets. large_minimum: and never before this step.
         pixels_each: least number of pixels, of all training pictures, for each Gaussian. A Gaussian has some sixty
             parameters and a pixel three values: with fewer than twenty pixels each, unknowns outnumber data.
     """
@@ -33,7 +36,14 @@ class Densification:
     dense_share: float = 0.01
     minimum_opacity: float = 0.005
     maximum_scale_share: float = 0.1
+    far_scale_share: float = 0.25
+    large_from: float = 0.1
+    large_minimum: int = 700
     pixels_each: float = 20.0
+
+    def prunes_large(self, step: int, steps: int) -> bool:
+        """Whether a round after a number of steps, of ``steps`` in all, prunes huge Gaussians."""
+        return step >= max(self.large_minimum, self.large_from * steps)
 
 
 class DensityStatistics:
@@ -107,7 +117,7 @@ def densify(
 
     Args:
         extent: the scene's extent (``scene_extent``). middle: [3], the cameras' mean position.
-        prune_large: also prune the huge ones (after the first opacity reset).
+        prune_large: also prune the huge ones (``Densification.prunes_large``).
         empty: space in which Gaussians are pruned, too.
         limit: the largest number of Gaussians.
         generator: draws the positions of the children.
@@ -131,7 +141,8 @@ def densify(
         doomed |= empty.contains(gaussians["means"].detach())
     if prune_large:
         distance = (gaussians["means"] - middle).norm(dim=1)
-        allowed = settings.maximum_scale_share * distance.clamp(min=extent)
+        far = settings.far_scale_share * distance
+        allowed = torch.where(distance > extent, far, settings.maximum_scale_share * extent)
         doomed |= gaussians["log_scales"].exp().amax(dim=1) > allowed
     if bool(doomed.all()):
         doomed[opacity.argmax()] = False

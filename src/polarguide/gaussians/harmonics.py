@@ -99,7 +99,8 @@ class _Harmonics(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         means, center, dc, rest = ctx.saved_tensors
-        to_means, to_dc, to_rest = (torch.empty_like(t) for t in (means, dc, rest))
+        to_dc, to_rest = torch.empty_like(dc), torch.empty_like(rest)
+        to_means = torch.empty_like(means) if ctx.needs_input_grad[0] else None
         _native.harmonics_backward(
             ctx.degree, means, center, dc, rest, grad.contiguous(), to_means, to_dc, to_rest
         )

@@ -1,6 +1,6 @@
 """PLY files of Gaussians as the 3DGS release writes them, so that ordinary viewers open them.
 
-One ``vertex`` per Gaussian, float32 binary little-endian: position, normal (zero, as in the release),
+One ``vertex`` per Gaussian, float32 binary little-endian: position, normal (where the release has zero),
 spherical harmonics of the display color, opacity (logit), scales (log), rotation (w, x, y, z). Our own
 fields follow in the same vertex. Viewers that read fields by name ignore them; the SIBR viewer of the release
 reads records of a fixed size and opens only files without extra fields.
@@ -49,6 +49,7 @@ def write_ply(
     opacity_logits: Tensor,
     sh_dc: Tensor,
     sh_rest: Tensor,
+    normals: Tensor | None = None,
     extra: Mapping[str, Tensor] | None = None,
 ) -> None:
     """Write Gaussians in one step: a reader sees the old file or the whole new one.
@@ -60,6 +61,7 @@ def write_ply(
         quaternions: [N, 4] rotations (w, x, y, z).
         opacity_logits: [N] or [N, 1].
         sh_dc, sh_rest: [N, 1, 3] and [N, 15, 3] harmonics of the display (sRGB-encoded) color minus 0.5.
+        normals: [N, 3] world axes; zero, as in the release, if None.
         extra: further floating-point tensors [N, ...] by name (letters, digits, underscores). A tensor [N]
             becomes the field ``name``; one [N, ..., C] the fields ``name_0`` and so on, last axis slowest
             (channel-major, as ``f_rest``). A header comment keeps its shape.
@@ -74,13 +76,14 @@ def write_ply(
         "quaternions": (quaternions, (4,)),
         "sh_dc": (sh_dc, (1, 3)),
         "sh_rest": (sh_rest, (REST_COUNT, 3)),
+        "normals": (torch.zeros_like(means) if normals is None else normals, (3,)),
     }
     for name, (tensor, shape) in core.items():
         if tensor.shape != (count, *shape):
             raise ValueError(f"{name}: expected {[count, *shape]}, found {list(tensor.shape)}")
     if opacity_logits.numel() != count:
         raise ValueError(f"opacity_logits: expected [{count}], found {list(opacity_logits.shape)}")
-    columns = [means, torch.zeros_like(means), sh_dc, sh_rest, opacity_logits, log_scales, quaternions]
+    columns = [means, core["normals"][0], sh_dc, sh_rest, opacity_logits, log_scales, quaternions]
     names = list(RELEASE_FIELDS)
     comments = []
     for name, tensor in (extra or {}).items():

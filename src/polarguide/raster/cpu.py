@@ -52,7 +52,7 @@ class _Rasterize(torch.autograd.Function):
         out = torch.empty(camera.height, camera.width, channels)
         alpha = torch.empty(camera.height, camera.width)
         radii = torch.empty(count)
-        rasterizer.forward(*inputs, out, alpha, radii)
+        rasterizer.forward(*inputs, out, alpha, radii, for_backward=any(ctx.needs_input_grad))
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(*inputs, out)
         ctx.rasterizer = rasterizer

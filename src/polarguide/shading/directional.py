@@ -8,6 +8,10 @@ mirrored at the blended normal and ``r`` the roughness,
     final = albedo + specular
 
 in linear radiance. The MLP has two hidden layers with ReLU. The albedo does not depend on the view.
+
+Surroundings are no surface that reflects: a Gaussian that began farther away than the cameras (``surface`` 0) splats
+its harmonics in place of the albedo, and the specular light of a pixel counts by the share of its alpha that Gaussians
+with a surface have. (The release blends the two on real scenes by a sphere that the user gives.)
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from torch import Tensor
 from torch.nn.functional import relu
 
 from polarguide.camera import Camera
+from polarguide.gaussians.harmonics import SH_C0
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
@@ -32,6 +37,8 @@ from polarguide.shading.model import (
     Parameter,
     Parameters,
     ShadingModel,
+    base_colors,
+    harmonic_colors,
     mirrored,
 )
 from polarguide.vectors import unit
@@ -42,6 +49,7 @@ INPUTS = CHANNELS * (1 + FEATURES)
 ALBEDO_SCALE = 0.2
 # Pixels with less alpha than this get no specular light: there is no surface to reflect it.
 MINIMUM_ALPHA = 0.05
+SURROUNDINGS_NOTE = "The far surroundings have one color from all sides here; in the program they vary."
 _DARKEST = 1e-3  # a black point's first albedo, so that its logarithm is finite
 
 
@@ -81,11 +89,12 @@ class DirectionalShading(ShadingModel):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """``log_albedo`` [N, 3], ``roughness_logits`` [N] and ``features`` [N, 4]."""
+        """``log_albedo`` [N, 3], ``roughness_logits`` [N], ``features`` [N, 4]; ``surface`` [N] keeps its 1 or 0."""
         return {
             "log_albedo": Parameter((3,), self.albedo_rate),
             "roughness_logits": Parameter((), self.feature_rate),
             "features": Parameter((FEATURES,), self.feature_rate),
+            "surface": Parameter((), 0.0),
         }
 
     @property
@@ -99,7 +108,7 @@ class DirectionalShading(ShadingModel):
         return table
 
     def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """Albedo from the colors, one roughness, random features."""
+        """Albedo from the colors, one roughness, random features; all with a surface."""
         count = colors.shape[0]
         albedo = (self.first_albedo * colors).clamp(min=_DARKEST)
         logit = math.log(self.first_roughness / (1 - self.first_roughness))
@@ -107,7 +116,12 @@ class DirectionalShading(ShadingModel):
             "log_albedo": torch.log(albedo / ALBEDO_SCALE),
             "roughness_logits": torch.full((count,), logit),
             "features": torch.randn(count, FEATURES, generator=generator),
+            "surface": torch.ones(count),
         }
+
+    def placed_parameters(self, far: Tensor) -> dict[str, Tensor]:
+        """Surroundings have no surface."""
+        return {"surface": (~far).float()}
 
     def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Uniform texels, then the MLP: uniform within 1 / sqrt(inputs), as torch's Linear."""
@@ -145,12 +159,18 @@ class DirectionalShading(ShadingModel):
         return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
     def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
-        """Albedo [N, 3]; then roughness and feature together, [N, 5]. No harmonics are read."""
+        """Albedo, or harmonics without a surface [N, 3]; then roughness, feature and ``surface`` together, [N, 6].
+
+        Without a surface the latter are 0.
+        """
+        surface = gaussians["surface"].detach()[:, None]
+        colors = torch.where(surface > 0, albedo_of(gaussians), base_colors(gaussians, center, degree))
         roughness = torch.sigmoid(gaussians["roughness_logits"])[:, None]
-        return [albedo_of(gaussians), torch.cat((roughness, torch.tanh(gaussians["features"])), dim=1)]
+        lit = torch.cat((roughness, torch.tanh(gaussians["features"])), dim=1)
+        return [colors, torch.cat((surface * lit, surface), dim=1)]
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
-        """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the color that was splatted is albedo."""
+        """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the color that was splatted is the diffuse one."""
         albedo, normal, further, alpha = splatted.color, splatted.normal, splatted.further, splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
         directions = mirrored(rays, unit(normal, 1e-3))
@@ -160,7 +180,8 @@ class DirectionalShading(ShadingModel):
             further[..., 0].flatten(),
             further[..., 1 : 1 + FEATURES].reshape(-1, FEATURES),
         ).reshape(albedo.shape)
-        specular = radiance * (alpha > MINIMUM_ALPHA)[..., None]
+        share = (further[..., 1 + FEATURES] / alpha.clamp(min=MINIMUM_ALPHA)).clamp(max=1)
+        specular = radiance * (share * (alpha > MINIMUM_ALPHA))[..., None]
         return {"final": albedo + specular, "specular": specular, "diffuse": albedo}
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
@@ -170,28 +191,42 @@ class DirectionalShading(ShadingModel):
             rays: [N, 3] unit. normals: [N, 3] unit, facing them.
         """
         roughness, features = torch.sigmoid(gaussians["roughness_logits"]), torch.tanh(gaussians["features"])
-        return albedo_of(gaussians) + self.radiance(light, mirrored(rays, normals), roughness, features)
+        specular = self.radiance(light, mirrored(rays, normals), roughness, features)
+        return self.diffuse_colors(gaussians, rays) + gaussians["surface"][:, None] * specular
 
     def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
-        """Albedo [N, 3]."""
-        return albedo_of(gaussians)
+        """Albedo, or harmonics without a surface [N, 3]."""
+        surface = gaussians["surface"][:, None] > 0
+        return torch.where(surface, albedo_of(gaussians), harmonic_colors(gaussians, rays))
 
     def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """What a PLY of the Gaussians keeps besides display colors: ``albedo``, ``roughness``, ``feature``."""
+        """Linear harmonics, which count where ``surface`` is 0; ``albedo``, ``roughness``, ``feature``, ``surface``."""
         return {
+            **super().fields(gaussians),
             "albedo": albedo_of(gaussians),
             "roughness": torch.sigmoid(gaussians["roughness_logits"]),
             "feature": torch.tanh(gaussians["features"]),
+            "surface": gaussians["surface"],
         }
 
     def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
-        """Albedo, roughness, features; the grid's levels and the MLP."""
-        fields = self.fields(gaussians)
+        """Albedo, roughness, features; the grid's levels and the MLP.
+
+        A record has no room for features and harmonics: the surroundings have their mean color and no features, by
+        which the page knows them.
+        """
+        fields, surface = self.fields(gaussians), gaussians["surface"]
+        mean_color = (gaussians["sh_dc"] * SH_C0 + 0.5).clamp(min=0)
         layers = range(3)
         return PageShading(
             kind="directional",
-            values={"color": fields["albedo"], "share": fields["roughness"], "features": fields["feature"]},
+            values={
+                "color": torch.where(surface[:, None] > 0, fields["albedo"], mean_color),
+                "share": surface * fields["roughness"],
+                "features": surface[:, None] * fields["feature"],
+            },
             light=box_mips(light["texels"]),
             network=[m for k in layers for m in (light[f"mlp_weight_{k}"], light[f"mlp_bias_{k}"][None])],
             constants={"width": self.width},
+            notes=[] if bool((surface > 0).all()) else [SURROUNDINGS_NOTE],
         )

@@ -5,11 +5,13 @@ from __future__ import annotations
 from types import MappingProxyType
 
 import torch
+from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
 from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
+from polarguide.shading.native import split_native
 from polarguide.shading.result import RenderResult
 
 COLOR_CHANNELS = (0, 1, 2)
@@ -51,21 +53,53 @@ def render(
     channels.insert(1, axes)
     if depth:
         channels.append(((means - center) @ pose.rotation[2])[:, None])
-    splats = Splats(
+    picture = rasterize(splats(gaussians, torch.cat(channels, dim=1)), camera, statistic=statistic)
+    features, normal, camera_depth = split(picture.features, picture.alpha, normals=normals, depth=depth)
+    layers = shading.shade(GBuffer(features, picture.alpha), light, camera)
+    return RenderResult(
+        final=layers["final"],
+        base=features[..., :3],
+        **{name: layers.get(name) for name in ("specular", "diffuse", "reflection", "strength")},
+        normal=normal,
+        depth=camera_depth,
+        alpha=picture.alpha,
+        radii=picture.radii,
+    )
+
+
+Split = tuple[Tensor, Tensor | None, Tensor | None]
+
+
+def split(features: Tensor, alpha: Tensor, *, normals: bool, depth: bool) -> Split:
+    """What a result holds of its G-buffer: ``split_reference``, on the CPU in float32 with one native gradient pass."""
+    if (
+        normals
+        and features.shape[-1] > 6
+        and features.device.type == "cpu"
+        and features.dtype == torch.float32
+    ):
+        return split_native(features, alpha, depth=depth)
+    return split_reference(features, alpha, normals=normals, depth=depth)
+
+
+def split_reference(features: Tensor, alpha: Tensor, *, normals: bool, depth: bool) -> Split:
+    """Features for the shading model, blended normal [H, W, 3] and camera depth [H, W]; any dtype and device.
+
+    Args:
+        features: [H, W, D] blended color, with ``normals`` the normal, and with ``depth`` depth times alpha at last.
+        alpha: [H, W].
+    """
+    normal = features[..., 3:6] if normals else None
+    return features, normal, features[..., -1] / alpha.clamp(min=1e-6) if depth else None
+
+
+def splats(gaussians: Parameters, features: Tensor | None = None) -> Splats:
+    """Gaussians as a rasterizer takes them, with features [N, D]; none: one that is zero."""
+    means = gaussians["means"]
+    return Splats(
         means,
         gaussians["quaternions"],
         gaussians["log_scales"].exp(),
         torch.sigmoid(gaussians["opacity_logits"]),
-        torch.cat(channels, dim=1),
-    )
-    picture = rasterize(splats, camera, statistic=statistic)
-    layers = shading.shade(GBuffer(picture.features, picture.alpha), light, camera)
-    return RenderResult(
-        final=layers["final"],
-        base=picture.features[..., :3],
-        **{name: layers.get(name) for name in ("specular", "diffuse", "reflection", "strength")},
-        normal=picture.features[..., 3:6] if normals else None,
-        depth=picture.features[..., -1] / picture.alpha.clamp(min=1e-6) if depth else None,
-        alpha=picture.alpha,
-        radii=picture.radii,
+        means.new_zeros(len(means), 1) if features is None else features,
     )

@@ -45,7 +45,7 @@ class Parameter(NamedTuple):
 
     Attributes:
         shape: of one Gaussian's values; of the whole tensor for a parameter of the light.
-        rate: learning rate (Adam).
+        rate: learning rate (Adam); with 0 it keeps its first values.
         reset_minimum: a reset of the opacities raises values to at least this; None: it leaves them.
     """
 
@@ -166,6 +166,14 @@ class ShadingModel(ABC):
         """
         return {}
 
+    def placed_parameters(self, far: Tensor) -> dict[str, Tensor]:
+        """Those of ``initial_parameters`` that depend on where the first Gaussians lie, which replace them.
+
+        Args:
+            far: [N] bool, which of them lie farther away than the cameras (``gaussians.initialize.far_away``).
+        """
+        return {}
+
     def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
         """The tensors of ``light_parameters`` before the first step."""
         return {}
@@ -206,6 +214,11 @@ class ShadingModel(ABC):
     @abstractmethod
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """Layers of a picture by their names in ``RenderResult``; ``final`` at least."""
+
+    @property
+    def smooth_dielectric(self) -> bool:
+        """Whether ``predicted_stokes`` is that of a smooth dielectric, as here; False for a class with its own."""
+        return type(self).predicted_stokes is ShadingModel.predicted_stokes
 
     def predicted_stokes(self, result: RenderResult, camera: Camera) -> Tensor:
         """Stokes vectors [3, H, W, 3] of a rendered picture; here of a smooth dielectric.

@@ -1,4 +1,8 @@
-"""Deferred reflection on the CPU in one native pass; ``deferred.reflect_reference`` is its reference implementation."""
+"""Native passes over the G-buffer on the CPU.
+
+The reference implementation of ``reflect_native`` is ``deferred.reflect_reference``, that of ``split_native`` is
+``gbuffer.split_reference``.
+"""
 
 from __future__ import annotations
 
@@ -64,3 +68,56 @@ def reflect_native(
         features, rays, texels, fresnel, local, refractive_index
     )
     return final, specular, diffuse, reflection
+
+
+class _Split(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, features: Tensor, alpha: Tensor, deep: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        kept, covered = features.detach().contiguous(), alpha.detach().contiguous()
+        normal = kept.new_empty(*covered.shape, 3)
+        depth = torch.empty_like(covered) if deep else None
+        flat_depth = None if depth is None else depth.view(-1)
+        _native.gbuffer_split(kept.flatten(0, 1), covered.view(-1), normal.view(-1, 3), flat_depth)
+        ctx.save_for_backward(covered, depth)
+        ctx.channels = features.shape[-1]
+        ctx.set_materialize_grads(False)
+        return features.view_as(features), normal, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, Tensor | None, None]:
+        covered, depth = ctx.saved_tensors
+        by_features, by_normal, by_depth = (None if g is None else g.contiguous() for g in grads)
+        if by_normal is None and by_depth is None:
+            return by_features, None, None
+        to_features = covered.new_empty(*covered.shape, ctx.channels)
+        to_alpha = None if by_depth is None else torch.empty_like(covered)
+        _native.gbuffer_join(
+            covered.view(-1),
+            None if depth is None else depth.view(-1),
+            None if by_features is None else by_features.flatten(0, 1),
+            None if by_normal is None else by_normal.view(-1, 3),
+            None if by_depth is None else by_depth.view(-1),
+            to_features.flatten(0, 1),
+            None if to_alpha is None else to_alpha.view(-1),
+        )
+        return to_features, to_alpha, None
+
+
+def split_native(features: Tensor, alpha: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The blended normal and the depth of a G-buffer, with one gradient pass for them and whatever else is read.
+
+    Args:
+        features: [H, W, D] blended color, normal and at least one channel more. alpha: [H, W]. Both float32 on the CPU.
+        depth: whether the last channel is the depth times alpha.
+
+    Returns:
+        ``features`` for whoever else reads them, the normal [H, W, 3] and the depth [H, W] or None.
+
+    Raises:
+        ValueError: if a shape is not as above.
+    """
+    rest, normal, deep = _Split.apply(features, alpha, depth)
+    return rest, normal, deep

@@ -1,0 +1,145 @@
+// A tile as both passes of the blending see it: its Gaussians gathered, its blocks, and what a Gaussian covers in them.
+#pragma once
+#include "raster.h"
+#include "simd.h"
+
+namespace polarguide {
+namespace POLARGUIDE_ISA {
+namespace {
+
+constexpr float log2_minimum = -7.99435344f; // log2(1 / 255)
+constexpr float maximum_alpha = 0.99f;
+constexpr float minimum_transmittance = 1e-4f;
+constexpr float natural = 0.693147181f;
+
+alignas(64) const float lane_x[16] = {-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f,
+                                      -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f};
+alignas(64) const float lane_y[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f,
+                                      .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
+
+// The blocks (one bit each) of a tile in which log2(alpha) of a Gaussian can reach the threshold. The maximum of the
+// concave exponent over a block lies on one of the two sides that face the center. `row` is relative to the tile center.
+POLARGUIDE_INLINE uint32_t touched_blocks(const float *row) {
+    uint32_t blocks = 0;
+    const float half_ac = -0.5f * row[3], to_y = half_ac / row[4], to_x = half_ac / row[2];
+    for (int l = 0; l < lanes; l += reg_lanes) {
+        const reg bx = reg_load(lane_x + l) * 4.0f - row[0], by = reg_load(lane_y + l) * 4.0f - row[1];
+        const reg x0 = bx - 1.5f, x1 = bx + 1.5f, y0 = by - 1.5f, y1 = by + 1.5f;
+        const reg cx = clamp(reg{}, x0, x1), cy = clamp(reg{}, y0, y1);
+        const reg a = reg_splat(row[2]), b = reg_splat(row[3]), c = reg_splat(row[4]);
+        const reg ey = clamp(cx * to_y, y0, y1), ex = clamp(cy * to_x, x0, x1);
+        const reg q1 = a * cx * cx + b * cx * ey + c * ey * ey, q2 = a * ex * ex + b * ex * cy + c * cy * cy;
+        blocks |= bits(max(q1, q2) + row[5] >= log2_minimum - 1e-4f) << l;
+    }
+    return blocks;
+}
+
+struct Tile {
+    const float *rows; // [count, channels + 6]
+    int count;
+    int x0, y0;
+    float center_x, center_y;
+    int list_sizes[16];
+};
+
+POLARGUIDE_INLINE Tile open_tile(const RasterArgs &a, int64_t tile, const float *rows) {
+    Tile t;
+    t.rows = rows;
+    t.count = int(a.tile_begin[tile + 1] - a.tile_begin[tile]);
+    t.x0 = int(tile % a.tiles_x) * tile_size, t.y0 = int(tile / a.tiles_x) * tile_size;
+    t.center_x = float(t.x0) + 8.0f, t.center_y = float(t.y0) + 8.0f;
+    for (int &size : t.list_sizes) size = 0;
+    return t;
+}
+
+// Adds Gaussian `i` of the tile to the lists of the blocks that it touches.
+POLARGUIDE_INLINE void list_in_blocks(uint32_t blocks, int i, int32_t *lists, Tile *t) {
+    for (; blocks; blocks &= blocks - 1) {
+        const int block = __builtin_ctz(blocks);
+        lists[int64_t(block) * t->count + t->list_sizes[block]++] = i;
+    }
+}
+
+// Gathers the tile's Gaussians into contiguous rows and sorts them into one list per block.
+template <int D> POLARGUIDE_INLINE Tile gather_tile(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
+    const int64_t begin = a.tile_begin[tile];
+    float *rows = a.rows ? a.rows + begin * (D + 6) : s.rows;
+    Tile t = open_tile(a, tile, rows);
+    const int real = a.channels_real;
+    constexpr int ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
+    for (int i = 0; i < t.count; ++i) {
+        if (i + ahead < t.count) {
+            const int64_t next = a.gaussians[begin + i + ahead];
+            __builtin_prefetch(a.screen + next * screen_values);
+            __builtin_prefetch(a.features + next * real);
+            __builtin_prefetch(a.features + next * real + real - 1);
+        }
+        const int64_t g = a.gaussians[begin + i];
+        const float *screen = a.screen + g * screen_values, *features = a.features + g * real;
+        float *row = rows + int64_t(i) * (D + 6);
+        row[0] = screen[0] - t.center_x, row[1] = screen[1] - t.center_y;
+        for (int k = 2; k < 6; ++k) row[k] = screen[k];
+        for (int k = 0; k < real; ++k) row[6 + k] = features[a.permutation[k]];
+        for (int k = real; k < D; ++k) row[6 + k] = 0.0f;
+        const uint32_t blocks = touched_blocks(row);
+        if (a.blocks) a.blocks[begin + i] = uint16_t(blocks);
+        list_in_blocks(blocks, i, s.lists, &t);
+    }
+    return t;
+}
+
+// The same tile again in the backward pass, from what the forward pass kept.
+template <int D> POLARGUIDE_INLINE Tile reopen_tile(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
+    const int64_t begin = a.tile_begin[tile];
+    Tile t = open_tile(a, tile, a.rows + begin * (D + 6));
+    for (int i = 0; i < t.count; ++i) list_in_blocks(a.blocks[begin + i], i, s.lists, &t);
+    return t;
+}
+
+struct Block {
+    int x, y;                 // first pixel
+    float center_x, center_y; // relative to the tile center
+};
+POLARGUIDE_INLINE bool open_block(const RasterArgs &a, const Tile &t, int block, Block *out) {
+    int bx = (block & 3) * 4, by = (block >> 2) * 4;
+    out->x = t.x0 + bx, out->y = t.y0 + by;
+    out->center_x = float(bx) - 6.0f, out->center_y = float(by) - 6.0f;
+    return out->x < a.width && out->y < a.height;
+}
+
+// As many of a block's pixels as a register has lanes, from the l-th on: their centers relative to the tile center.
+struct Pixels {
+    reg x, y;
+};
+POLARGUIDE_INLINE Pixels pixels_from(const Block &b, int l) {
+    return {reg_load(lane_x + l) + b.center_x, reg_load(lane_y + l) + b.center_y};
+}
+
+struct Alpha {
+    reg value; // 0 where the Gaussian does not contribute
+    ireg capped;
+};
+POLARGUIDE_INLINE Alpha alpha_at(const float *row, const Pixels &p) {
+    Alpha r;
+    const reg dx = p.x - row[0], dy = p.y - row[1];
+    const reg e = (dx * row[2] + dy * row[3]) * dx + (dy * row[4]) * dy + row[5];
+    const reg alpha = exp2(max(e, reg_splat(-30.0f)));
+    r.capped = alpha > maximum_alpha;
+    r.value = e >= log2_minimum ? min(alpha, reg_splat(maximum_alpha)) : reg{};
+    return r;
+}
+
+} // namespace
+} // namespace POLARGUIDE_ISA
+} // namespace polarguide
+
+#define POLARGUIDE_BY_CHANNELS(function)                                                                               \
+    switch (a.channels) {                                                                                              \
+    case 3: return function<3>(a, tile, s);                                                                            \
+    case 4: return function<4>(a, tile, s);                                                                            \
+    case 7: return function<7>(a, tile, s);                                                                            \
+    case 8: return function<8>(a, tile, s);                                                                            \
+    case 12: return function<12>(a, tile, s);                                                                          \
+    case 16: return function<16>(a, tile, s);                                                                          \
+    default: return function<32>(a, tile, s);                                                                          \
+    }
