@@ -88,7 +88,7 @@ def test_every_key_has_its_definition():
         "diffuse_psnr_aligned": HIGHEST_PSNR,
     }
     assert {key: got[key] for key in expected} == pytest.approx(expected)
-    assert set(got) == {*VIEW_KEYS, "lpips_reason"}
+    assert set(got) == {*VIEW_KEYS, "lpips_reason", "stokes_error_reason"}
     assert len({round(expected[key], 6) for key in list(expected)[:7]}) == 7
 
 
@@ -199,6 +199,32 @@ def test_metrics_file(tmp_path, views):
     assert read["provenance"] == PROVENANCE
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
     record.validate_metrics(read)
+
+
+ERRORS = {
+    "pixels": 12,
+    "views": 2,
+    "psnr": 30.0,
+    "normal_mae_deg": 4.5,
+    "specular_psnr": None,
+    "diffuse_psnr": 20.0,
+    "stokes_error": 0.5,
+}
+
+
+def test_errors_by_object_are_part_of_the_record(tmp_path, views):
+    objects, materials = {"cup": {"material": "dielectric", **ERRORS}}, {"dielectric": ERRORS}
+    given = {"views": views, "run": {}, "provenance": PROVENANCE}
+    record.write_metrics(tmp_path / "metrics.json", **given, objects=objects, materials=materials)
+    read = record.read_metrics(tmp_path)
+    assert (read["objects"], read["materials"]) == (objects, materials)
+    record.write_metrics(tmp_path / "metrics.json", **given)
+    assert record.read_metrics(tmp_path)["objects"] == {}
+    wrong = {"cup": {key: value for key, value in objects["cup"].items() if key != "stokes_error"}}
+    with pytest.raises(PolarguideError, match="stokes_error"):
+        record.write_metrics(tmp_path / "metrics.json", **given, objects=wrong)
+    with pytest.raises(PolarguideError, match="a number or null"):
+        record.write_metrics(tmp_path / "metrics.json", **given, materials={"metal": {**ERRORS, "psnr": "x"}})
 
 
 def test_failed_write_leaves_the_old_file(tmp_path, views):

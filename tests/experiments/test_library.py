@@ -61,6 +61,7 @@ def test_a_comparison_and_an_ablation_share_runs(
     )
     assert [(r["recipe"], r["state"]) for r in results["runs"]] == [("3dgs-dr", "done"), (only, "failed")]
     assert "run.json" in str(results["runs"][1]["error"])
+    assert results["settings"]["against"] == "3dgs-dr"
     assert capfd.readouterr() == ("", "")
 
 
@@ -68,6 +69,10 @@ def test_a_recipe_that_other_processes_do_not_know_is_refused(demo_scene: Path, 
     changed = dataclasses.replace(recipe_named("3dgs"), ssim_weight=0.3)
     with pytest.raises(PolarguideError, match="expected the registered recipe 3dgs, found one of this name"):
         polarguide.compare([demo_scene], [changed], tmp_path / "out")
+    with pytest.raises(PolarguideError, match="against: expected one of 3dgs, found 3dgs-dr"):
+        polarguide.compare(
+            [demo_scene], ["3dgs"], tmp_path / "out", options=CompareOptions(against="3dgs-dr")
+        )
     with pytest.raises(PolarguideError, match="recipe: expected one of"):
         polarguide.compare([demo_scene], ["magic"], tmp_path / "out")
     with pytest.raises(PolarguideError, match="compare: expected a scene, found none"):

@@ -15,6 +15,7 @@ from polarguide.evaluation.evaluate import evaluate
 from polarguide.evaluation.sources import scoring_digest
 from polarguide.experiments import plan as plans
 from polarguide.experiments.ablate import ablated
+from polarguide.experiments.compare import compare
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
 from polarguide.options import SceneOptions
@@ -76,6 +77,18 @@ def test_seeds_count_up_from_that_of_the_settings() -> None:
     assert [run.settings.seed for run in runs] == [3, 3, 4, 4]
 
 
+def test_a_recipe_may_have_seeds_of_its_own() -> None:
+    runs = plan_runs(asked(settings=TrainSettings(40, 3), seeds_of={"3dgs": 3}), [ENTRY])
+    found = [(run.recipe.name, run.settings.seed) for run in runs]
+    other = "polarguide:without-normals"
+    assert found == [("3dgs", 3), (other, 3), ("3dgs", 4), (other, 4), ("3dgs", 5)]
+    assert folders(seeds_of={"3dgs": 1}) == [folders()[k] for k in (0, 1, 3)]
+    with pytest.raises(PolarguideError, match="seeds_of: expected one of 3dgs, found 3dgs-dr"):
+        compare(["none"], ["3dgs"], "none", seeds_of={"3dgs-dr": 2})
+    with pytest.raises(PolarguideError, match="seeds_of: expected 1 or more"):
+        compare(["none"], ["3dgs"], "none", seeds_of={"3dgs": 0})
+
+
 def test_another_scene_recipe_value_or_program_has_another_key(monkeypatch: pytest.MonkeyPatch) -> None:
     def key(scene: str = "s", recipe: dict[str, Any] | None = None, code: str = "c", seed: int = 0) -> str:
         data = RECIPES["3dgs"].data() if recipe is None else recipe
@@ -95,6 +108,7 @@ def test_the_command_in_the_record_asks_for_the_same() -> None:
     assert command.startswith(
         "polarguide compare 'my cup' --recipes 3dgs polarguide:without-normals --steps 40"
     )
+    assert asked(asked="polarguide bench --out x").command == "polarguide bench --out x"
 
 
 @pytest.fixture

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import base64
+import hashlib
+import itertools
 import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from comparison_records import results, run, unfinished
+from browsers import chromium
+from comparison_records import part, results, run, unfinished
 
 from polarguide.experiments.curves import Curve, curves_svg, read_curve, smoothed, ticks
+from polarguide.experiments.forms import sections
 from polarguide.experiments.report import report_html
 from polarguide.visualization.embedded import Tile, chosen_views, data_uri, embed
 
+FREE = ("r:unpolarized", "r:unpolarized-without-consistency")
 EVIL = "</script><img src=x onerror=alert(1)>&\"'"
 
 
@@ -69,6 +75,72 @@ def test_nothing_comes_from_outside() -> None:
     reader.feed(text)
     assert not {"link", "iframe", "object", "base"} & set(reader.tags)
     assert not [value for key, value in reader.attributes if key in ("src", "href", "action")]
+
+
+def bench() -> dict[str, Any]:
+    """A comparison with controls, objects, unequal seeds and runs that are missing."""
+    rng = np.random.default_rng(0)
+    runs = []
+    levels = {
+        "3dgs": (30.0, 25.0),
+        "3dgs-dr": (30.2, 15.0),
+        "r": (31.0, 6.0),
+        FREE[0]: (30.8, 9.0),
+        FREE[1]: (31.1, 14.0),
+    }
+    for scene, (recipe, (psnr, angle)) in itertools.product(("figure", "kit", "ceramic"), levels.items()):
+        for seed in range(3 if recipe in ("r", FREE[0]) else 1):
+            views = {
+                f"v{k}": {"psnr": psnr + k + rng.normal(0, 0.2), "normal_mae_deg": angle + rng.normal(0, 0.3)}
+                for k in range(4)
+            }
+            parts = {
+                f"{scene} ball": part("metal", psnr=psnr - 3, normal_mae_deg=angle + 5),
+                f"{scene} vase": part(
+                    "plastic", psnr=psnr + 1 + rng.normal(0, 0.1), normal_mae_deg=angle - 1
+                ),
+            }
+            means = {
+                key: float(np.mean([view[key] for view in views.values()]))
+                for key in ("psnr", "normal_mae_deg")
+            }
+            made = run(scene, recipe, seed, **means, gaussians=1000)
+            materials = {scores["material"]: scores for scores in parts.values()}
+            runs.append(made | {"views": views, "objects": parts, "materials": materials})
+    runs[-1] = unfinished("ceramic", FREE[1], 0, "disk full")
+    return results(runs, against="3dgs-dr", black=("ceramic",))
+
+
+def test_every_section_is_on_the_page_and_in_the_browser(tmp_path: Path) -> None:
+    record = bench()
+    sheets = {"figure": [("r", "runs/figure/r/0-ab cd/errors.png")]}
+    path = tmp_path / "report.html"
+    path.write_text(report_html(record, [], {"figure": []}, [], sheets), encoding="utf-8")
+    with chromium() as browser:
+        view = browser.new_page(viewport={"width": 1500, "height": 1000})
+        faults: list[str] = []
+        view.on("pageerror", lambda error: faults.append(str(error)))
+        view.goto(path.as_uri())
+        titles = view.locator("h2:visible").all_inner_texts()
+        assert titles[:6] == [
+            "Scores on held-out views",
+            "What polarization buys",
+            "Differences to 3dgs-dr",
+            "By object",
+            "By material",
+            "Where the error is",
+        ]
+        for section in sections(record):
+            rows = view.locator(f"#{section.key} tbody tr")
+            assert rows.count() == sum(len(block.rows) for block in section.blocks)
+            wide = view.locator(f"#{section.key}").evaluate("e => e.scrollWidth <= e.clientWidth + 1")
+            assert wide, f"{section.key} runs out of its panel"
+        assert view.locator("#sheets a").get_attribute("href") == "runs/figure/r/0-ab%20cd/errors.png"
+        buys = view.locator("#controls tbody tr").last.inner_text()
+        assert "over scenes" in buys
+        assert "3 scenes" in buys
+        assert "failed" in view.locator("#scores tbody").nth(2).inner_text()
+        assert not faults
 
 
 def test_the_page_says_what_it_holds() -> None:
@@ -147,3 +219,12 @@ def test_ticks_are_round_and_enclose(low: float, high: float, expected: list[flo
     assert found[0] <= low < found[-1] or found[0] <= low <= high <= found[-1]
     assert found[-1] > found[0]
     assert expected is None or found == expected
+
+
+def test_no_script_but_its_own_may_run() -> None:
+    text = report_html(results([run("cup", "a", 0, psnr=30.0)]), [], {"cup": []})
+    (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)
+    (script,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert policy.startswith(f"default-src 'none'; script-src 'sha256-{digest}';")
+    assert " onclick=" not in text.replace(script, "")

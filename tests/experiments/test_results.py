@@ -12,7 +12,7 @@ from comparison_records import results, run
 
 from polarguide.errors import PolarguideError
 from polarguide.experiments.results import read_results, validate_results, write_results
-from polarguide.experiments.tables import blocks, shown_columns
+from polarguide.experiments.tables import scores_section, shown_columns
 
 STORED = Path(__file__).parents[2] / "benchmarks" / "results"
 
@@ -31,11 +31,12 @@ def test_what_is_written_passes(record: dict[str, Any], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        (("format",), "other", "(format): expected polarguide-results-1, found "),
+        (("format",), "other", "(format): expected polarguide-results-2, found "),
         (("provenance", "date"), None, "(provenance.date): expected text, found null"),
         (("provenance", "commit"), 3, "(provenance.commit): expected text or null, found 3"),
         (("settings", "steps"), "10", "(settings.steps): expected a whole number, found "),
         (("settings", "seeds"), True, "(settings.seeds): expected a whole number, found true"),
+        (("settings", "against"), "c", "(settings.against): expected one of the recipes a, found "),
         (("scenes",), [], "(scenes): expected a list"),
         (("scenes", 1, "name"), "x", "(scenes): expected every name once, found ["),
         (("recipes", 0, "data"), [], "(recipes[0].data): expected a JSON object {...}, found []"),
@@ -80,7 +81,29 @@ def test_numbers_in_a_file_are_finite(record: dict[str, Any], tmp_path: Path) ->
 @pytest.mark.parametrize("path", sorted(STORED.glob("*.json")), ids=lambda path: path.stem)
 def test_stored_results_are_read_and_shown(path: Path) -> None:
     stored = read_results(path)
-    assert len(blocks(stored)) == len(stored["scenes"]) + (len(stored["scenes"]) > 1)
+    assert len(scores_section(stored).blocks) == len(stored["scenes"]) + (len(stored["scenes"]) > 1)
+
+
+def test_a_record_of_the_version_before_is_completed(tmp_path: Path) -> None:
+    record = results([run("x", "r", 0, psnr=30.0), run("x", "r:unpolarized", 0, psnr=28.0)])
+    former = copy.deepcopy(record) | {"format": "polarguide-results-1"}
+    del former["differences"], former["settings"]["against"], former["scenes"][0]["black_share"]
+    for item in former["runs"]:
+        del item["objects"], item["materials"]
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(former))
+    record["scenes"][0]["black_share"] = None
+    assert read_results(path) == record
+    assert [d["mean"] for d in record["differences"]] == [2.0]
+
+
+@pytest.mark.parametrize("key", ["settings", "scenes", "runs"])
+@pytest.mark.parametrize("value", [None, 3, "x", [3]])
+def test_a_broken_record_of_the_version_before_is_named(key: str, value: object, tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps({**results([run("x", "r", 0)]), "format": "polarguide-results-1", key: value}))
+    with pytest.raises(PolarguideError, match=rf"results\.json \({key}"):
+        read_results(path)
 
 
 def test_a_record_from_before_a_metric_has_no_value_of_it(record: dict[str, Any]) -> None:

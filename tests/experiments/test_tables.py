@@ -10,7 +10,8 @@ from comparison_records import results, run, unfinished
 
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.aggregate import aggregate, cell_of
-from polarguide.experiments.tables import best_rows, blocks, csv_text, latex, latex_text, markdown, notes
+from polarguide.experiments.forms import csv_text, latex, latex_text, markdown
+from polarguide.experiments.tables import leading_rows, notes, scores_section
 
 BY_KEY = {column.key: column for column in COLUMNS}
 
@@ -58,7 +59,7 @@ def test_means_over_different_scenes_are_not_compared() -> None:
     ("key", "values", "best"),
     [
         ("psnr", (30.0, 31.0, 29.0), {1}),
-        ("normal_mae_deg", (20.0, 19.0, 21.0), {1}),
+        ("normal_mae_deg", (20.5, 19.0, 21.0), {1}),
         ("psnr", (30.004, 30.0, 29.0), {0, 1}),  # the same number as shown
         ("psnr", (30.0, None, 30.0), {0, 2}),
         ("psnr", (None, 31.0, None), set()),  # nothing to be better than
@@ -68,7 +69,8 @@ def test_means_over_different_scenes_are_not_compared() -> None:
 def test_the_best_is_marked(key: str, values: tuple[float | None, ...], best: set[int]) -> None:
     names = [f"r{index}" for index in range(len(values))]
     runs = [run("cup", name, 0, **{key: value}) for name, value in zip(names, values, strict=True)]
-    assert best_rows(aggregate(runs, ["cup"], names), BY_KEY[key]) == best
+    record = results(runs)
+    assert leading_rows(record["table"], BY_KEY[key], record) == best
 
 
 def test_what_is_not_there_is_told_apart() -> None:
@@ -77,8 +79,9 @@ def test_what_is_not_there_is_told_apart() -> None:
         run("cup", "polarguide", 0, psnr=31.0, specular_psnr=25.0, fps=60.0),
         unfinished("cup", "broken", 0, "disk full"),
     ]
-    (block,) = blocks(results(runs))
-    shown = {recipe: [cell.value for cell in cells] for recipe, cells in block.rows}
+    (block,) = scores_section(results(runs)).blocks
+    shown = {row.labels[0].text: [cell.value for cell in row.cells] for row in block.rows}
+    assert [row.labels[0].remark for row in block.rows] == ["", "", "failed"]
     assert shown == {  # PSNR, specular PSNR, Gaussians, FPS
         "3dgs": ["30.00", "n/a", "1,200", ""],
         "polarguide": ["31.00", "25.00", "n/a", "60.0"],
@@ -117,8 +120,8 @@ def test_latex() -> None:
     runs = [run("my_cup", "a", s, psnr=30.0 + s) for s in (0, 1)] + [run("my_cup", "b&c", 0, psnr=29.0)]
     text = latex(results(runs))
     assert "\\emph{my\\_cup}" in text
-    assert "a & \\textbf{30.50} $\\pm$ 0.71 \\\\" in text
-    assert "b\\&c & 29.00 \\\\" in text
+    assert "a (2 seeds) & \\textbf{30.50} $\\pm$ 0.71 \\\\" in text
+    assert "b\\&c (1 seed) & 29.00 \\\\" in text
     assert "PSNR (dB) $\\uparrow$" in text
     for word in ("\\toprule", "\\midrule", "\\bottomrule", "\\begin{tabular}{lr}", "\\end{tabular}"):
         assert word in text
@@ -143,3 +146,12 @@ def test_notes_name_what_failed() -> None:
     assert "x, b, seed 0 failed: disk full" in said
     assert "x, c, seed 0 has not finished" in said
     assert not any("LPIPS" in note for note in said)
+
+
+def test_names_are_no_formulas_in_a_spreadsheet() -> None:
+    rows = list(
+        csv.DictReader(
+            io.StringIO(csv_text(results([run(name, "a", 0, psnr=30.0) for name in ("=1+1", "@x", "cup")])))
+        )
+    )
+    assert {row["scene"] for row in rows} >= {"'=1+1", "'@x", "cup"}

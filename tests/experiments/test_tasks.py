@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from polarguide.evaluation.evaluate import evaluate
 from polarguide.experiments import compare as comparing
-from polarguide.experiments.collect import BESIDE_OTHERS, collect
+from polarguide.experiments.collect import BESIDE_OTHERS, _black_share, collect, write_tables
 from polarguide.experiments.jobs import Job
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
@@ -91,6 +94,40 @@ def test_seconds_count_only_alone(planned: Planned, trained: Path) -> None:
     (record,) = collect(question, scenes, [only], {only.folder: "an old error"})["runs"]
     assert (record["metrics"]["train_seconds"], record["metrics"]["fps"]) == (None, 60.0)
     assert record["error"] is None
+
+
+def test_objects_materials_and_black_pixels_are_collected(planned: Planned, trained: Path) -> None:
+    question, scenes, only = planned
+    shutil.copytree(trained, only.folder)
+    score(only.folder, objects={}, materials={})
+    record = collect(question, scenes, [only], {})
+    assert (record["runs"][0]["objects"], record["runs"][0]["materials"]) == ({}, {})
+    assert record["scenes"][0]["black_share"] < 0.01
+    values = {
+        "psnr": 20.0, "normal_mae_deg": None, "specular_psnr": None, "diffuse_psnr": 30.0, "stokes_error": 0.5,
+    }  # fmt: skip
+    scores = {"pixels": 7, "views": 1, **values}
+    score(only.folder, objects={"ball": {"material": "metal", **scores}}, materials={"metal": scores})
+    (run,) = collect(question, scenes, [only], {})["runs"]
+    expected = {"pixels": 7, "views": 1, "metrics": values}
+    assert run["objects"] == {"ball": {"material": "metal", **expected}}
+    assert run["materials"] == {"metal": {"material": None, **expected}}
+    # What an earlier comparison in the folder had, and this one has not, goes.
+    (question.out / "differences.csv").touch()
+    write_tables(question.out, collect(question, scenes, [only], {}))
+    assert sorted(path.name for path in question.out.glob("*.*")) == [
+        "parts.csv", "results.csv", "results.json", "results.md", "results.tex",
+    ]  # fmt: skip
+
+
+def test_black_pixels_are_counted_where_there_is_a_picture(tmp_path: Path) -> None:
+    picture = np.zeros((4, 5, 3), np.uint16)
+    picture[1, 2] = (0, 200, 0)  # one pixel is not black
+    (tmp_path / "polar").mkdir()
+    cv2.imwrite(str(tmp_path / "polar" / "v0_000.png"), picture)
+    entry = SceneEntry(tmp_path, "x", "digest", 2, ("v0",))
+    assert _black_share(entry) == pytest.approx(19 / 20)
+    assert _black_share(dataclasses.replace(entry, test_views=("v1",))) is None
 
 
 class Warnings(Reporter):

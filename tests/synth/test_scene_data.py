@@ -60,8 +60,17 @@ def test_presets_are_full_scenes(name: str) -> None:
     assert spec.exposure
     if name != "proof":
         assert spec.about
-        assert len(spec.things) >= 8
+        assert len(spec.things) >= (5 if spec.object_only else 8)
         assert not all(thing.foreground for thing in spec.things)
+
+
+def test_a_field_that_is_off_is_not_part_of_the_request() -> None:
+    """Folders that were begun before the field existed go on."""
+    assert "object_only" not in parsed().data()
+    assert parsed(object_only=False) == parsed()
+    alone = parsed(object_only=True)
+    assert alone.data()["object_only"]
+    assert parse_scene(alone.data(), "again", folder=Path()) == alone
 
 
 def test_keys_of_earlier_versions_are_accepted() -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import scipy.ndimage
@@ -88,6 +89,34 @@ def test_points_lie_near_surfaces(scene: Path) -> None:
     ground = np.abs(points[:, 2])
     ball = np.abs(np.linalg.norm(points - [0, 0, 0.6], axis=1) - 0.6)
     assert np.median(np.minimum(ground, ball)) < 0.15  # sixteen pixels are coarse
+
+
+def test_object_only_blackens_all_else_and_nothing_of_the_object(
+    scene: Path, spec: SceneSpec, variant: Variant, tmp_path: Path
+) -> None:
+    """Light, ground truth and points of the object are those of the full scene, whose ground it still mirrors."""
+    alone = msgspec.structs.replace(spec, object_only=True)
+    out = synthesize(alone, tmp_path / "alone", SETTINGS, Reporter(), threads=1)
+    with np.load(out / "gt" / "v000.npz") as found, np.load(scene / "gt" / "v000.npz") as full:
+        ball = full["objid"] == 2
+        inside, near = (scipy.ndimage.binary_erosion(ball), scipy.ndimage.binary_dilation(ball))
+        assert inside.sum() > 10
+        assert (~near).sum() > 10
+        for name in ("stokes", "specular", "diffuse"):
+            np.testing.assert_allclose(found[name][..., inside, :], full[name][..., inside, :], rtol=2e-3)
+            assert not found[name][..., ~near, :].any()
+            assert full[name][..., ~near, :].any()
+        for name in ("normal", "depth", "objid", "mask"):
+            assert found[name].dtype == full[name].dtype
+            np.testing.assert_array_equal(found[name][ball], full[name][ball])
+            assert not found[name][~ball].any()
+        np.testing.assert_array_equal(found["mask"], ball)
+    points = load_scene(out).points.numpy().astype(float)
+    off = np.abs(np.linalg.norm(points - [0, 0, 0.6], axis=1) - 0.6)
+    assert len(points) > 5
+    assert np.median(off) < 0.15
+    with pytest.raises(PolarguideError, match="same settings"):
+        synthesize(spec, out, SETTINGS, Reporter(), threads=1)
 
 
 def test_rendering_goes_on_to_the_same_files(

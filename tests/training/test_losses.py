@@ -100,6 +100,16 @@ def test_normal_loss_is_zero_at_the_target_whatever_the_length(priors: ViewPrior
     assert float(normal_loss(length * priors.normal, priors)) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_normal_loss_takes_the_nearest_candidate_pixel_by_pixel(priors: ViewPriors) -> None:
+    candidates = torch.stack((-priors.normal, priors.plane, unit(40), unit(41)), dim=-2)
+    live = replace(priors, candidates=candidates)
+    rendered = 0.7 * unit(42)
+    cosines = (normalize(rendered, dim=-1)[..., None, :] * candidates).sum(dim=-1)
+    expected = ((1 - cosines.max(dim=-1).values) * priors.weight).sum() / priors.weight.sum()
+    torch.testing.assert_close(normal_loss(rendered, live), expected)
+    assert float(normal_loss(candidates[..., 2, :], live)) == pytest.approx(0.0, abs=1e-6)
+
+
 def test_normal_loss_is_two_at_the_opposite_and_one_across(priors: ViewPriors) -> None:
     assert float(normal_loss(-priors.normal, priors)) == pytest.approx(2.0, rel=1e-5)
     assert float(normal_loss(priors.plane, priors)) == pytest.approx(1.0, rel=1e-4)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from polarguide import optics
 from polarguide.capture import GroundTruth, View, load_scene
 from polarguide.color import srgb_decode, srgb_encode
 from polarguide.training.losses import azimuth_loss
@@ -146,3 +147,37 @@ def test_guide_normals_face_the_camera_and_mixed_ones_are_not_known(view: View) 
     assert torch.equal(known, raw.norm(dim=-1) > 0.3)
     facing = (raw * rays).sum(-1) < -1e-3
     torch.testing.assert_close(unit[facing], normalize(raw, dim=-1)[facing])
+
+
+KIND = replace(PAPER, candidates="azimuths", live=True, threshold=0.1, full_dolp=1e-6)
+
+
+def test_kindly_read_candidates_face_the_camera_a_quarter_turn_apart(view: View) -> None:
+    priors = view_priors(view, guide_of(view), KIND, INDEX)
+    assert priors.candidates is not None
+    candidates = view.camera.to_camera(priors.candidates)
+    rays = view.camera.rays()[..., None, :]
+    cosine = -(candidates * rays).sum(dim=-1)
+    assert float(cosine.min()) > -1e-6
+    torch.testing.assert_close(cosine, cosine[..., :1].expand_as(cosine), atol=1e-5, rtol=0)
+    across = candidates + cosine[..., None] * rays
+    for turn, expected in ((1, 0.0), (2, -1.0), (3, 0.0)):
+        turned = (across * across.roll(turn, dims=-2)).sum(dim=-1) / across.square().sum(dim=-1).clamp(
+            min=1e-9
+        )
+        tilted = across.norm(dim=-1) > 0.05
+        torch.testing.assert_close(
+            turned[tilted], torch.full_like(turned[tilted], expected), atol=1e-3, rtol=0
+        )
+
+
+def test_a_live_choice_counts_wherever_the_polarization_is_strong(view: View) -> None:
+    nowhere = torch.zeros_like(guide_of(view))
+    frozen = view_priors(view, nowhere, replace(KIND, live=False), INDEX)
+    live = view_priors(view, nowhere, KIND, INDEX)
+    assert frozen.candidates is None
+    assert not frozen.weight.any()
+    stokes = optics.luminance(optics.stokes(view.intensities()))
+    strong = (optics.dolp(stokes) > 0.1) & ~view.invalid & ~view.saturated
+    assert torch.equal(live.weight, strong.float())
+    assert 0.01 < float(strong.float().mean()) < 0.9

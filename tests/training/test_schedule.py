@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
 
 from polarguide.errors import PolarguideError
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
-from polarguide.training.recipe import Recipe, Repeat, Stage
+from polarguide.training.recipe import Recipe, Repeat, Rounds, Stage
 from polarguide.training.schedule import Schedule
 
 EVERY_RECIPE = pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES.keys())
 
 RESET = Repeat("reset_opacity", fraction=0.06)
-PROPAGATE = Repeat("propagate_normals", fraction=0.02)
+TURNS = Rounds(("propagate_normals", "propagate_normals", "reset_opacity"), fraction=0.02)
 REFRESH = Repeat("refresh_priors", fraction=0.03)
 RECIPE = Recipe(
     name="three",
     about="",
     stages=(
         Stage("first", 0.2, reflection=False),
-        Stage("second", 0.5, True, repeats=(RESET, PROPAGATE, REFRESH), on_enter=("refresh_priors",)),
+        Stage("second", 0.5, True, repeats=(RESET, REFRESH), on_enter=("refresh_priors",)),
         Stage("third", 0.3, reflection=True),
     ),
     rates={"means": 2.0},
@@ -59,11 +60,30 @@ def test_actions_are_due_at_their_distance_from_the_stage_start() -> None:
     assert max(due) < 70
 
 
-def test_the_reset_wins_over_the_propagation() -> None:
-    schedule = Schedule(RECIPE, 100)
-    propagated = [s for s in range(100) if "propagate_normals" in schedule.at(s).actions]
-    assert propagated == [s for s in range(22, 70, 2) if (s - 20) % 6]
-    assert schedule.at(26).actions == ("reset_opacity", "refresh_priors")
+def test_rounds_fill_their_stage_evenly_and_end_before_the_next() -> None:
+    turning = replace(RECIPE.stages[1], rounds=TURNS, repeats=(REFRESH,))
+    schedule = Schedule(replace(RECIPE, stages=(RECIPE.stages[0], turning, RECIPE.stages[2])), 120)
+    # 60 steps from the 24th on, turns at least 2 apart: ten whole rounds.
+    due = {s: a for s in range(120) for a in schedule.at(s).actions if a != "refresh_priors"}
+    assert list(due) == list(range(26, 84, 2))
+    assert list(due.values()) == [TURNS.actions[k % 3] for k in range(29)]
+    assert schedule.at(28).actions == ("propagate_normals", "refresh_priors")
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 7, 60, 61, 1000])
+@pytest.mark.parametrize("minimum", [1, 50, 5000])
+def test_turns_are_as_far_apart_as_asked_for_unless_there_is_but_one_round(length: int, minimum: int) -> None:
+    places = [0, *Rounds(TURNS.actions, 0.02, minimum).turns(length, 2 * length), length]
+    gaps = [after - before for before, after in pairwise(places)]
+    assert min(gaps) >= (max(minimum, round(0.04 * length)) - 1 if len(gaps) > 3 else length // 3)
+    assert max(gaps) - min(gaps) <= 1 or length < 3
+
+
+def test_the_last_turn_belongs_to_what_follows() -> None:
+    assert Rounds(TURNS.actions, 0.1, 100).turns(300, 1000) == {
+        100: "propagate_normals",
+        200: "propagate_normals",
+    }
 
 
 def test_minimum_distance() -> None:
@@ -75,7 +95,7 @@ def test_minimum_distance() -> None:
 
 
 def test_a_repeat_is_never_closer_than_one_step() -> None:
-    assert Schedule(RECIPE, 3).period(PROPAGATE) == 1
+    assert Schedule(RECIPE, 3).period(REFRESH) == 1
 
 
 def test_harmonics_begin_at_their_shares() -> None:
@@ -139,7 +159,7 @@ def test_every_recipe_is_named_described_and_trains_what_it_renders(recipe: Reci
     core = {"means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest"}
     assert core <= set(recipe.rates)
     assert all(set(stage.rate_factors) <= set(recipe.rates) for stage in recipe.stages)
-    assert set(recipe.learning_rates) == set(recipe.shapes) - {"outward"}
+    assert set(recipe.learning_rates) == set(recipe.shapes) - {"outward", "surface"}
     assert recipe.shading.reflects == any(stage.reflection for stage in recipe.stages)
     assert recipe.shading.reflects == bool(recipe.light_rates)
     assert list(recipe.sh_fractions) == sorted(recipe.sh_fractions)
@@ -156,12 +176,52 @@ def test_priors_are_refreshed_before_a_stage_that_uses_them(recipe: Recipe) -> N
             assert refreshed, stage.name
 
 
-@EVERY_RECIPE
-@pytest.mark.parametrize("steps", [500, 5000])
-def test_no_recipe_resets_and_propagates_at_once(recipe: Recipe, steps: int) -> None:
-    schedule = Schedule(recipe, steps)
+def upheavals(name: str, steps: int) -> dict[str, list[int]]:
+    """When opacities are reset and normals propagated."""
+    schedule = Schedule(recipe_named(name), steps)
+    found: dict[str, list[int]] = {"reset_opacity": [], "propagate_normals": []}
     for step in range(steps):
-        assert not {"reset_opacity", "propagate_normals"} <= set(schedule.at(step).actions)
+        for action in schedule.at(step).actions:
+            if action in found:
+                found[action].append(step)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("steps", "propagations", "resets"),
+    [
+        (1500, [369], [590]),
+        (2500, [615], [984]),
+        (5000, [861, 1598], [1230, 1967]),
+        (
+            61_000,
+            list(range(7500, 24_000, 3000)),
+            list(range(9000, 28_000, 3000)),
+        ),  # resets as in the release
+    ],
+)
+@pytest.mark.parametrize("name", ["3dgs-dr", "polarguide-paper:kind"])
+def test_when_3dgs_dr_resets_and_propagates(
+    name: str, steps: int, propagations: list[int], resets: list[int]
+) -> None:
+    assert upheavals(name, steps) == {"propagate_normals": propagations, "reset_opacity": resets}
+
+
+@pytest.mark.parametrize("name", [*RECIPES, "polarguide-paper:kind"])
+@pytest.mark.parametrize("steps", [300, 1500, 2500, 5000, 9999, 20_000, 40_001, 61_000])
+def test_a_scene_can_heal_between_resets_and_propagations(name: str, steps: int) -> None:
+    """Also across stages: a tenth of the steps, or 350."""
+    places = sorted(step for found in upheavals(name, steps).values() for step in found)
+    gaps = [after - before for before, after in pairwise(places)]
+    assert min(gaps, default=steps) >= min(0.098 * steps - 1, 350)
+
+
+def test_without_propagation_nothing_is_propagated_or_reset() -> None:
+    assert upheavals("3dgs-dr:without-propagation", 5000) == {"reset_opacity": [], "propagate_normals": []}
+    base, bare = RECIPES["3dgs-dr"], recipe_named("3dgs-dr:without-propagation")
+    assert [(s.name, s.fraction, s.weights) for s in base.stages] == [
+        (s.name, s.fraction, s.weights) for s in bare.stages
+    ]
 
 
 def test_an_ablation_changes_something_and_is_found_by_its_name() -> None:
@@ -188,6 +248,13 @@ def test_an_ablation_changes_something_and_is_found_by_its_name() -> None:
         ("polarguide-stokes:without-separation", {"specular", "diffuse"}),
         ("polarguide-stokes:without-normals", {"azimuth", "chromatic", "consistency"}),
         ("polarguide-stokes:without-consistency", {"consistency"}),
+        ("polarguide:unpolarized", {"azimuth", "chromatic", "specular", "diffuse"}),
+        ("polarguide-paper:unpolarized", {"normal", "specular", "diffuse"}),
+        ("polarguide-stokes:unpolarized", {"azimuth", "chromatic", "specular", "diffuse", "stokes"}),
+        (
+            "polarguide-stokes:unpolarized-without-consistency",
+            {"azimuth", "chromatic", "specular", "diffuse", "stokes", "consistency"},
+        ),
     ],
 )
 def test_an_ablation_switches_off_its_terms_in_every_stage_and_no_other(name: str, terms: set[str]) -> None:
@@ -197,8 +264,18 @@ def test_an_ablation_switches_off_its_terms_in_every_stage_and_no_other(name: st
         before, after = asdict(old.weights), asdict(new.weights)
         assert all(after[term] == 0 for term in terms)
         changed |= {term for term in before if before[term] != after[term]}
+        if "unpolarized" in name:
+            old = _without_refresh(old)
         assert replace(new, weights=old.weights) == old
     assert changed == terms
+
+
+def _without_refresh(stage: Stage) -> Stage:
+    return replace(
+        stage,
+        repeats=tuple(r for r in stage.repeats if r.action != "refresh_priors"),
+        on_enter=tuple(a for a in stage.on_enter if a != "refresh_priors"),
+    )
 
 
 @pytest.mark.parametrize("base", ["polarguide", "polarguide-stokes"])

@@ -53,7 +53,6 @@ def test_a_training_stays_there_and_goes_on_from_its_checkpoint(
             assert due or device.waits == before, step
             counts.append(len(trainer.state.gaussians))
         assert len(set(counts)) > 2
-        assert trainer.state.opacity_was_reset
         # Plain Adam counts its steps on the CPU.
         tensors = {n: t for n, t in trainer.state.tensors().items() if not n.endswith((".step", "scalars"))}
         assert {n for n, t in tensors.items() if t.device != THERE} == set()

@@ -10,6 +10,7 @@ import torch
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.visualization import figures
+from polarguide.visualization.layers import clipping_exposure
 from polarguide.visualization.sheet import contact_sheet
 
 # A camera that looks along world +x, with world +z up: its right is world -y.
@@ -167,3 +168,44 @@ def test_sheet_refuses_labels_that_do_not_fit():
         contact_sheet([[None]], ["a"], ["b"])
     with pytest.raises(ValueError, match=r"found float32 \[4, 4, 3\]"):
         contact_sheet([[tile.astype(np.float32)]], ["a"], ["b"])
+
+
+def test_scale_bar_runs_through_the_colors_of_its_map():
+    bar = figures.scale_bar(0.0, 45.0, "inferno")
+    assert bar.shape == (44, 256, 3)
+    expected = figures.scalar_to_rgb(torch.linspace(0, 45, 256)[None], 0, 45, "inferno")[0]
+    assert (bar[:22] == expected).all()
+    below = bar[22:]
+    assert (below[:, :60] < 128).any(), "the number at the left end"
+    assert (below[:, -60:] < 128).any(), "the number at the right end"
+    assert (below[:, 80:180] == 255).all()
+    assert (figures.scale_bar(0.0, 45.0, "inferno") != figures.scale_bar(0.0, 0.25, "inferno")).any()
+
+
+def test_a_footer_stands_below_its_columns():
+    tile = np.full((20, 300, 3), 10, np.uint8)
+    bar = np.full((30, 300, 3), (200, 0, 0), np.uint8)
+    plain = contact_sheet([[tile, tile]], ["a"], ["x", "y"])
+    sheet = contact_sheet([[tile, tile]], ["a"], ["x", "y"], footer=[None, bar])
+    assert (sheet[: plain.shape[0]] == plain).all()
+    strip = sheet[plain.shape[0] :]
+    assert strip.shape[0] == 30 + 8
+    red = (strip == (200, 0, 0)).all(axis=2)
+    assert red.sum() == 30 * 300
+    columns = np.flatnonzero((plain == 10).all(axis=(2)).any(axis=0))
+    assert np.flatnonzero(red.any(axis=0)).tolist() == columns[-300:].tolist()
+    assert (
+        contact_sheet([[tile]], ["a"], ["x"], footer=[None]).shape
+        == contact_sheet([[tile]], ["a"], ["x"]).shape
+    )
+
+
+def test_an_exposure_clips_under_a_hundredth() -> None:
+    rng = np.random.default_rng(0)
+    values = torch.from_numpy(rng.gamma(0.4, 1.5, (60, 80, 3)).astype(np.float32))
+    assert float((values.amax(dim=-1) > 1).float().mean()) > 0.3
+    factor = clipping_exposure(values)
+    clipped = float((values.amax(dim=-1) * factor > 1).float().mean())
+    assert 0.005 < clipped < 0.01
+    assert clipping_exposure(values * 0.01) == 1.0
+    assert clipping_exposure(values * 0) == 1.0

@@ -13,8 +13,13 @@ import torch
 import polarguide
 from polarguide import _native
 from polarguide.capture import View
+from polarguide.evaluation.error_sheet import ERRORS_FILE, ErrorSheet
+from polarguide.evaluation.facts import SceneFacts
+from polarguide.evaluation.maps import ErrorsByObject
+from polarguide.evaluation.measures import HAZE_DEPTH
+from polarguide.evaluation.mesh import mesh_scores
 from polarguide.evaluation.record import METRICS_FILE, write_metrics
-from polarguide.evaluation.scores import score_view
+from polarguide.evaluation.scores import ViewScores, score_view
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.target import ViewTarget
 from polarguide.progress import SILENT, Reporter
@@ -27,7 +32,7 @@ MINIMUM_SECONDS = 1.5
 
 
 def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT) -> dict[str, Any]:
-    """Score a run's test views and write ``metrics.json`` into its folder.
+    """Score a run's test views and write ``metrics.json`` and ``errors.png`` into its folder.
 
     Args:
         run: the run; it is asked for layers only.
@@ -35,19 +40,25 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
         reporter: told how far it is.
 
     Returns:
-        The record as written: means over the views, ``views`` by name, and ``provenance``.
+        The record as written: means over the views, ``views`` by name, ``objects``, ``materials`` and ``provenance``.
 
     Raises:
         PolarguideError: the scene cannot be read, or has no test views.
     """
     tests = run.scene.test_views
-    views = {}
+    facts = SceneFacts.of(run.scene)
+    for warning in facts.warnings:
+        reporter.warn(warning)
+    views, by_object, sheet = {}, ErrorsByObject(facts.objects), ErrorSheet(len(tests))
     with reporter.track("scoring", len(tests)) as advance:
         for view in tests:
-            # First what is known of it: copied later, it would have to wait until the rendering is done.
-            target = ViewTarget.of(view.photograph(), view.invalid, view.ground_truth, run.model.device)
-            views[view.name] = score_view(target, run.model.render(view.camera))
+            views[view.name] = _score(run, view, facts, by_object, sheet)
             advance(len(views))
+    sheet.write(run.folder / ERRORS_FILE)
+    memory = peak_memory_mib()  # before the mesh, which is no part of what a run needs
+    with reporter.track("measuring the mesh"):
+        mesh = mesh_scores(run.cameras, lambda camera: run.model.render(camera, depth=True), tests)
+    objects, materials = by_object.records()
     seconds, alone = RunLog(run.folder).elapsed()
     return write_metrics(
         run.folder / METRICS_FILE,
@@ -58,10 +69,28 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
             "train_seconds": seconds if alone and seconds > 0 else None,
             "gaussians": len(run.model),
             "steps": run.steps,
-            "peak_memory_mib": peak_memory_mib(),
+            "peak_memory_mib": memory,
+            **mesh,
         },
+        objects=objects,
+        materials=materials,
         provenance=_provenance(run),
     )
+
+
+def _score(
+    run: OpenedRun, view: View, facts: SceneFacts, by_object: ErrorsByObject, sheet: ErrorSheet
+) -> ViewScores:
+    """Score a view; its errors are added to those by object, and its pictures to the sheet."""
+    # First what is known of it: copied later, it would have to wait until the rendering is done.
+    target = ViewTarget.of_view(view, facts, run.model.device)
+    result = run.model.render(view.camera, depth=True)
+    stokes = run.model.stokes(result, view.camera)
+    in_front = None
+    if target.depth is not None:
+        in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
+    sheet.add(view, target, result, stokes)
+    return score_view(target, result, stokes=stokes, in_front=in_front, by_object=by_object)
 
 
 def _speed(run: OpenedRun, **layers: bool) -> float | None:

@@ -39,10 +39,38 @@ def _fields(metrics: tuple[Metric, ...]) -> list[tuple[str, Any]]:
     ]
 
 
-_REASON = ("lpips_reason", str | None, None)
-_VIEW = msgspec.defstruct("View", [*_fields(VIEW_METRICS), _REASON])
+_REASONS = [("lpips_reason", str | None, None), ("stokes_error_reason", str | None, None)]
+_Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
+
+
+class ObjectErrors(msgspec.Struct, kw_only=True):
+    """Errors over the pixels of an object, or of all objects of a class of material, in all test views."""
+
+    pixels: int
+    views: int
+    psnr: _Decibels
+    normal_mae_deg: float | None
+    specular_psnr: _Decibels
+    diffuse_psnr: _Decibels
+    stokes_error: float | None
+    material: str | None = None
+
+
+_VIEW = msgspec.defstruct("View", [*_fields(VIEW_METRICS), *_REASONS])
 _VIEWS = Annotated[dict[str, Any], msgspec.Meta(min_length=1)]
-_RUN = msgspec.defstruct("Run", [*_fields(METRICS), ("views", _VIEWS), ("provenance", Provenance), _REASON])
+_RUN = msgspec.defstruct(
+    "Run",
+    [
+        *_fields(METRICS),
+        ("views", _VIEWS),
+        ("provenance", Provenance),
+        *_REASONS,
+        *(
+            (name, dict[str, ObjectErrors], msgspec.field(default_factory=dict))
+            for name in ("objects", "materials")
+        ),
+    ],
+)
 
 
 def write_metrics(
@@ -51,16 +79,20 @@ def write_metrics(
     views: Mapping[str, ViewScores],
     run: Mapping[str, float | int | None],
     provenance: Mapping[str, Any],
+    objects: Mapping[str, Any] | None = None,
+    materials: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Write ``metrics.json`` in one step: a reader sees the old file or the whole new one.
 
-    Top level: the means of ``summarize``, the keys of ``run``, ``views`` and ``provenance``. NaN becomes null.
+    Top level: the means of ``summarize``, the keys of ``run``, ``views``, ``objects``, ``materials`` and
+    ``provenance``. NaN becomes null.
 
     Args:
         path: the file; its folder must exist.
         views: the scores by view name, at least one.
         run: values of ``RUN_METRICS`` by key; one that is left out is null.
         provenance: the keys of ``Provenance``, and others as you like.
+        objects, materials: errors by object and by class of material, as of ``ErrorsByObject.records``.
 
     Returns:
         What was written.
@@ -76,6 +108,8 @@ def write_metrics(
         **{metric.key: None for metric in RUN_METRICS},
         **{key: _finite(value) for key, value in run.items()},
         "views": finite,
+        "objects": dict(objects or {}),
+        "materials": dict(materials or {}),
         "provenance": dict(provenance),
     }
     validate_metrics(record, where=path)

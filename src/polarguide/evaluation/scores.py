@@ -10,19 +10,31 @@ import torch
 from torch import Tensor
 
 from polarguide.evaluation.lpips import lpips
+from polarguide.evaluation.maps import ErrorsByObject
 from polarguide.evaluation.metrics import decibels
 from polarguide.evaluation.table import HIGHEST_PSNR, VIEW_METRICS
 from polarguide.evaluation.target import ViewTarget
 
+_NO_LAYERS = "the recipe has no specular and diffuse layers to predict it from"
+_NO_POLARIZATION = "hardly any polarization was measured where it counts"
+
 ViewScores = dict[str, float | str | None]
 """The scores of one view by key. None where one is not defined: no ground truth, no such layer, no pixel that counts.
 
-``lpips_reason`` says why ``lpips`` is None. ``nonfinite_pixels`` is there when the rendered pictures held NaN or
-infinity, and counts the pixels; they were scored as black, and their normals as 90 degrees off.
+``lpips_reason`` says why ``lpips`` is None, ``stokes_error_reason`` why ``stokes_error`` is. ``nonfinite_pixels`` is
+there when the rendered layers held NaN or infinity, and counts the pixels; they were scored as black, and their normals
+as 90 degrees off.
 """
 
 
-def score_view(target: ViewTarget, rendered: Any) -> ViewScores:
+def score_view(
+    target: ViewTarget,
+    rendered: Any,
+    *,
+    stokes: Tensor | None = None,
+    in_front: Tensor | None = None,
+    by_object: ErrorsByObject | None = None,
+) -> ViewScores:
     """Score one rendered view, on the device where it was rendered, which is waited for once.
 
     (LPIPS, where its network is at hand, waits by itself: torchmetrics checks the pictures' values.)
@@ -31,7 +43,10 @@ def score_view(target: ViewTarget, rendered: Any) -> ViewScores:
         target: what it is compared with, on the same device.
         rendered: an object with ``final`` [H, W, 3] linear, and, each None where the recipe has no such
             layer, ``normal`` [H, W, 3] world of any length, ``specular`` and ``diffuse`` [H, W, 3] linear
-            contributions to the final picture.
+            contributions to the final picture; ``depth`` and ``alpha`` [H, W] may be missing.
+        stokes: [3, H, W, 3] predicted Stokes vectors on the scale where the picture is S0/2; None: no prediction.
+        in_front: [H, W] share of the weight before ``HAZE_DEPTH`` times the true depth; None: not measured.
+        by_object: gets the view's errors added.
 
     Returns:
         Every per-view key. PSNRs are at most ``HIGHEST_PSNR``.
@@ -40,15 +55,20 @@ def score_view(target: ViewTarget, rendered: Any) -> ViewScores:
         ValueError: shapes that do not fit.
     """
     layers = {name: _plain(getattr(rendered, name)) for name in ("final", "normal", "specular", "diffuse")}
+    layers |= {name: _plain(getattr(rendered, name, None)) for name in ("depth", "alpha")}
+    layers["polarization"] = None if stokes is None else _plain(stokes[1:].movedim(0, 2).flatten(2))
+    layers["in_front"] = _plain(in_front)
     broken = torch.zeros_like(target.valid.mask)
     for name, layer in layers.items():
         if layer is not None:
-            lost = ~layer.isfinite().all(-1)
+            lost = ~(layer.isfinite() if layer.ndim == 2 else layer.isfinite().all(-1))
             broken |= lost
-            layers[name] = torch.where(lost[..., None], 0.0, layer)
+            layers[name] = torch.where(lost if layer.ndim == 2 else lost[..., None], 0.0, layer)
     final = layers["final"]
     assert final is not None
     distance, reason = lpips(final, target.photograph, target.valid.mask)
+    if by_object is not None:
+        by_object.add(target, layers)
     measures = {m.key: m.measure(target, layers) for m in VIEW_METRICS if m.measure is not None}
     found = _numbers({"nonfinite_pixels": broken.sum(), **measures})
     lost_pixels = int(found.pop("nonfinite_pixels"))
@@ -59,6 +79,8 @@ def score_view(target: ViewTarget, rendered: Any) -> ViewScores:
             value = min(decibels(value), HIGHEST_PSNR)
         scores[metric.key] = _number(value)
     scores |= {"lpips": distance, "lpips_reason": reason}
+    if scores["stokes_error"] is None:
+        scores["stokes_error_reason"] = _NO_LAYERS if stokes is None else _NO_POLARIZATION
     if lost_pixels:
         scores["nonfinite_pixels"] = lost_pixels
     return scores
@@ -72,7 +94,8 @@ def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | Non
 
     Returns:
         The keys of ``VIEW_METRICS``, each the mean over the views where it is a number, None where it is in no
-        view; and ``lpips_reason``, the reason of the first view without LPIPS, else None.
+        view; ``lpips_reason``, the reason of the first view without LPIPS, else None; and ``stokes_error_reason``
+        where no view has a ``stokes_error``.
     """
     means: dict[str, float | str | None] = {}
     for metric in VIEW_METRICS:
@@ -80,6 +103,9 @@ def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | Non
         means[metric.key] = math.fsum(values) / len(values) if values else None
     reasons = (scores.get("lpips_reason") for scores in per_view.values())
     means["lpips_reason"] = next((reason for reason in reasons if reason), None)
+    if means["stokes_error"] is None:
+        reasons = (scores.get("stokes_error_reason") for scores in per_view.values())
+        means["stokes_error_reason"] = next((reason for reason in reasons if reason), None)
     return means
 
 

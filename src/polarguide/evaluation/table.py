@@ -12,6 +12,13 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from polarguide.evaluation.measures import (
+    coverage_error,
+    depth_error_percent,
+    haze_share,
+    mean_alpha,
+    stokes_error,
+)
 from polarguide.evaluation.metrics import layer_error, normal_mae_deg, normal_within_11, squared_error, ssim
 from polarguide.evaluation.target import ViewTarget
 
@@ -19,7 +26,8 @@ HIGHEST_PSNR = 100.0
 """What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
 
 Layers = Mapping[str, Tensor | None]
-"""Rendered layers of a view by name: ``final``, ``normal``, ``specular``, ``diffuse``; None where there is none."""
+"""Rendered layers of a view by name: ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, the
+predicted ``polarization`` and the weight ``in_front`` of the surface; None where there is none."""
 Measure = Callable[[ViewTarget, Layers], Tensor | None]
 """A metric of one view as a tensor []; None where it is not defined. In place of decibels the mean squared error."""
 
@@ -92,9 +100,24 @@ def _normal(compare: Callable[..., Tensor]) -> Measure:
     return _compared(compare, "normal", "normal", "surface")
 
 
-def _layer(name: str, *, aligned: bool = False) -> Measure:
-    """The squared error of a layer against its true lobe on the foreground."""
-    return _compared(partial(layer_error, aligned=aligned), name, name, "foreground")
+def _layer(name: str, *, aligned: bool = False, region: str = "foreground") -> Measure:
+    """The squared error of a layer against its true lobe on the foreground, or another region."""
+    return _compared(partial(layer_error, aligned=aligned), name, name, region)
+
+
+def _of_layer(measure: Callable[..., Tensor], layer: str, region: str) -> Measure:
+    """A measure of a layer by itself over a region of the target."""
+
+    def measured(target: ViewTarget, layers: Layers) -> Tensor | None:
+        values, keep = layers[layer], getattr(target, region)
+        return None if values is None or keep is None else measure(values, keep)
+
+    return measured
+
+
+def _mesh(key: str, label: str, *, shown: Literal["tables", "files"] = "files") -> Metric:
+    """A share of the mesh, or of what it should be."""
+    return Metric(key, label, "%", 1, "higher", of="run", shown=shown, factor=100.0)
 
 
 METRICS: tuple[Metric, ...] = (
@@ -135,6 +158,76 @@ METRICS: tuple[Metric, ...] = (
         measure=_layer("diffuse", aligned=True),
         shown="files",
     ),
+    Metric(
+        "specular_psnr_dielectric",
+        "specular PSNR without metals",
+        "dB",
+        2,
+        "higher",
+        measure=_layer("specular", region="dielectric"),
+        shown="files",
+    ),
+    Metric(
+        "diffuse_psnr_dielectric",
+        "diffuse PSNR without metals",
+        "dB",
+        2,
+        "higher",
+        measure=_layer("diffuse", region="dielectric"),
+        shown="files",
+    ),
+    Metric(
+        "stokes_error",
+        "Stokes error",
+        "",
+        3,
+        "lower",
+        measure=_compared(stokes_error, "polarization", "polarization", "polarized", "photograph"),
+    ),
+    Metric(
+        "depth_error_median_percent",
+        "depth error",
+        "%",
+        2,
+        "lower",
+        measure=_compared(depth_error_percent, "depth", "depth", "near", "extent"),
+    ),
+    Metric(
+        "haze",
+        "haze",
+        "%",
+        2,
+        "lower",
+        measure=_of_layer(haze_share, "in_front", "smooth"),
+        shown="files",
+        factor=100.0,
+    ),
+    Metric(
+        "coverage_error",
+        "coverage error",
+        "%",
+        2,
+        "lower",
+        measure=_compared(coverage_error, "alpha", "mask", "valid"),
+        shown="files",
+        factor=100.0,
+    ),
+    Metric(
+        "alpha_outside",
+        "alpha outside the mask",
+        "%",
+        2,
+        "lower",
+        measure=_of_layer(mean_alpha, "alpha", "beyond"),
+        shown="files",
+        factor=100.0,
+    ),
+    _mesh("mesh_fscore_1", "mesh F-score 1 %", shown="tables"),
+    _mesh("mesh_fscore_05", "mesh F-score 0.5 %"),
+    _mesh("mesh_accuracy_1", "mesh accuracy 1 %"),
+    _mesh("mesh_accuracy_05", "mesh accuracy 0.5 %"),
+    _mesh("mesh_completeness_1", "mesh completeness 1 %"),
+    _mesh("mesh_completeness_05", "mesh completeness 0.5 %"),
     Metric("gaussians", "Gaussians", "", 0, None, of="run"),
     Metric("fps", "FPS", "", 1, "higher", of="run", timed=True),
     Metric("fps_layers", "FPS all layers", "", 1, "higher", of="run", shown="files", timed=True),
@@ -142,6 +235,8 @@ METRICS: tuple[Metric, ...] = (
     Metric("steps", "steps", "", 0, None, of="run", shown="record"),
     Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
 )
+OBJECT_METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr", "stokes_error")
+"""Keys of those that are told apart by object and by material."""
 VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")
 """Those of one view, which are averaged over views."""
 RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from polarguide.errors import PolarguideError
 from polarguide.experiments.compare import compare
@@ -28,6 +29,8 @@ def ablate(
 ) -> Results:
     """``compare`` with a recipe and its ablations; it shares runs with a comparison in the same folder.
 
+    Differences are to the recipe, unless ``options.against`` names another.
+
     Args:
         scenes, out, settings, options, reporter: as for ``compare``.
         base: name of the recipe whose ablations to train.
@@ -38,6 +41,7 @@ def ablate(
         PolarguideError: as ``compare``; or a recipe without ablations, or an ablation that it does not have.
     """
     recipes = [*reference, *ablated(base, only)]
+    options = replace(options, against=options.against or base)
     return compare(scenes, recipes, out, settings=settings, options=options, reporter=reporter)
 
 

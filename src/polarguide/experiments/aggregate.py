@@ -10,11 +10,25 @@ from typing import TypedDict
 from polarguide.evaluation.table import COLUMNS
 
 
+class PartScores(TypedDict):
+    """What a run scores on an object, or on all objects of a material.
+
+    ``pixels`` counts those of all test views, ``views`` the test views that show it; ``metrics`` holds numbers or None
+    by key. ``material`` is the class of material, None where it is not known.
+    """
+
+    material: str | None
+    pixels: int
+    views: int
+    metrics: dict[str, float | None]
+
+
 class RunRecord(TypedDict):
     """One training: what it was, the state of its work, and its scores.
 
     ``metrics`` holds numbers or None by key, and is None unless the run is done; ``views`` holds the same for each test
-    view. ``folder`` is relative to that of the record.
+    view, ``objects`` for each object by name, ``materials`` for each class of material; the last two are empty where
+    the scene has no table of objects. ``folder`` is relative to that of the record.
     """
 
     scene: str
@@ -26,6 +40,8 @@ class RunRecord(TypedDict):
     metrics: dict[str, float | None] | None
     lpips_reason: str | None
     views: dict[str, dict[str, float | None]]
+    objects: dict[str, PartScores]
+    materials: dict[str, PartScores]
 
 
 class Cell(TypedDict):

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
 
 from polarguide import __version__
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.table import COLUMNS
-from polarguide.experiments.aggregate import RunRecord, aggregate
+from polarguide.experiments.aggregate import PartScores, RunRecord, aggregate
+from polarguide.experiments.forms import csv_text, differences_csv, latex, markdown, parts_csv
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
-from polarguide.experiments.results import FORMAT, Results, validate_results, write_results
-from polarguide.experiments.tables import csv_text, latex, markdown
+from polarguide.experiments.results import FORMAT, Results, differences_of, validate_results, write_results
 from polarguide.files import write_text
 
 BESIDE_OTHERS = "beside_others.txt"
 """Marks a run folder whose training shared the machine, so that its seconds do not count."""
 
 TITLE = "# Comparison\n\n"
+BLACK = 0.002
+"""Share of full scale under which a pixel is black."""
 
 
 def collect(
@@ -52,9 +59,16 @@ def collect(
             "refractive_index": comparison.settings.refractive_index,
             "threads": comparison.options.threads,
             "jobs": comparison.options.parallel,
+            "against": comparison.options.against,
         },
         scenes=[
-            {"name": s.name, "digest": s.digest, "views": s.views, "test_views": list(s.test_views)}
+            {
+                "name": s.name,
+                "digest": s.digest,
+                "views": s.views,
+                "test_views": list(s.test_views),
+                "black_share": _black_share(s),
+            }
             for s in scenes
         ],
         recipes=[
@@ -63,7 +77,9 @@ def collect(
         ],
         runs=runs,
         table=aggregate(runs, [scene.name for scene in scenes], recipes),
+        differences=[],
     )
+    record["differences"] = differences_of(record)
     return validate_results(record)
 
 
@@ -89,12 +105,46 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
         }
         if record is not None
         else {},
+        "objects": _parts((record or {}).get("objects")),
+        "materials": _parts((record or {}).get("materials")),
     }
 
 
+def _parts(found: Mapping[str, Mapping[str, Any]] | None) -> dict[str, PartScores]:
+    """The scores by object or material of a run, as ``metrics.json`` has them, if it has any."""
+    return {
+        name: {
+            "material": scores.get("material"),
+            "pixels": scores["pixels"],
+            "views": scores["views"],
+            "metrics": {m.key: scores[m.key] for m in COLUMNS if m.key in scores},
+        }
+        for name, scores in (found or {}).items()
+    }
+
+
+@lru_cache
+def _black_share(scene: SceneEntry) -> float | None:
+    """The share of black pixels in the first test view; None where its picture is not at hand."""
+    picture = cv2.imread(str(scene.path / "polar" / f"{scene.test_views[0]}_000.png"), cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        return None
+    brightest = np.atleast_3d(picture).max(axis=-1)
+    return float(np.mean(brightest < BLACK * np.iinfo(brightest.dtype).max))
+
+
 def write_tables(out: Path, results: Results) -> None:
-    """Write ``results.json``, ``.md``, ``.csv`` and ``.tex``, each in one step."""
+    """Write ``results.json``, ``.md``, ``.csv`` and ``.tex``, each in one step, and what else there is as CSV."""
     write_results(out / "results.json", results)
-    files = {"md": TITLE + markdown(results), "csv": csv_text(results), "tex": latex(results)}
-    for suffix, text in files.items():
-        write_text(out / f"results.{suffix}", text)
+    files = {
+        "results.md": TITLE + markdown(results),
+        "results.csv": csv_text(results),
+        "results.tex": latex(results),
+        "differences.csv": differences_csv(results),
+        "parts.csv": parts_csv(results),
+    }
+    for name, text in files.items():
+        if text is None:
+            (out / name).unlink(missing_ok=True)  # of a comparison with other recipes
+        else:
+            write_text(out / name, text)

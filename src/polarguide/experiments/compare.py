@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from polarguide.errors import PolarguideError
 from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
@@ -17,7 +18,7 @@ from polarguide.experiments.results import Results
 from polarguide.experiments.study import write_study
 from polarguide.experiments.worker import Scoring, Task, Training
 from polarguide.files import make_folder
-from polarguide.options import ComputeOptions, PathLike
+from polarguide.options import ComputeOptions, PathLike, check_choice, check_count
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
@@ -35,11 +36,14 @@ def compare(
     *,
     settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
+    seeds_of: Mapping[str, int] = MappingProxyType({}),
+    asked: str = "",
     reporter: Reporter = SILENT,
 ) -> Results:
     """Train and score every recipe on every scene with every seed, each run in processes of its own.
 
-    Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``.
+    Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``;
+    paired differences go to ``differences.csv``, scores by object and material to ``parts.csv``, where there are any.
     Finished runs are found again and not repeated. KeyboardInterrupt is passed on after the runs at work have saved
     their state; the same call goes on with them.
 
@@ -49,6 +53,8 @@ def compare(
         out: folder to write.
         settings: of each training; ``seed`` is the first of ``options.seeds``.
         options: how runs are trained, timed and shown.
+        seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
+        asked: the command line that asked, for the record, if not ``polarguide compare``.
         reporter: receives messages and progress.
 
     Returns:
@@ -63,14 +69,21 @@ def compare(
         settings=replace(settings, views_per_step=settings.views_per_step or 1),  # a run is one process
         options=options,
         out=Path(out),
+        seeds_of=dict(seeds_of),
+        asked=asked,
     )
+    for name, count in seeds_of.items():
+        check_choice("seeds_of", name, [recipe.name for recipe in comparison.recipes])
+        check_count("seeds_of", count)
     if not scenes:
         raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
+    if options.against is not None:
+        check_choice("against", options.against, [recipe.name for recipe in comparison.recipes])
     choose_backend(options.device)
     entries = scene_entries(comparison, reporter)
     plan = plan_runs(comparison, entries)
     make_folder(comparison.out)
-    with _locked(comparison.out):
+    with locked(comparison.out):
         failures = _train(comparison, entries, plan, reporter)
         if options.speed:
             _time(comparison, plan, reporter)
@@ -177,8 +190,8 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Keep two comparisons out of one folder. Children inherit the lock and hold it if the parent is killed."""
+def locked(folder: Path) -> Iterator[None]:
+    """Keep two comparisons out of an existing folder. Children inherit the lock and hold it if the parent is killed."""
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(exclusive_lock(folder / LOCK))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from polarguide.options import DeviceName, SceneOptions, check_count
+from polarguide.options import MOST_THREADS, DeviceName, SceneOptions, check_count
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,7 @@ class CompareOptions(SceneOptions):
         speed: At the end time pictures, one run after the other, where that was not done alone before.
         report_views: Test views of each scene in the report; 0 leaves the pictures out.
         device: What to compute on.
+        against: One of the recipes: tables have the difference of every other one to it.
     """
 
     seeds: int = 1
@@ -27,12 +28,13 @@ class CompareOptions(SceneOptions):
     speed: bool = False
     report_views: int = 3
     device: DeviceName = "auto"
+    against: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("seeds", self.seeds)
-        check_count("jobs", self.jobs, 0)
-        check_count("threads", self.threads)
+        check_count("jobs", self.jobs, 0, MOST_THREADS)
+        check_count("threads", self.threads, 1, MOST_THREADS)
         check_count("report_views", self.report_views, 0)
 
     @property

@@ -10,7 +10,7 @@ import hashlib
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,6 +40,8 @@ class Comparison:
         settings: of each training; the first seed, from which others count up.
         options: how runs are trained, timed and shown.
         out: folder to write.
+        seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
+        asked: the command line that asked, if not ``polarguide compare``.
     """
 
     scenes: tuple[Path, ...]
@@ -47,10 +49,19 @@ class Comparison:
     settings: TrainSettings
     options: CompareOptions
     out: Path
+    seeds_of: Mapping[str, int] = field(default_factory=dict)
+    asked: str = ""
+
+    def seeds(self, recipe: Recipe) -> range:
+        """The seeds of a recipe."""
+        first = self.settings.seed
+        return range(first, first + self.seeds_of.get(recipe.name, self.options.seeds))
 
     @property
     def command(self) -> str:
         """A command line that asks for the same."""
+        if self.asked:
+            return self.asked
         settings, options = self.settings, self.options
         words = ["polarguide", "compare", *map(str, self.scenes)]
         words += ["--recipes", *(recipe.name for recipe in self.recipes)]
@@ -150,11 +161,13 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:
     """All runs, scene by scene; within a scene seed by seed, so that first results compare all recipes."""
+    every = {recipe.name: comparison.seeds(recipe) for recipe in comparison.recipes}
     return [
         _planned(comparison, scene, recipe, seed)
         for scene in scenes
-        for seed in range(comparison.settings.seed, comparison.settings.seed + comparison.options.seeds)
+        for seed in sorted(set().union(*every.values()))
         for recipe in comparison.recipes
+        if seed in every[recipe.name]
     ]
 
 

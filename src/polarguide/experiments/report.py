@@ -6,6 +6,8 @@ import html
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from string import Template
+from types import MappingProxyType
+from urllib.parse import quote
 
 import torch
 from torch import Tensor
@@ -14,9 +16,12 @@ from polarguide.capture import View
 from polarguide.evaluation.metrics import normal_angles_deg
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash, read_curve
+from polarguide.experiments.forms import sections
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
+from polarguide.experiments.report_tables import list_html, section_html
 from polarguide.experiments.results import Results
-from polarguide.experiments.tables import Block, ShownCell, blocks, formatted, notes, shown_columns
+from polarguide.experiments.shown import formatted
+from polarguide.experiments.tables import seed_counts
 from polarguide.files import write_text
 from polarguide.progress import Reporter
 from polarguide.runs.opened import OpenedRun, read_scene
@@ -26,6 +31,7 @@ from polarguide.visualization.embedded import (
     EmbeddedView,
     Tile,
     chosen_views,
+    content_policy,
     embed,
     page_part,
     script_json,
@@ -33,6 +39,8 @@ from polarguide.visualization.embedded import (
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
 
 REPORT = "report.html"
+ERROR_SHEET = "errors.png"
+"""What scoring writes into a run's folder where it draws the errors."""
 PICTURE_BYTES = 28_000_000
 """What all pictures of a report may take, so that the file stays one that can be mailed and opened."""
 GROUND_TRUTH = "ground truth"
@@ -68,8 +76,15 @@ def write_report(
     views: list[EmbeddedView] = []
     remarks: list[str] = []
     curves: dict[str, list[Curve]] = {}
+    sheets: dict[str, list[tuple[str, str]]] = {}
     for scene in scenes:
         shown = _first_finished(comparison, plan, scene)
+        drawn_errors = [(run.recipe.name, run.folder / ERROR_SHEET) for run in shown]
+        sheets[scene.name] = [
+            (name, path.relative_to(comparison.out).as_posix())
+            for name, path in drawn_errors
+            if path.exists()
+        ]
         drawn = (read_curve(run.folder, run.recipe.name) for run in shown)
         curves[scene.name] = [curve for curve in drawn if curve is not None]
         if comparison.options.report_views and shown:
@@ -84,7 +99,7 @@ def write_report(
                     views += [embedded] if embedded is not None else []
                     remarks += [remark] if remark is not None else []
                     advance(done + 1)
-    write_text(comparison.out / REPORT, report_html(results, views, curves, remarks))
+    write_text(comparison.out / REPORT, report_html(results, views, curves, remarks, sheets))
 
 
 def _first_finished(
@@ -151,6 +166,7 @@ def report_html(
     views: Sequence[EmbeddedView],
     curves: Mapping[str, Sequence[Curve]],
     remarks: Sequence[str] = (),
+    sheets: Mapping[str, Sequence[tuple[str, str]]] = MappingProxyType({}),
 ) -> str:
     """The page.
 
@@ -159,20 +175,23 @@ def report_html(
         views: the pictures.
         curves: by scene, those of its recipes.
         remarks: what was left out of the pictures or reduced, a sentence each.
+        sheets: by scene, recipes and their pictures of errors, as paths from the page.
 
     Returns:
-        HTML; all names and texts in it are escaped, and it asks for nothing from outside.
+        HTML; all names and texts in it are escaped, and it asks for nothing from outside. It links to ``sheets``.
     """
     scenes = ", ".join(scene["name"] for scene in results["scenes"])
+    script = page_part(__package__, "report.js")
     return Template(page_part(__package__, "report.html")).substitute(
         title=html.escape(f"Comparison on {scenes}"),
         style=page_part(__package__, "report.css"),
-        script=page_part(__package__, "report.js"),
+        script=script,
+        policy=content_policy(script),
         summary=html.escape(_summary(results)),
-        tables=_tables(results),
-        notes=_list(notes(results)),
+        tables="".join(map(section_html, sections(results))),
         pictures_hidden="" if views else "hidden",
-        remarks=_list(remarks),
+        remarks=list_html(remarks),
+        sheets=_sheets(sheets),
         gradient=figures.color_gradient("inferno"),
         legend=script_json(LEGEND),
         data=script_json([vars(view) for view in views]),
@@ -193,38 +212,28 @@ def _summary(results: Results) -> str:
         (
             plural(counts["recipes"], "recipe"),
             plural(counts["scenes"], "scene"),
-            plural(settings["seeds"], "seed"),
+            " or ".join(plural(count, "seed") for count in seed_counts(results)),
             f"{settings['steps']:,} steps a run",
         )
     )
 
 
-def _list(texts: Sequence[str]) -> str:
-    return "<ul>" + "".join(f"<li>{html.escape(text)}</li>" for text in texts) + "</ul>" if texts else ""
-
-
-def _tables(results: Results) -> str:
-    headings = "".join(
-        f"<th>{html.escape(column.label)}<br>{html.escape(' '.join((column.unit, column.arrow)))}</th>"
-        for column in shown_columns(results)
-    )
-    return "".join(_table(block, headings) for block in blocks(results))
-
-
-def _table(block: Block, headings: str) -> str:
-    rows = "".join(
-        f"<tr><th>{html.escape(recipe)}</th>{''.join(map(_cell, cells))}</tr>" for recipe, cells in block.rows
-    )
+def _sheets(sheets: Mapping[str, Sequence[tuple[str, str]]]) -> str:
+    """Links to the pictures of errors beside the page, a line for each scene."""
+    lines = [
+        f"<li>{html.escape(scene)}: "
+        + ", ".join(f'<a href="{html.escape(quote(path))}">{html.escape(name)}</a>' for name, path in found)
+        + "</li>"
+        for scene, found in sheets.items()
+        if found
+    ]
+    if not lines:
+        return ""
     return (
-        f'<h3>{html.escape(block.title)}</h3><div class="scroll"><table><thead><tr><th>recipe</th>{headings}</tr>'
-        f"</thead><tbody>{rows}</tbody></table></div>"
+        f'<section id="sheets"><h2>Where the error is</h2><ul>{"".join(lines)}</ul>'
+        '<p class="hint">Pictures in the folders of the runs, of the first finished seed: they open while these lie '
+        "beside this page.</p></section>"
     )
-
-
-def _cell(cell: ShownCell) -> str:
-    value, spread = html.escape(cell.value), html.escape(cell.spread)
-    value = f"<b>{value}</b>" if cell.best else value
-    return f"<td>{value}{f' <small>± {spread}</small>' if spread else ''}</td>"
 
 
 def _curves(results: Results, curves: Mapping[str, Sequence[Curve]]) -> str:

@@ -11,10 +11,13 @@ import msgspec
 
 from polarguide.errors import PolarguideError
 from polarguide.experiments.aggregate import Row, RunRecord
+from polarguide.experiments.differences import Difference, differences
 from polarguide.files import write_text
 from polarguide.records import decode, read_record, shortened
 
-FORMAT = "polarguide-results-1"
+FORMAT = "polarguide-results-2"
+FORMER = "polarguide-results-1"
+"""Lacks objects, materials, black pixels, the recipe to compare with, and differences; it is read as if it had them."""
 STATES = ("done", "failed", "missing")
 _REMEDY = "Give the command again to write the record anew."
 _Item = TypeVar("_Item")
@@ -32,7 +35,7 @@ class Provenance(TypedDict):
 
 
 class Settings(TypedDict):
-    """What all runs have in common; ``jobs`` of them worked at a time."""
+    """What all runs have in common; ``jobs`` of them worked at a time. ``against``: what others are compared with."""
 
     steps: int
     seeds: int
@@ -41,15 +44,20 @@ class Settings(TypedDict):
     refractive_index: float
     threads: int
     jobs: int
+    against: str | None
 
 
 class SceneRecord(TypedDict):
-    """A scene: the digest of its files, how many views it has, and the names of those that scores are means over."""
+    """A scene: the digest of its files, how many views it has, and the names of those that scores are means over.
+
+    ``black_share`` is the share of black pixels in its first test view, None where that is not known.
+    """
 
     name: str
     digest: str
     views: int
     test_views: list[str]
+    black_share: float | None
 
 
 class RecipeRecord(TypedDict):
@@ -61,7 +69,11 @@ class RecipeRecord(TypedDict):
 
 
 class Results(TypedDict):
-    """A comparison. ``table`` has a row for every scene and recipe, and with several scenes their means at the end."""
+    """A comparison.
+
+    ``table`` has a row for every scene and recipe, and with several scenes their means at the end; ``differences`` are
+    those that finished runs give.
+    """
 
     format: str
     provenance: Provenance
@@ -70,6 +82,7 @@ class Results(TypedDict):
     recipes: _Filled[RecipeRecord]
     runs: _Filled[RunRecord]
     table: _Filled[Row]
+    differences: list[Difference]
 
 
 def write_results(path: Path, record: Results) -> None:
@@ -78,12 +91,46 @@ def write_results(path: Path, record: Results) -> None:
 
 
 def read_results(path: Path) -> Results:
-    """Read ``results.json``.
+    """Read ``results.json``, of this version or the one before.
 
     Raises:
         PolarguideError: there is none, or it is not what ``write_results`` writes.
     """
-    return validate_results(read_record(path, dict[str, Any], remedy=_REMEDY), path)
+    record = read_record(path, dict[str, Any], remedy=_REMEDY)
+    if record.get("format") != FORMER:
+        return validate_results(record, path)
+    results = validate_results(_completed(record), path)
+    results["differences"] = differences_of(results)
+    return results
+
+
+def _completed(record: dict[str, Any]) -> dict[str, Any]:
+    """A record of the former version with what it lacks; what is wrong with it is left for the check."""
+
+    def with_fields(items: Any, **fields: Any) -> Any:
+        if not isinstance(items, list):
+            return items
+        return [{**fields, **item} if isinstance(item, dict) else item for item in items]
+
+    settings = record.get("settings")
+    return {
+        **record,
+        "format": FORMAT,
+        "settings": {"against": None, **settings} if isinstance(settings, dict) else settings,
+        "scenes": with_fields(record.get("scenes"), black_share=None),
+        "runs": with_fields(record.get("runs"), objects={}, materials={}),
+        "differences": [],
+    }
+
+
+def differences_of(record: Results) -> list[Difference]:
+    """What belongs under ``differences``, from the runs of a record."""
+    return differences(
+        record["runs"],
+        {scene["name"]: scene["black_share"] for scene in record["scenes"]},
+        [recipe["name"] for recipe in record["recipes"]],
+        record["settings"]["against"],
+    )
 
 
 def validate_results(record: Any, where: str | Path = "results.json") -> Results:
@@ -112,6 +159,9 @@ def _check_relations(record: Results, where: str | Path) -> None:
     for key, names in (("scenes", scenes), ("recipes", recipes)):
         if len(set(names)) < len(names):
             raise _fault(f"{where} ({key})", "every name once", names)
+    against = record["settings"]["against"]
+    if against is not None and against not in recipes:
+        raise _fault(f"{where} (settings.against)", f"one of the recipes {', '.join(recipes)}", against)
     for index, run in enumerate(record["runs"]):
         _check_run(run, scenes, recipes, where, f"runs[{index}]")
     places: list[str | None] = [*scenes, *([None] if len(scenes) > 1 else [])]

@@ -1,44 +1,27 @@
-"""The table of a comparison as Markdown, CSV and LaTeX, and as cells for the report."""
+"""The scores of a comparison by scene, with what cannot be told from the best marked."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
 
 from polarguide.evaluation.table import COLUMNS, Metric
-from polarguide.experiments.aggregate import NO_VALUE, Cell, Row
+from polarguide.experiments.aggregate import NO_VALUE, Cell, Row, RunRecord
+from polarguide.experiments.intervals import mean
+from polarguide.experiments.noise import known_scatter, training_noise
 from polarguide.experiments.results import Results
+from polarguide.experiments.shown import (
+    MEAN_TITLE,
+    NOT_APPLICABLE,
+    Block,
+    Label,
+    Section,
+    ShownCell,
+    formatted,
+)
+from polarguide.experiments.shown import Row as ShownRow
 
-MEAN_TITLE = "mean over scenes"
-NOT_APPLICABLE = "n/a"
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "↑": r"$\uparrow$",
-    "↓": r"$\downarrow$",
-    "±": r"$\pm$",
-    **{character: "\\" + character for character in "&%$#_{}"},
-}
-
-
-@dataclass(frozen=True)
-class ShownCell:
-    """A cell as people read it: a value, its spread (empty: none), and whether it is the best of its column."""
-
-    value: str
-    spread: str = ""
-    best: bool = False
-
-
-@dataclass(frozen=True)
-class Block:
-    """The rows of one scene: its title, and for every recipe the shown cells."""
-
-    title: str
-    rows: tuple[tuple[str, tuple[ShownCell, ...]], ...]
+BySceneAndSeed = Mapping[str, Mapping[int, float]]
 
 
 def shown_columns(results: Results) -> tuple[Metric, ...]:
@@ -50,43 +33,118 @@ def shown_columns(results: Results) -> tuple[Metric, ...]:
     )
 
 
-def blocks(results: Results) -> list[Block]:
-    """The table by scenes, formatted, with the best of every column marked."""
+def scores_section(results: Results) -> Section:
+    """The table by scenes, formatted, with the leaders of every column marked."""
     columns = shown_columns(results)
     titles: dict[str | None, str] = {row["scene"]: row["scene"] or MEAN_TITLE for row in results["table"]}
     made = []
     for scene, title in titles.items():
         rows = [row for row in results["table"] if row["scene"] == scene]
-        best = [best_rows(rows, column) for column in columns]
-        cells = [
-            tuple(
-                _cell(row, column, index in winners, results["table"])
-                for column, winners in zip(columns, best, strict=True)
+        bold = [leading_rows(rows, column, results) for column in columns]
+        shown = tuple(
+            ShownRow(
+                (Label(row["recipe"], code=True, remark=_remark(row, results)),),
+                tuple(
+                    _cell(row, column, index in leaders, results["table"])
+                    for column, leaders in zip(columns, bold, strict=True)
+                ),
             )
             for index, row in enumerate(rows)
-        ]
-        made.append(Block(title, tuple((r["recipe"], c) for r, c in zip(rows, cells, strict=True))))
-    return made
+        )
+        made.append(Block(title, shown))
+    headings = tuple(column.heading for column in columns)
+    return Section("scores", "", ("recipe",), headings, tuple(made), tuple(notes(results)))
 
 
-def best_rows(rows: Sequence[Row], column: Metric) -> set[int]:
-    """Which rows are best in a column, as far as its shown digits tell; none where fewer than two have a value."""
-    values = {i: _shown_number(_cell_of(row, column), column) for i, row in enumerate(rows)}
-    numbers = {index: value for index, value in values.items() if value is not None}
-    if column.better is None or len(numbers) < 2:
+def leading_rows(rows: Sequence[Row], column: Metric, results: Results) -> set[int]:
+    """Which rows of one scene (or of the mean over scenes) have the best value of a column, or one not told from it.
+
+    A row is told from the best by the differences at the same seeds, if they exceed ``training_noise``; where that is
+    not known, by the digits shown. None where fewer than two rows have a value, or the column has no better side.
+    """
+    means = {i: value for i, row in enumerate(rows) if (value := _cell_of(row, column)["mean"]) is not None}
+    if column.better is None or len(means) < 2:
         return set()
-    best = max(numbers.values()) if column.better == "higher" else min(numbers.values())
-    return {index for index, value in numbers.items() if value == best}
+    scenes = {
+        scene["name"]: known_scatter(column.key, scene["black_share"])
+        for scene in results["scenes"]
+        if rows[0]["scene"] in (None, scene["name"])
+    }
+    values = {
+        i: _by_scene_and_seed(results["runs"], list(scenes), rows[i]["recipe"], column.key) for i in means
+    }
+    return leaders(means, values, column, scenes)
+
+
+def leaders(
+    means: Mapping[int, float],
+    values: Mapping[int, BySceneAndSeed],
+    column: Metric,
+    scatter: Mapping[str, float | None],
+) -> set[int]:
+    """Which of several means are the best, or not told from it.
+
+    Args:
+        means: shown values. values: what each is a mean of, by scene and seed.
+        column: the metric; without a better side there are no leaders.
+        scatter: the known scatter by scene.
+    """
+    if column.better is None or not means:
+        return set()
+    sign = 1.0 if column.better == "higher" else -1.0
+    best = max(means, key=lambda index: sign * means[index])
+    return {
+        index
+        for index in means
+        if formatted(means[index], column) == formatted(means[best], column)
+        or _not_told(values[best], values[index], sign, scatter)
+    }
+
+
+def _not_told(
+    best: BySceneAndSeed, other: BySceneAndSeed, sign: float, scatter: Mapping[str, float | None]
+) -> bool:
+    """Whether the lead of the best over another, at the seeds that both have, is within noise."""
+    leads = {
+        scene: {
+            seed: sign * (value - other[scene][seed]) for seed, value in seeds.items() if seed in other[scene]
+        }
+        for scene, seeds in best.items()
+        if scene in other
+    }
+    if set(leads) != set(best) | set(other) or not all(leads.values()):
+        return False
+    half = training_noise(leads, scatter)
+    return half is not None and mean(mean(by_seed.values()) for by_seed in leads.values()) <= half
+
+
+def _by_scene_and_seed(
+    runs: Sequence[RunRecord], scenes: Sequence[str], recipe: str, key: str
+) -> BySceneAndSeed:
+    found: dict[str, dict[int, float]] = {}
+    for run in runs:
+        value = (run["metrics"] or {}).get(key)
+        if value is not None and run["scene"] in scenes and run["recipe"] == recipe:
+            found.setdefault(run["scene"], {})[run["seed"]] = value
+    return found
 
 
 def notes(results: Results) -> list[str]:
-    """What a reader of the table has to know, a sentence each."""
-    said = ["↑ higher is better, ↓ lower is better; the best of each scene and column is bold."]
-    seeds = results["settings"]["seeds"]
-    if seeds > 1:
-        said.append(f"Mean ± sample standard deviation over {seeds} seeds.")
-    else:
-        said.append("One seed: differences may be within what a seed moves.")
+    """What a reader of the scores has to know, a sentence each."""
+    said = [
+        "↑ higher is better, ↓ lower is better.",
+        "Bold: the best of each scene and column, and whatever differs from it by no more than another seed may "
+        "change, with 95 % confidence: by the paired differences where three seeds are paired, else by the known "
+        "scatter of such differences; in a column without one, what shows the same digits.",
+    ]
+    counts = seed_counts(results)
+    if len(counts) > 1:
+        said.append("The number of seeds differs between rows: it stands after the name.")
+    if max(counts) > 1:
+        number = f"{counts[0]} " if len(counts) == 1 else ""
+        said.append(f"Mean ± sample standard deviation over {number}seeds.")
+    if min(counts) < 2:
+        said.append("Of one seed, what another would change is not in the table.")
     if len(results["scenes"]) > 1:
         said.append(
             "Mean over scenes: over those where any recipe has a value of the column, with one weight each."
@@ -101,53 +159,27 @@ def notes(results: Results) -> list[str]:
     return said
 
 
-def markdown(results: Results) -> str:
-    """The table in Markdown, a heading for every scene, then the notes."""
-    columns = shown_columns(results)
-    lines = []
-    for block in blocks(results):
-        lines += [f"## {_markdown_text(block.title)}", ""]
-        lines.append(_markdown_row(["recipe", *(column.heading for column in columns)]))
-        lines.append("|---|" + "---:|" * len(columns))
-        for recipe, cells in block.rows:
-            lines.append(_markdown_row([f"`{recipe}`", *(_marked(cell, "**", "**") for cell in cells)]))
-        lines.append("")
-    lines += [f"- {_markdown_text(note)}" for note in notes(results)]
-    return "\n".join(lines) + "\n"
+def seed_counts(results: Results) -> list[int]:
+    """How many seeds were asked for: one number, or several where recipes or scenes differ in it; ascending."""
+    return sorted(set(Counter((run["scene"], run["recipe"]) for run in results["runs"]).values()))
 
 
-def csv_text(results: Results) -> str:
-    """All columns in full precision: ``scene`` (empty: mean over scenes), ``recipe``, ``runs``, key, key_spread, ..."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    pairs = (name for column in COLUMNS for name in (column.key, f"{column.key}_spread"))
-    writer.writerow(["scene", "recipe", "runs", *pairs])
-    for row in results["table"]:
-        cells = [_cell_of(row, column) for column in COLUMNS]
-        values = (value for cell in cells for value in (cell["mean"], cell["spread"]))
-        writer.writerow([row["scene"] or "", row["recipe"], row["finished"], *values])
-    return file.getvalue()
-
-
-def latex(results: Results) -> str:
-    """A ``tabular`` in the style of booktabs, one block of rows for every scene."""
-    columns = shown_columns(results)
-    lines = ["% needs \\usepackage{booktabs}", f"\\begin{{tabular}}{{l{'r' * len(columns)}}}", "\\toprule"]
-    lines.append(_latex_row(["recipe", *(column.heading for column in columns)]))
-    for block in blocks(results):
-        lines.append("\\midrule")
-        lines.append(f"\\multicolumn{{{len(columns) + 1}}}{{l}}{{\\emph{{{latex_text(block.title)}}}}} \\\\")
-        for recipe, cells in block.rows:
-            shown = [_marked(c, "\0", "\1") for c in cells]
-            lines.append(_latex_row([recipe, *shown]).replace("\0", "\\textbf{").replace("\1", "}"))
-    lines += ["\\bottomrule", "\\end{tabular}"]
-    lines += [f"% {note}" for note in notes(results)]
-    return "\n".join(" ".join(line.splitlines()) for line in lines) + "\n"
-
-
-def latex_text(text: str) -> str:
-    """Text with everything escaped that LaTeX reads as a command."""
-    return "".join(_LATEX.get(character, character) for character in text)
+def _remark(row: Row, results: Results) -> str:
+    """What is missing of a row; else how many seeds it has, where rows differ in that."""
+    planned = [
+        run
+        for run in results["runs"]
+        if run["recipe"] == row["recipe"] and row["scene"] in (None, run["scene"])
+    ]
+    done = sum(run["state"] == "done" for run in planned)
+    if planned and not done:
+        return "failed" if any(run["state"] == "failed" for run in planned) else "missing"
+    what = "runs" if row["scene"] is None else "seeds"
+    if done < len(planned):
+        return f"{done} of {len(planned)} {what}"
+    if row["scene"] is not None and len(seed_counts(results)) > 1:
+        return f"{done} seed{'' if done == 1 else 's'}"
+    return ""
 
 
 def _cell_of(row: Row, column: Metric) -> Cell:
@@ -155,7 +187,7 @@ def _cell_of(row: Row, column: Metric) -> Cell:
     return row["cells"].get(column.key, NO_VALUE)
 
 
-def _cell(row: Row, column: Metric, best: bool, table: Sequence[Row]) -> ShownCell:
+def _cell(row: Row, column: Metric, bold: bool, table: Sequence[Row]) -> ShownCell:
     cell = _cell_of(row, column)
     if cell["mean"] is None:
         # A speed that was not measured alone, or a run that has not finished, is not "not applicable".
@@ -163,33 +195,5 @@ def _cell(row: Row, column: Metric, best: bool, table: Sequence[Row]) -> ShownCe
             other["recipe"] == row["recipe"] and _cell_of(other, column)["count"] for other in table
         )
         return ShownCell("" if column.timed or not row["finished"] or known else NOT_APPLICABLE)
-    spread = "" if cell["spread"] is None else formatted(cell["spread"], column)
-    return ShownCell(formatted(cell["mean"], column), spread, best)
-
-
-def _shown_number(cell: Cell, column: Metric) -> float | None:
-    return None if cell["mean"] is None else round(cell["mean"] * column.factor, column.digits)
-
-
-def formatted(value: float, column: Metric) -> str:
-    """A recorded value as tables show it, without its unit."""
-    return f"{value * column.factor:,.{column.digits}f}"
-
-
-def _marked(cell: ShownCell, before: str, after: str) -> str:
-    value = f"{before}{cell.value}{after}" if cell.best else cell.value
-    return f"{value} ± {cell.spread}" if cell.spread else value
-
-
-def _markdown_row(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-
-def _markdown_text(text: str) -> str:
-    """Text on one line that Markdown leaves alone."""
-    special = "\\`*_[]<>#"
-    return "".join("\\" + c if c in special else c for c in " ".join(text.split()))
-
-
-def _latex_row(cells: Iterable[str]) -> str:
-    return " & ".join(latex_text(cell) for cell in cells) + " \\\\"
+    spread = "" if cell["spread"] is None else f"± {formatted(cell['spread'], column)}"
+    return ShownCell(formatted(cell["mean"], column), spread, bold)

@@ -16,7 +16,7 @@ from polarguide.raster import use_threads
 from polarguide.records import decode, to_json
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train
-from polarguide.system import StopSignals
+from polarguide.system import StopSignals, keep_freed_memory
 from polarguide.training.settings import TrainSettings
 
 PACKAGE = Path(__file__).parents[1]
@@ -56,6 +56,7 @@ def main() -> int:
     """Do the task on standard input; returns the exit status (0 done, 130 stopped, 2 wrong input, with one line)."""
     # As Ctrl-C does, so that whatever is open is closed.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    keep_freed_memory()
     try:
         kind: Any = Task
         do(decode(sys.stdin.buffer.read(), kind, "task"))

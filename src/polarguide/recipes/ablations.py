@@ -7,7 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 from polarguide.recipes.baselines import RECIPE_3DGS_DR
-from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_STOKES
+from polarguide.recipes.polarguide import (
+    RECIPE_POLARGUIDE,
+    RECIPE_POLARGUIDE_PAPER,
+    RECIPE_POLARGUIDE_PAPER_KIND,
+    RECIPE_POLARGUIDE_STOKES,
+)
 from polarguide.training.recipe import Action, Recipe, Stage, Weights
 
 Change = Callable[[Recipe], Recipe]
@@ -62,6 +67,12 @@ def both(first: Change, second: Change) -> Change:
     return lambda recipe: second(first(recipe))
 
 
+def without_propagation(base: Recipe) -> Recipe:
+    """Neither propagations nor resets of the opacities."""
+    bare = staged(lambda stage: replace(stage, rounds=None))
+    return both(bare, without("reset_opacity"))(base)
+
+
 def firm_to_the_end(base: Recipe) -> Recipe:
     """The final stage keeps rates and weights (but those of the layers) of the guided one."""
     *before, final = base.stages
@@ -70,6 +81,17 @@ def firm_to_the_end(base: Recipe) -> Recipe:
 
 
 _NORMAL_TERMS_OFF = off("normal", "azimuth", "chromatic", "consistency")
+_POLARIZED_TERMS = ("normal", "azimuth", "chromatic", "stokes", "specular", "diffuse")
+_UNPOLARIZED = (
+    "unpolarized",
+    "The same without any polarization: normals agree with the depth everywhere, where the recipe has them agree.",
+    both(off(*_POLARIZED_TERMS), without("refresh_priors")),
+)
+_UNPOLARIZED_INCONSISTENT = (
+    "unpolarized-without-consistency",
+    "The same without any polarization, and normals need not agree with the depth.",
+    both(off(*_POLARIZED_TERMS, "consistency"), without("refresh_priors")),
+)
 _COMMON = (
     (
         "without-colour",
@@ -82,6 +104,8 @@ _COMMON = (
         firm_to_the_end,
     ),
     ("without-consistency", "Normals need not agree with the depth.", off("consistency")),
+    _UNPOLARIZED,
+    _UNPOLARIZED_INCONSISTENT,
 )
 
 ABLATIONS_3DGS_DR = varied(
@@ -91,6 +115,16 @@ ABLATIONS_3DGS_DR = varied(
         "Flat Gaussians whose normals agree with the depth: what geometry gives without polarization.",
         staged(lambda stage: replace(stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1))),
     ),
+    (
+        "without-propagation",
+        "Neither propagations nor resets of the opacities: the row to compare with on real captures.",
+        without_propagation,
+    ),
+)
+
+ABLATIONS_PAPER = (
+    RECIPE_POLARGUIDE_PAPER_KIND,
+    *varied(RECIPE_POLARGUIDE_PAPER, _UNPOLARIZED),
 )
 
 ABLATIONS_POLARGUIDE = varied(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from polarguide.shading.deferred import DeferredShading
-from polarguide.training.recipe import Recipe, Repeat, Stage
+from polarguide.training.recipe import Recipe, Repeat, Rounds, Stage
 
 # Learning rates of the 3DGS release; that of the means is times the scene's extent.
 RATES_3DGS = {
@@ -30,7 +30,9 @@ RECIPE_3DGS = Recipe(
     rates=RATES_3DGS,
 )
 
-PROPAGATE = Repeat("propagate_normals", fraction=1 / 61, minimum=350)
+# Of 61,000 steps, the release resets every 3,000 and propagates at the other thousands. Here one propagation lies in
+# the middle between two resets: what it makes opaque and wide has to go again before the next.
+PROPAGATION_DR = Rounds(("propagate_normals", "reset_opacity"), 1.5 / 61, minimum=350)
 RESET_DR = Repeat("reset_opacity", fraction=3 / 61, minimum=700)
 
 # The release's first values (0.001, 5, 0.05, 128) need its 61,000 steps: see docs/explanation/recipes.md.
@@ -45,11 +47,18 @@ RECIPE_3DGS_DR = Recipe(
     name="3dgs-dr",
     about="3DGS with deferred reflection and normal propagation: RGB alone.",
     stages=(
-        Stage("plain", 0.1, reflection=False, densify=True),
-        Stage("propagate", 0.3, reflection=True, densify=True, repeats=(RESET_DR, PROPAGATE)),
-        # The release resets after the last propagation, too: what no view needs must not stay as opaque as it left it.
-        Stage("densify", 0.1, reflection=True, densify=True, on_enter=("reset_opacity",)),
-        Stage("refine", 0.5, reflection=True),
+        Stage("plain", 6 / 61, reflection=False, densify=True),
+        Stage("propagate", 18 / 61, reflection=True, densify=True, rounds=PROPAGATION_DR),
+        # The last turn of the last round: what no view needs must not stay as opaque as the propagation left it.
+        Stage(
+            "densify",
+            6 / 61,
+            reflection=True,
+            densify=True,
+            repeats=(RESET_DR,),
+            on_enter=("reset_opacity",),
+        ),
+        Stage("refine", 31 / 61, reflection=True),
     ),
     rates=RATES_REFLECTION,
     sh_fractions=(10 / 61, 11 / 61, 12 / 61),

@@ -89,7 +89,37 @@ RECIPE_POLARGUIDE_STOKES: Recipe = replace(
 RECIPE_POLARGUIDE_PAPER: Recipe = replace(
     RECIPE_POLARGUIDE,
     name="polarguide-paper",
-    about="PolarGuide-GSDR to the letter: its four candidates and its separation cue; kept for comparison.",
+    about="PolarGuide-GSDR to the letter: its four candidates and its separation cue; its kind reading is :kind.",
     stages=_stages(Weights(specular=0.5, diffuse=0.2, normal=0.2), Weights(normal=0.2)),
     priors=Priors(candidates="paper", separation="paper", azimuth_weight=0.0),
+)
+
+
+def _kind_stages() -> tuple[Stage, ...]:
+    """3DGS-DR's stages, deferred from the first step on, with the terms where PolarGuide-GSDR has them."""
+    plain, propagate, densify, refine = RECIPE_3DGS_DR.stages
+    guided = Weights(specular=0.1, diffuse=0.05, normal=0.02)
+    final = 0.15
+    return (
+        replace(plain, reflection=True),
+        replace(propagate, weights=guided, on_enter=("refresh_priors",)),
+        replace(densify, weights=guided),
+        replace(refine, name="guided", fraction=refine.fraction - final, weights=guided),
+        replace(refine, name="final", fraction=final, weights=Weights(normal=guided.normal)),
+    )
+
+
+RECIPE_POLARGUIDE_PAPER_KIND: Recipe = replace(
+    RECIPE_3DGS_DR,
+    name="polarguide-paper:kind",
+    about="PolarGuide-GSDR as read most kindly: azimuths in place of -n, chosen in every step, on 3DGS-DR whole.",
+    stages=_kind_stages(),
+    priors=Priors(
+        candidates="azimuths",
+        live=True,
+        separation="paper",
+        threshold=0.1,
+        full_dolp=1e-6,
+        azimuth_weight=0.0,
+    ),
 )

@@ -11,7 +11,12 @@ from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 
 from polarguide.errors import PolarguideError
-from polarguide.recipes.ablations import ABLATIONS_3DGS_DR, ABLATIONS_POLARGUIDE, ABLATIONS_STOKES
+from polarguide.recipes.ablations import (
+    ABLATIONS_3DGS_DR,
+    ABLATIONS_PAPER,
+    ABLATIONS_POLARGUIDE,
+    ABLATIONS_STOKES,
+)
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
 from polarguide.recipes.ref_gs import RECIPE_REF_GS
@@ -34,6 +39,7 @@ RECIPES: dict[str, Recipe] = {
 
 ABLATIONS: dict[str, tuple[Recipe, ...]] = {
     "3dgs-dr": ABLATIONS_3DGS_DR,
+    "polarguide-paper": ABLATIONS_PAPER,
     "polarguide": ABLATIONS_POLARGUIDE,
     "polarguide-stokes": ABLATIONS_STOKES,
 }

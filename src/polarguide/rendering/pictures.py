@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder
-from polarguide.options import PathLike
+from polarguide.files import atomic, make_folder, write_whole
+from polarguide.options import PathLike, PictureFormat, check_choice
 from polarguide.progress import SILENT, Reporter
+from polarguide.records import to_json
+from polarguide.rendering.relight import write_exr
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.visualization import figures
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture, true_depth_range
@@ -17,6 +23,16 @@ from polarguide.visualization.sheet import contact_sheet
 
 SHEET_VIEWS = 8
 CONTACT_SHEET = "contact_sheet.png"
+UNITS_FILE = "layers.json"
+_RADIANCE = "linear radiance, R G B; 1 is full scale of the photograph S0/2"
+UNITS = {
+    **dict.fromkeys(("final", "base", "reflection", "specular", "diffuse"), _RADIANCE),
+    "strength": "share of the reflection, 0 to 1",
+    "normal": "world axes of the scene, x y z; blended, so up to length 1, and 0 where nothing is",
+    "depth": "distance along the camera's axis, in the scene's units",
+    "alpha": "coverage, 0 to 1",
+}
+"""What the numbers of each layer mean."""
 
 
 def select_views(scene: Scene, choice: str) -> tuple[View, ...]:
@@ -41,9 +57,10 @@ def write_pictures(
     *,
     views: str = "test",
     layers: Sequence[str] | None = None,
+    format: PictureFormat = "png",
     reporter: Reporter = SILENT,
 ) -> Path:
-    """Write layers of some views, one PNG each, and a contact sheet of them and the ground truth.
+    """Write layers of some views, one file each, and a contact sheet of them and the ground truth.
 
     Args:
         run: the run; its scene is read.
@@ -51,6 +68,8 @@ def write_pictures(
         views: ``test``, ``train``, ``all``, or names separated by commas.
         layers: names of layers, all of the run's by default; one that the recipe has not is left out, and named to
             the reporter.
+        format: png as a display shows layers; exr and npy hold their linear numbers, in the units that ``layers.json``
+            beside them states. The contact sheet is PNG.
 
     Returns:
         The path of the contact sheet.
@@ -62,27 +81,55 @@ def write_pictures(
     names = checked_layers(list(run.layers if layers is None else layers))
     chosen = select_views(run.scene, views)
     make_folder(folder)
-    rows: list[list[Picture | None]] = []
-    labels: list[str] = []
+    check_choice("format", format, get_args(PictureFormat))
+    shown: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
     with reporter.track("rendering", len(chosen)) as advance:
         for number, view in enumerate(chosen):
             result = run.result(view.camera).to("cpu")
             depths = true_depth_range(view)
-            pictures = {name: layer_picture(result, name, view.camera, depths) for name in names}
+            pictures = {
+                name: layer_picture(result, name, view.camera, depths, exposed=name == "reflection")
+                for name in names
+            }
             for name, picture in pictures.items():
                 if picture is None:
                     missing.add(name)
-                else:
+                elif format == "png":
                     figures.write_png(folder / f"{view.name}_{name}.png", picture)
-            ground_truth = ground_truth_pictures(view)
-            if len(rows) < 2 * SHEET_VIEWS:
-                rows.append([pictures[name] for name in names])
-                rows.append([ground_truth.get(name) for name in names])
-                labels += [view.name, f"{view.name} true"]
+                else:
+                    _write_numbers(folder / f"{view.name}_{name}.{format}", getattr(result, name))
+            if len(shown) < SHEET_VIEWS:
+                known = ground_truth_pictures(view)
+                cells = {name: picture for name, picture in pictures.items() if picture is not None}
+                shown.append(
+                    (view.name, cells | {f"{name}, true": known[name] for name in cells if name in known})
+                )
             advance(number + 1)
+    if format != "png":
+        write_whole(
+            folder / UNITS_FILE, to_json({name: UNITS[name] for name in names if name not in missing})
+        )
     sheet = folder / CONTACT_SHEET
-    figures.write_png(sheet, contact_sheet(rows, labels, names))
+    figures.write_png(sheet, _sheet(shown, names))
     if missing:
         reporter.say(f"this recipe has no layer {', '.join(sorted(missing))}")
     return sheet
+
+
+def _sheet(shown: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str]) -> Picture:
+    """A row a view, and beside each layer what is true of it. A column that some view has not is left out."""
+    wanted = [column for name in names for column in (name, f"{name}, true")]
+    columns = [column for column in wanted if all(column in cells for _, cells in shown)]
+    rows = [[cells[column] for column in columns] for _, cells in shown]
+    return contact_sheet(rows, [name for name, _ in shown], columns)
+
+
+def _write_numbers(path: Path, values: Tensor) -> None:
+    """Linear numbers of a layer, [H, W] or [H, W, 3], float32."""
+    found = values.detach().cpu().float().contiguous()
+    if path.suffix == ".exr":
+        write_exr(path, found if found.ndim == 3 else found[..., None].expand(-1, -1, 3))
+        return
+    with atomic(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, found.numpy())

@@ -11,7 +11,7 @@ from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
-from polarguide.options import PathLike, SceneOptions
+from polarguide.options import PathLike, SceneOptions, check_finite
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
 from polarguide.runs.opened import OpenedRun, read_scene
@@ -51,6 +51,8 @@ def write_priors(
     Raises:
         PolarguideError: there is no such view, or the run was trained at another size.
     """
+    check_finite("refractive_index", refractive_index, 1.0001, 4.0)
+    check_finite("threshold", threshold, 0.0, 1.0)
     if not isinstance(scene, Scene):
         scene = read_scene(scene, reading, reporter)
     if run is not None and run.configuration.downscale != scene.downscale:

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
+from polarguide.capture.formats.radiance import read_radiance
 from polarguide.errors import PolarguideError, optional_import
+from polarguide.files import atomic
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
@@ -126,8 +127,11 @@ def write_exr(path: Path, picture: Tensor) -> None:
     exr = optional_import("OpenEXR", "an EXR file")
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
     pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32))
-    with exr.File(header, {"RGB": pixels}) as file:
-        file.write(str(path))
+    with atomic(path) as temporary, exr.File(header, {"RGB": pixels}) as file:
+        try:
+            file.write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(str(error).strip().splitlines()[-1]) from None
 
 
 def read_panorama(path: Path) -> Tensor:
@@ -141,35 +145,9 @@ def read_panorama(path: Path) -> Tensor:
     if not path.is_file() or path.suffix.lower() not in (".hdr", ".exr"):
         found = "no such file" if not path.is_file() else f"a name that ends in {path.suffix or 'nothing'}"
         raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
-    pixels = _exr_pixels(path) if path.suffix.lower() == ".exr" else _hdr_pixels(path)
-    if (
-        pixels is None
-        or pixels.ndim != 3
-        or pixels.shape[1] != 2 * pixels.shape[0]
-        or pixels.size > 3 * LARGEST
-    ):
-        found = "something else" if pixels is None else f"a picture of shape {list(pixels.shape)}"
+    pixels = read_radiance(path)
+    if pixels.shape[1] != 2 * pixels.shape[0] or pixels.size > 3 * LARGEST:
+        found = f"a picture of shape {list(pixels.shape)}"
         raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
-    values = torch.from_numpy(np.ascontiguousarray(pixels[..., :3], dtype=np.float32))
+    values = torch.tensor(pixels)
     return values.nan_to_num(0.0, 6e4, 0.0).clamp(0, 6e4)
-
-
-def _exr_pixels(path: Path) -> np.ndarray | None:
-    exr = optional_import("OpenEXR", str(path))
-    try:
-        with exr.File(str(path)) as file:
-            channels = file.channels()
-            if "RGB" in channels or "RGBA" in channels:
-                return np.array(channels.get("RGB", channels.get("RGBA")).pixels)
-            return np.stack([np.array(channels[name].pixels) for name in "RGB"], axis=-1)
-    except (RuntimeError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _hdr_pixels(path: Path) -> np.ndarray | None:
-    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    try:
-        decoded = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    except cv2.error:
-        return None
-    return None if decoded is None or decoded.ndim != 3 else decoded[..., ::-1]

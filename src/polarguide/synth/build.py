@@ -12,7 +12,7 @@ import numpy as np
 from polarguide.errors import PolarguideError
 from polarguide.synth.environment import make_environment
 from polarguide.synth.mesh import Array, Mesh, rotation, write_ply
-from polarguide.synth.mitsuba_dicts import area_light_dict, bsdf_dict, environment_dict
+from polarguide.synth.mitsuba_dicts import area_light_dict, bsdf_dict, environment_dict, shown_dict
 from polarguide.synth.schema import SceneSpec, Thing
 from polarguide.synth.shapes import make_mesh, sphere
 from polarguide.synth.textures import make_texture
@@ -56,10 +56,11 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
         content: dict[str, Any] = {"type": "scene", "sky": environment_dict(panorama, channel)}
         for number, thing in enumerate(spec.things):
             place = folder / "mesh" / f"{thing.name}.ply"
-            shape = _shape(thing, meshes[number], place, bsdf_dict(thing.material, pictures[number], channel))
-            content[f"thing{number}"] = shape
+            surface = {"bsdf": bsdf_dict(thing.material, pictures[number], channel)}
+            surface |= shown_dict(spec, spec.shown[number])
+            content[f"thing{number}"] = _shape(thing, meshes[number], place, surface)
         for number, light in enumerate(spec.lights):
-            content[f"light{number}"] = area_light_dict(light, channel, spec.name)
+            content[f"light{number}"] = area_light_dict(light, channel, spec.name) | shown_dict(spec, False)
         scene = mi.load_dict(content)
         scenes.append(scene)
         if not first:
@@ -115,14 +116,12 @@ def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
     return mesh.palette[None]
 
 
-def _shape(thing: Thing, mesh: Mesh, path: Path, bsdf: dict[str, Any]) -> Any:
-    """Mitsuba's shape with its BSDF."""
+def _shape(thing: Thing, mesh: Mesh, path: Path, surface: dict[str, Any]) -> Any:
+    """Mitsuba's shape with its BSDF and attributes."""
     import mitsuba as mi
 
     if thing.shape.get("type") == "ball":
         radius = float(thing.shape.get("radius", 1.0)) * thing.scale
-        return mi.load_dict(
-            {"type": "sphere", "center": list(thing.position), "radius": radius, "bsdf": bsdf}
-        )
+        return mi.load_dict({"type": "sphere", "center": list(thing.position), "radius": radius, **surface})
     flat = mesh.normals is None
-    return mi.load_dict({"type": "ply", "filename": str(path), "face_normals": flat, "bsdf": bsdf})
+    return mi.load_dict({"type": "ply", "filename": str(path), "face_normals": flat, **surface})

@@ -6,8 +6,7 @@ import numpy as np
 
 from polarguide.camera import Camera, look_at
 from polarguide.synth.schema import CameraPath
-
-TEST_EVERY = 8
+from polarguide.synth.settings import TEST_EVERY
 
 
 def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[Camera]:
@@ -51,6 +50,6 @@ def view_names(count: int) -> list[str]:
     return [f"v{number:0{digits}d}" for number in range(count)]
 
 
-def held_out_names(names: list[str]) -> list[str]:
-    """Every eighth view, starting with the first; none if there are fewer than two views."""
-    return names[::TEST_EVERY] if len(names) > 1 else []
+def held_out_names(names: list[str], every: int = TEST_EVERY) -> list[str]:
+    """One view in ``every``, starting with the first; none if there are fewer than two views."""
+    return names[::every] if len(names) > 1 else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,29 +16,46 @@ from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
 from polarguide.polarizer import ANGLES, malus
-from polarguide.records import read_record
+from polarguide.records import read_record, shortened
 from polarguide.synth.mesh import Array
-from polarguide.synth.schema import with_current_keys
+from polarguide.synth.schema import SceneSpec, with_current_keys
+from polarguide.synth.settings import SynthSettings
 
+State = Literal["new", "begun", "finished"]
 REQUEST = "request.json"
 STEP = 16
 """Pictures have 12 bits in 16, as cameras give them: 0, 16, 32, ..."""
 TOP = 65535 // STEP
 
 
+def scene_request(spec: SceneSpec, settings: SynthSettings) -> dict[str, Any]:
+    """The content of ``request.json``: what a rendering was asked for."""
+    return {"scene": spec.data(), "settings": settings.data()}
+
+
 def open_folder(out: Path, request: dict[str, Any]) -> bool:
     """Create the folder, or resume the same request in it; returns whether the scene is finished.
+
+    Raises:
+        PolarguideError: as ``folder_state``.
+    """
+    state = folder_state(out, request)
+    if state == "new":
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(out / REQUEST, json.dumps(request, indent=1).encode())
+    return state == "finished"
+
+
+def folder_state(out: Path, request: dict[str, Any]) -> State:
+    """How far the rendering of a request in a folder is. Nothing is written.
 
     Raises:
         PolarguideError: the folder holds something else, or the same scene with other settings.
     """
     path = out / REQUEST
-    text = json.dumps(request, indent=1)
     remedy = "Give another --out, or remove the folder."
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        out.mkdir(parents=True, exist_ok=True)
-        write_file(path, text.encode())
-        return False
+        return "new"
     if not path.is_file():
         raise PolarguideError(
             out,
@@ -47,14 +64,26 @@ def open_folder(out: Path, request: dict[str, Any]) -> bool:
             remedy="Give another --out.",
         )
     before = with_current_keys(read_record(path, dict[str, Any], remedy=remedy))
-    if before != json.loads(text):
+    now = json.loads(json.dumps(request))
+    if before != now:
         raise PolarguideError(
             out,
             expected="a scene that was begun with the same settings",
-            found="a scene with other settings",
+            found=f"a scene with other settings ({_difference(before, now)})",
             remedy=remedy,
         )
-    return (out / "scene.json").exists()
+    return "finished" if (out / "scene.json").exists() else "begun"
+
+
+def _difference(before: Any, now: Any, place: str = "") -> str:
+    """Where two JSON values differ first, in words."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        pairs = [(f"{place}.{key}", before.get(key), now.get(key)) for key in {**now, **before}]
+    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        pairs = [(f"{place}[{k}]", *both) for k, both in enumerate(zip(before, now, strict=True))]
+    else:
+        return f"{place.lstrip('.')}: {shortened(before)} in place of {shortened(now)}"
+    return next(_difference(old, new, at) for at, old, new in pairs if old != new)
 
 
 def write_file(path: Path, data: bytes) -> None:

@@ -61,16 +61,18 @@ def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any
 
 
 def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[Any]]:
-    """Normals, depth, mask and object numbers at pixel centers, with the keys of a ground-truth file."""
+    """Normals, depth, mask and object numbers at pixel centers, with the keys of a ground-truth file; nothing of
+    what is black to the camera."""
     rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     origins = np.broadcast_to(camera.center.numpy(), rays.shape)
     hits = intersect(built, origins, rays)
     shape = (camera.height, camera.width)
     front = np.array([False] + [thing.foreground for thing in built.spec.things])
-    depth = hits.distance * (rays @ camera.rotation[2].numpy())
+    shown = np.array([False, *built.spec.shown])[hits.thing]
+    depth = shown * hits.distance * (rays @ camera.rotation[2].numpy())
     return {
-        "normal": hits.normal.reshape(*shape, 3).astype(np.float16),
+        "normal": (shown[:, None] * hits.normal).reshape(*shape, 3).astype(np.float16),
         "depth": depth.reshape(shape).astype(np.float16),
         "mask": front[hits.thing].reshape(shape),
-        "objid": hits.thing.reshape(shape),
+        "objid": (shown * hits.thing).reshape(shape),
     }

@@ -8,7 +8,8 @@ import numpy as np
 
 from polarguide.errors import PolarguideError
 from polarguide.synth.mesh import Array
-from polarguide.synth.schema import Material
+from polarguide.synth.schema import Material, SceneSpec
+from polarguide.synth.transport import SHOWN
 
 AIR = 1.0
 
@@ -62,6 +63,11 @@ def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
     axes = np.array([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
     return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(part, np.float32)),
             "to_world": mi.ScalarTransform4f(axes)}  # fmt: skip
+
+
+def shown_dict(spec: SceneSpec, shown: bool) -> dict[str, Any]:
+    """The attribute of a shape that says whether the camera sees it; nothing where it sees all."""
+    return {SHOWN: {"type": "uniform", "value": float(shown)}} if spec.object_only else {}
 
 
 def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> dict[str, Any]:

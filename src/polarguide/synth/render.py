@@ -77,13 +77,13 @@ def synthesize(
         PolarguideError: Mitsuba is missing, the folder holds something else, or the scene has a mistake.
     """
     settings.check()
-    if folder.open_folder(out, {"scene": spec.data(), "settings": settings.data()}):
+    if folder.open_folder(out, folder.scene_request(spec, settings)):
         verify_scene(out)
         reporter.say(f"{out} is finished already; all its files have their checksums.")
         return out
     variant = choose_variant(settings.color, threads=threads)
     names = view_names(spec.camera.views)
-    tests = held_out_names(names)
+    tests = held_out_names(names, settings.test_every)
     if variant.note:
         views = len(names) + (TEST_SAMPLES - 1) * len(tests)
         paths = settings.width * settings.height * settings.samples * views
@@ -127,7 +127,8 @@ def _render_view(job: Job, number: int) -> None:
     big = camera.scaled(2, 2 * camera.width, 2 * camera.height) if job.mosaics else camera
     if job.mosaics:
         samples = max(1, samples // 4)
-    limits = PathLimits(job.built.spec.depth, job.built.spec.clamp / job.exposure)
+    spec = job.built.spec
+    limits = PathLimits(spec.depth, spec.clamp / job.exposure, shown_only=spec.object_only)
     light = render_lobes(job.built.scenes, big, samples, seed=settings.seed * 100003 + number, limits=limits)
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
@@ -169,7 +170,8 @@ def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> fl
     values = []
     for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
         factor = max(1, camera.width // METER_WIDTH)
-        limits, small = PathLimits(built.spec.depth), camera.downscaled(factor)
+        limits = PathLimits(built.spec.depth, shown_only=built.spec.object_only)
+        small = camera.downscaled(factor)
         light = render_lobes(built.scenes, small, METER_SAMPLES, seed=seed, limits=limits)
         values.append(light.stokes[0].ravel())
     return float(f"{BRIGHT / max(float(np.percentile(np.concatenate(values), 99)), 1e-9):.4g}")

@@ -93,6 +93,8 @@ class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
         depth: largest number of surfaces on a light path.
         clamp: see ``transport.PathLimits``.
         exposure: display value of radiance 1; None takes one by which 1 % of S0 lies above 1.5.
+        object_only: whether only things of the foreground are in the pictures; all else is black to the camera, but
+            still lights them, is mirrored in them and hides what is behind it.
         folder: where relative file names of meshes and pictures start.
     """
 
@@ -105,12 +107,20 @@ class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
     depth: int = 6
     clamp: float = 0.0
     exposure: float | None = None
+    object_only: bool = False
     folder: Path = Path(".")
+
+    @property
+    def shown(self) -> tuple[bool, ...]:
+        """Of each thing, whether the camera sees it."""
+        return tuple(thing.foreground or not self.object_only for thing in self.things)
 
     def data(self) -> Data:
         """The scene as JSON data, without the folder."""
         values: Data = msgspec.to_builtins(self, enc_hook=str)
         del values["folder"]
+        if not self.object_only:  # folders of versions without this field go on
+            del values["object_only"]
         return values
 
 

@@ -14,7 +14,13 @@ from polarguide.records import check_options
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file
 from polarguide.synth.variant import Color
 
-PRESETS = ("figure", "kit", "car", "cup", "water", "proof")
+PRESETS = (
+    *("figure", "kit", "car", "cup", "water"),
+    *("metals-a", "metals-b", "ceramic-a", "ceramic-b", "rough", "lacquer"),
+    "proof",
+)
+TEST_EVERY = 8
+"""As reports of 3DGS do."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,7 @@ class SynthSettings:
         color: Three channels with exact values, or a sampled spectrum.
         ground_truth: Views that get ground truth.
         points: Sparse points to look for.
+        test_every: One view in so many is held out.
     """
 
     size: str = "256x192"
@@ -40,6 +47,7 @@ class SynthSettings:
     color: Color = "rgb"
     ground_truth: Literal["test", "all"] = "test"
     points: Annotated[int, Meta(ge=0)] = 5000
+    test_every: Annotated[int, Meta(ge=2)] = TEST_EVERY
 
     @property
     def width(self) -> int:
@@ -55,6 +63,8 @@ class SynthSettings:
         """As JSON."""
         values = asdict(self)
         del values["size"]
+        if self.test_every == TEST_EVERY:  # folders of versions without this setting go on
+            del values["test_every"]
         return {"width": self.width, "height": self.height, **values}
 
     def check(self) -> None:

@@ -75,7 +75,8 @@ def sample_sparse_points(
     near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1
     seen = np.where(ghost[:, None], near, seen)
     seen[np.arange(len(view)), view] = True
-    keep = np.flatnonzero((hits.thing > 0) & (seen.sum(1) >= 2))
+    shown = np.array([False, *built.spec.shown])[hits.thing]
+    keep = np.flatnonzero(shown & (seen.sum(1) >= 2))
     keep = np.sort(random.permutation(keep)[:count])
     tracks = [_track(places[k], np.flatnonzero(seen[k]), cameras, random) for k in keep]
     reach = np.linalg.norm(places - origin, axis=1)[keep]

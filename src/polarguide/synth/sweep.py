@@ -98,7 +98,7 @@ def _fewer_views(
     """All members of a sweep over the number of training views."""
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     by_name = dict(zip(view_names(len(cameras)), cameras, strict=True))
-    tests = held_out_names(list(by_name))
+    tests = held_out_names(list(by_name), settings.test_every)
     train = [name for name in by_name if name not in tests]
     if sweep.values[-1] > len(train):
         raise PolarguideError(

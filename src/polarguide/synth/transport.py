@@ -18,6 +18,8 @@ from polarguide.synth.bsdf_sampling import DirectionSampler, sample_bsdf, sample
 from polarguide.synth.sampler import Sampler
 
 TINY = 1e-30
+SHOWN = "shown"
+"""Of a shape, the attribute that is 1 where the camera sees it and 0 where it is black to it."""
 ROULETTE_FROM = 1
 """Number of surfaces after which Russian roulette starts."""
 
@@ -30,10 +32,12 @@ class PathLimits:
         depth: largest number of surfaces on a path.
         clamp: largest radiance that one path may contribute from beyond its second surface, in scene units; the Stokes
             vector of a brighter path is scaled down as a whole. 0: no limit and no bias.
+        shown_only: whether the camera sees only shapes whose attribute ``SHOWN`` is 1.
     """
 
     depth: int = 6
     clamp: float = 0.0
+    shown_only: bool = False
 
 
 def trace_paths(
@@ -55,7 +59,10 @@ def trace_paths(
     import mitsuba as mi
 
     si = scene.ray_intersect(ray)
+    seen = _shown(si) if limits.shown_only else mi.Bool(True)
     emitted = _emitted(scene, si, mi.Bool(True))
+    if limits.shown_only:
+        emitted *= dr.select(seen, 1.0, 0.0)  # the scalar variant evaluates emitters that are not active, too
     flags = mi.BSDFFlags
     lobes = []
     for kinds, sample_direction in (
@@ -65,7 +72,7 @@ def trace_paths(
         context = mi.BSDFContext()
         context.type_mask = int(kinds)
         numbers = (sampler.next(), sampler.pair(), sampler.pair())
-        start = (dr.identity(mi.Spectrum), numbers, si.is_valid())
+        start = (dr.identity(mi.Spectrum), numbers, si.is_valid() & seen)
         direct, after = _scatter(scene, ray, si, context, *start, sample_direction)
         lobes.append(_continue_paths(scene, direct, after, sampler, limits))
     return lobes[0], lobes[1], emitted
@@ -168,6 +175,15 @@ def _emitted(scene: Any, si: Any, active: Any) -> Any:
 
     emitter = si.emitter(scene)
     return mi.UnpolarizedSpectrum(0.0) if emitter is None else emitter.eval(si, active)[0, 0]
+
+
+def _shown(si: Any) -> Any:
+    """Whether the camera sees the surface at an intersection; lights and the environment are not among them."""
+    import mitsuba as mi
+
+    if si.shape is None:  # the scalar variant
+        return False
+    return si.shape.eval_attribute_1(SHOWN, si, mi.Bool(si.is_valid())) > 0.5
 
 
 def _limited(light: list[Any], limit: float, where: Any) -> list[Any]:

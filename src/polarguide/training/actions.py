@@ -28,7 +28,6 @@ def reset_opacity(state: TrainingState, shading: ShadingModel) -> None:
     for name, parameter in shading.parameters.items():
         if parameter.reset_minimum is not None:
             gaussians.overwrite(name, gaussians[name].clamp(min=parameter.reset_minimum))
-    state.opacity_was_reset = True
 
 
 @torch.no_grad()

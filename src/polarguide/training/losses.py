@@ -10,6 +10,15 @@ from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
+from polarguide.training.native_terms import (
+    S1_AND_S2,
+    Consistency,
+    Directions,
+    Polarization,
+    Terms,
+    fit_native,
+    pixel_terms,
+)
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Weights
@@ -50,13 +59,28 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
     return (distance if weight is None else weight * distance)[1:-1, 1:-1].mean()
 
 
+def nearest_target(normal: Tensor, priors: ViewPriors) -> Tensor:
+    """What the normal term compares with, [H, W, 3]: of a view with candidates the one nearest to the normals just
+    rendered, otherwise what the frozen Gaussians have chosen.
+
+    Args:
+        normal: [H, W, 3] blended normals, world axes, any length; gets no gradient.
+    """
+    if priors.candidates is None:
+        return priors.normal
+    nearest = dot(normal.detach()[..., None, :], priors.candidates).argmax(dim=-1)
+    return torch.take_along_dim(priors.candidates, nearest[..., None, None], dim=-2).squeeze(-2)
+
+
 def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
     """Mean of 1 - cos(normal, target) over the weighted pixels (the normal term of Shan et al. 2026).
+
+    The target is ``nearest_target``.
 
     Args:
         normal: [H, W, 3] blended normals, world axes, any length.
     """
-    cosine = dot(unit(normal, 1e-2), priors.normal)
+    cosine = dot(unit(normal, 1e-2), nearest_target(normal, priors))
     return ((1 - cosine) * priors.weight).sum() / priors.weight.sum().clamp(min=1)
 
 
@@ -83,16 +107,14 @@ def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel)
     """Mean distance of the predicted S1 and S2 from the measured ones, over the square root of S0.
 
     The shading model predicts from the rendered layers and the rendered normal, so that one explanation of
-    geometry and layers has to fit the polarization of all views. The variance of S1 and S2 grows with S0 where light
-    itself is the noise; the root evens that out.
+    geometry and layers has to fit the polarization of all views. See ``ViewPriors.stokes_weight`` for the root.
 
     Args:
         result: with both layers and the normal. shading: of the recipe, for the run's refractive index.
     """
     predicted = shading.predicted_stokes(result, priors.camera)
     distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))
-    scale = (priors.stokes[0].mean(dim=-1) + 0.01).rsqrt()
-    return (priors.reliable * scale * distance).mean()
+    return (priors.stokes_weight * distance).mean()
 
 
 def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
@@ -135,15 +157,10 @@ def step_loss(
     photometric = photometric_loss(result.final, shown, valid, ssim_weight)
     total = weights.photometric * photometric
     if priors is not None:
-        total = total + _prior_terms(result, weights, priors, ssim_weight)
-        if weights.stokes and shading.reflects:
-            total = total + weights.stokes * stokes_loss(result, priors, shading)
+        total = total + _layer_terms(result, weights, priors, ssim_weight)
     if weights.flatness and result.radii is not None:
         total = total + weights.flatness * flatness_loss(log_scales, result.radii, extent)
-    if weights.consistency and camera is not None:
-        total = total + weights.consistency * consistency_loss(
-            result, camera, None if priors is None else priors.weight
-        )
+    total = total + normal_terms(result, weights, priors, camera, shading)
     if total.device.type == "cpu":
         refuse_diverged(total.detach())
     return total, photometric
@@ -163,8 +180,8 @@ def refuse_diverged(total: Tensor) -> None:
         )
 
 
-def _prior_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssim_weight: float) -> Tensor:
-    """The weighted sum of the terms that compare with a view's priors."""
+def _layer_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssim_weight: float) -> Tensor:
+    """The weighted sum of the terms that compare layers with the separated pictures."""
     total = result.final.new_zeros(())
     for weight, layer, target in (
         (weights.specular, result.specular, priors.specular),
@@ -172,11 +189,86 @@ def _prior_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssi
     ):
         if weight and layer is not None:
             total = total + weight * photometric_loss(layer, target, priors.separated, ssim_weight)
-    for weight, loss in (
-        (weights.normal, normal_loss),
-        (weights.azimuth, azimuth_loss),
-        (weights.chromatic, chromatic_loss),
-    ):
-        if weight and result.normal is not None:
-            total = total + weight * loss(result.normal, priors)
+    return total
+
+
+def normal_terms(
+    result: RenderResult,
+    weights: Weights,
+    priors: ViewPriors | None,
+    camera: Camera | None,
+    shading: ShadingModel,
+) -> Tensor:
+    """The weighted sum of the terms that read the rendered normal.
+
+    On the CPU in float32 they are one native pass, but for the Stokes term of a shading model with a prediction of its
+    own. ``normal_terms_reference`` is the reference implementation.
+
+    Args:
+        result: the rendered layers. weights: of the stage.
+        priors: of the view; None: the terms that compare with them are left out.
+        camera: of the view; None: the consistency is left out.
+        shading: of the stage.
+    """
+    if not _native_fits(result, priors):
+        return normal_terms_reference(result, weights, priors, camera, shading)
+    stokes, directions, consistency, beside = None, [], None, result.alpha.new_zeros(())
+    if priors is not None:
+        assert result.normal is not None
+        directions = [
+            Directions(target, weight, factor / max(1.0, float(weight.sum())), plane)
+            for factor, target, weight, plane in (
+                (weights.normal, nearest_target(result.normal, priors), priors.weight, False),
+                (weights.azimuth, priors.plane, priors.weight, True),
+                (weights.chromatic, priors.chromatic, priors.chromatic_weight, False),
+            )
+            if factor
+        ]
+        if weights.stokes and shading.reflects and not shading.smooth_dielectric:
+            beside = weights.stokes * stokes_loss(result, priors, shading)
+        elif weights.stokes and shading.reflects:
+            measured, index = priors.stokes[1:], shading.refractive_index
+            factor = weights.stokes / measured.numel()
+            stokes = Polarization(measured, S1_AND_S2, priors.stokes_weight, factor, index)
+    if weights.consistency and camera is not None:
+        factor = weights.consistency / ((result.alpha.shape[0] - 2) * (result.alpha.shape[1] - 2))
+        consistency = Consistency(None if priors is None else priors.weight, factor)
+    terms = Terms(stokes, directions, consistency)
+    if not any(terms):
+        return beside
+    of = camera if priors is None else priors.camera
+    assert of is not None
+    return beside + pixel_terms(result, of, terms)
+
+
+def _native_fits(result: RenderResult, priors: ViewPriors | None) -> bool:
+    """Whether the native pass takes these pictures."""
+    rendered = result.normal, result.specular, result.diffuse, result.depth, result.alpha
+    compared = () if priors is None else (priors.stokes, priors.weight, priors.plane, priors.chromatic)
+    return result.normal is not None and min(result.alpha.shape) >= 3 and fit_native(*rendered, *compared)
+
+
+def normal_terms_reference(
+    result: RenderResult,
+    weights: Weights,
+    priors: ViewPriors | None,
+    camera: Camera | None,
+    shading: ShadingModel,
+) -> Tensor:
+    """The reference implementation of ``normal_terms``: plain torch, any dtype and device."""
+    total = result.final.new_zeros(())
+    if priors is not None:
+        for weight, loss in (
+            (weights.normal, normal_loss),
+            (weights.azimuth, azimuth_loss),
+            (weights.chromatic, chromatic_loss),
+        ):
+            if weight and result.normal is not None:
+                total = total + weight * loss(result.normal, priors)
+        if weights.stokes and shading.reflects:
+            total = total + weights.stokes * stokes_loss(result, priors, shading)
+    if weights.consistency and camera is not None:
+        total = total + weights.consistency * consistency_loss(
+            result, camera, None if priors is None else priors.weight
+        )
     return total

@@ -7,6 +7,7 @@ polarization normals and the separation, and what comes out supervises the Gauss
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.color import srgb_encode
-from polarguide.training.recipe import Priors
+from polarguide.training.recipe import Candidates, Priors
 from polarguide.vectors import dot, unit
 
 # Rendered normals shorter than this are too mixed to be trusted.
@@ -34,6 +35,7 @@ class ViewPriors:
         specular, diffuse: [H, W, 3] shown (sRGB) separated pictures, on the scale of S0/2.
         separated: [H, W] weight of both: 1 where the separation is well conditioned.
         normal: [H, W, 3] disambiguated polarization normal, world axes.
+        candidates: [H, W, K, 3] what each step chooses from in place of ``normal``, world axes; None: nothing.
         plane: [H, W, 3] world normal of the plane of incidence that the AoLP gives.
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
         chromatic: [H, W, 3] normal from the polarization of color differences, world axes.
@@ -54,6 +56,14 @@ class ViewPriors:
     camera: Camera
     stokes: Tensor
     reliable: Tensor
+    candidates: Tensor | None = None
+
+    @cached_property
+    def stokes_weight(self) -> Tensor:
+        """[H, W] weight of S1 and S2: one over the root of S0, since their variance grows with S0 where light itself is
+        the noise.
+        """
+        return self.reliable * (self.stokes[0].mean(dim=-1) + 0.01).rsqrt()
 
 
 def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,10 +108,8 @@ def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: 
         )
         chromatic_weight = chromatic_weight * known
         nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
-    make = optics.paper_candidates if settings.candidates == "paper" else optics.physical_candidates
-    chosen = optics.disambiguate(
-        make(luminance, rays, refractive_index), nearest_to, rays, azimuth_weight=settings.azimuth_weight
-    ).normal
+    candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
+    chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal
     if settings.separation == "paper":
         zenith = optics.diffuse_zenith(optics.dolp(luminance), refractive_index)
         layers = optics.paper_separation(stokes, zenith, refractive_index)
@@ -111,7 +119,7 @@ def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: 
         conditioned = layers.conditioned & known & ~view.saturated
     plane = unit(torch.linalg.cross(rays, chosen))
     degree = optics.dolp(luminance)
-    weight = (degree / settings.full_dolp).clamp(max=1) * (usable & known)
+    weight = (degree / settings.full_dolp).clamp(max=1) * (usable if settings.live else usable & known)
     if settings.chromatic:
         # Nearly unpolarized light has no reliable AoLP; the slope among its colors may still have one.
         better = (chromatic_weight > 0) & (degree < CHROMATIC_PLANE_DOLP)
@@ -131,7 +139,28 @@ def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: 
         camera=view.camera,
         stokes=stokes,
         reliable=(~(view.invalid | view.saturated)).float(),
+        candidates=view.camera.to_world(_normals(candidates)) if settings.live else None,
     )
+
+
+def _candidates(
+    kind: Candidates, luminance: Tensor, rays: Tensor, refractive_index: float
+) -> optics.Candidates | optics.PhysicalCandidates | Tensor:
+    """The candidate normals of a recipe, camera axes. luminance: [3, H, W]. rays: [H, W, 3]."""
+    if kind == "physical":
+        return optics.physical_candidates(luminance, rays, refractive_index)
+    paper = optics.paper_candidates(luminance, rays, refractive_index)
+    if kind == "paper":
+        return paper
+    quarters = [paper.azimuth + turn * torch.pi / 2 for turn in range(4)]
+    return torch.stack(
+        [optics.normal_from_angles(paper.zenith, azimuth, rays) for azimuth in quarters], dim=-2
+    )
+
+
+def _normals(candidates: optics.Candidates | optics.PhysicalCandidates | Tensor) -> Tensor:
+    """The candidates' normals [H, W, K, 3]."""
+    return candidates if isinstance(candidates, Tensor) else candidates.normals
 
 
 def facing_chromatic(

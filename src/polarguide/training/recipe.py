@@ -17,7 +17,7 @@ from polarguide.gaussians.initialize import Initialization
 from polarguide.shading.model import PLAIN, ShadingModel
 
 Action = Literal["reset_opacity", "propagate_normals", "refresh_priors", "orient_normals"]
-Candidates = Literal["paper", "physical"]
+Candidates = Literal["paper", "azimuths", "physical"]
 Separation = Literal["paper", "exact"]
 
 
@@ -34,6 +34,31 @@ class Repeat:
     action: Action
     fraction: float
     minimum: int = 1
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """Things that take turns, evenly spread over a stage in as many whole rounds as fit, one at least.
+
+    So two of them never fall on each other, however many steps there are. The last turn of the last round falls on
+    the end of the stage and is left out: it belongs to what follows (``on_enter`` of the next stage).
+
+    Attributes:
+        actions: what, in turn.
+        fraction: of all steps, the least distance between two turns.
+        minimum: nor closer than this many steps. A stage too short for one such round has one all the same.
+    """
+
+    actions: tuple[Action, ...]
+    fraction: float
+    minimum: int = 1
+
+    def turns(self, length: int, steps: int) -> dict[int, Action]:
+        """What is due when, in steps since the beginning of a stage of ``length`` steps, of ``steps`` in all."""
+        apart = max(1, self.minimum, round(self.fraction * steps))
+        count = len(self.actions) * max(1, length // (apart * len(self.actions)))
+        places = (round(turn * length / count) for turn in range(1, count))
+        return {at: self.actions[k % len(self.actions)] for k, at in enumerate(places) if 0 < at < length}
 
 
 @dataclass(frozen=True)
@@ -89,6 +114,7 @@ class Stage:
         weights: of the losses.
         densify: whether the density control runs.
         repeats: what happens every so often in it.
+        rounds: what happens in turns in it.
         on_enter: what happens at its first step.
         rate_factors: on the recipe's learning rates while it lasts, by name; 1 where not named.
     """
@@ -99,6 +125,7 @@ class Stage:
     weights: Weights = field(default_factory=Weights)
     densify: bool = False
     repeats: tuple[Repeat, ...] = ()
+    rounds: Rounds | None = None
     on_enter: tuple[Action, ...] = ()
     rate_factors: Mapping[str, float] = field(default_factory=dict)
 
@@ -108,7 +135,10 @@ class Priors:
     """How polarization priors are computed from the frozen Gaussians.
 
     Attributes:
-        candidates: which polarization normals are considered.
+        candidates: which polarization normals are considered: PolarGuide-GSDR's n, -n, R n, -R n ("paper"), the same
+            with -n read as the opposite azimuth ("azimuths"), or the six that physics allows.
+        live: whether each step chooses the candidate nearest to the normals that it renders, wherever the DoLP is over
+            the threshold; otherwise the frozen Gaussians have chosen, and count only where they have a normal.
         separation: which separation supervises the layers.
         threshold: DoLP above which a pixel's normal is used.
         full_dolp: DoLP from which on a pixel's normal counts fully; below, in proportion.
@@ -118,6 +148,7 @@ class Priors:
     """
 
     candidates: Candidates = "physical"
+    live: bool = False
     separation: Separation = "exact"
     threshold: float = 0.05
     full_dolp: float = 0.3
@@ -201,8 +232,9 @@ class Recipe:
 
     @property
     def learning_rates(self) -> dict[str, float]:
-        """Learning rates of the per-Gaussian tensors, the shading model's included."""
-        return {**self.rates, **{name: given.rate for name, given in self.shading.parameters.items()}}
+        """Learning rates of the per-Gaussian tensors that learn, the shading model's included."""
+        own = {name: given.rate for name, given in self.shading.parameters.items() if given.rate}
+        return {**self.rates, **own}
 
     @property
     def light_rates(self) -> dict[str, float]:

@@ -31,6 +31,11 @@ class Schedule:
         for stage in recipe.stages:
             self._starts.append(round(share * steps))
             share += stage.fraction
+        ends = (*self._starts[1:], steps)
+        self._turns = [
+            stage.rounds.turns(end - start, steps) if stage.rounds else {}
+            for stage, start, end in zip(recipe.stages, self._starts, ends, strict=True)
+        ]
 
     def at(self, step: int) -> Position:
         """The stage of a step (0-based) and the actions due before it."""
@@ -39,10 +44,8 @@ class Schedule:
         if since == 0:
             return Position(stage, stage.on_enter)
         due = [r.action for r in stage.repeats if since % self.period(r) == 0]
-        # An opacity reset and a propagation would undo each other: the reset wins, as in the release.
-        if "reset_opacity" in due:
-            due = [a for a in due if a != "propagate_normals"]
-        return Position(stage, tuple(due))
+        turn = self._turns[index].get(since)
+        return Position(stage, (turn, *due) if turn else tuple(due))
 
     def period(self, repeat: Repeat) -> int:
         """Steps between two occurrences."""

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from polarguide.errors import PolarguideError
 from polarguide.options import check_count
 
+MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -35,7 +37,8 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         check_count("steps", self.steps)
-        check_count("views_per_step", self.views_per_step, 0)
+        check_count("views_per_step", self.views_per_step, 0, MOST_VIEWS)
+        check_count("seed", self.seed, 0, MOST_SEEDS)
         if not 1.0 < self.refractive_index < 4.0:
             raise PolarguideError(
                 "refractive_index",

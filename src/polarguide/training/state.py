@@ -13,7 +13,7 @@ from polarguide.color import srgb_decode
 from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians, Trained
 from polarguide.gaussians.harmonics import SH_C0
-from polarguide.gaussians.initialize import initial_parameters
+from polarguide.gaussians.initialize import far_away, initial_parameters
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
@@ -56,7 +56,6 @@ class TrainingState:
         statistics: of the density control.
         frozen: copy of the Gaussians from which the present priors were computed; None before the first refresh.
         opacity_frozen_until: first step at which opacities train again (after a normal propagation).
-        opacity_was_reset: whether opacities have been reset yet (then huge Gaussians are pruned).
     """
 
     step: int
@@ -65,7 +64,6 @@ class TrainingState:
     statistics: DensityStatistics
     frozen: dict[str, Tensor] | None = None
     opacity_frozen_until: int = 0
-    opacity_was_reset: bool = False
 
     @property
     def light(self) -> dict[str, Tensor]:
@@ -81,43 +79,20 @@ class TrainingState:
         out["statistics.seen"] = self.statistics.seen
         if self.frozen is not None:
             out.update({f"frozen.{name}": t for name, t in self.frozen.items()})
-        out["scalars"] = torch.tensor(
-            [self.step, self.opacity_frozen_until, int(self.opacity_was_reset)], dtype=torch.int64
-        )
+        out["scalars"] = torch.tensor([self.step, self.opacity_frozen_until], dtype=torch.int64)
         return out
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], recipe: Recipe) -> TrainingState:
-        """The inverse of ``tensors``.
-
-        Raises:
-            KeyError, ValueError: tensors that no training of the recipe leaves.
-        """
-        refuse_foreign(tensors, recipe)
+        """The inverse of ``tensors``; what comes from a file is for ``refuse_foreign`` to check first."""
         gaussians = Gaussians.from_state(tensors, recipe.learning_rates)
         rates = recipe.light_rates
         environment = Environment.from_state(tensors, rates) if rates else None
         statistics = DensityStatistics.of(tensors["statistics.gradient"], tensors["statistics.seen"])
         frozen = {key[7:]: value for key, value in tensors.items() if key.startswith("frozen.")}
-        step, frozen_until, was_reset = (int(x) for x in tensors["scalars"])
-        return cls(step, gaussians, environment, statistics, frozen or None, frozen_until, bool(was_reset))
-
-
-def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
-    """Raise ValueError unless a checkpoint's Gaussians and light are what the recipe trains, finite floats."""
-    count = tensors["gaussians.means"].shape[0]
-    shapes = {f"gaussians.{name}": (count, *shape) for name, shape in recipe.shapes.items()}
-    for name, given in recipe.shading.light_parameters.items():
-        shapes[f"environment.{name}"] = given.shape
-    for name, shape in shapes.items():
-        values = tensors.get(name)
-        if values is None:
-            raise ValueError(f"no {name}")
-        if values.dtype != torch.float32 or tuple(values.shape) != shape:
-            found = f"{list(values.shape)}, {values.dtype}"
-            raise ValueError(f"{name} of shape {found}, not {list(shape)}, torch.float32")
-        if not bool(torch.isfinite(values).all()):
-            raise ValueError(f"{name} with values that are not finite")
+        # The first checkpoints had a third.
+        step, frozen_until = (int(x) for x in tensors["scalars"][:2])
+        return cls(step, gaussians, environment, statistics, frozen or None, frozen_until)
 
 
 def seeded(*numbers: int) -> torch.Generator:
@@ -140,6 +115,7 @@ def first_state(
         tensors |= {name: torch.zeros(count, *shape) for name, shape in ORIENTED_SHAPES.items()}
     generator = seeded(settings.seed, recipe.shading.stream)
     tensors |= recipe.shading.initial_parameters(tensors["sh_dc"] * SH_C0 + 0.5, generator)
+    tensors |= recipe.shading.placed_parameters(far_away(tensors["means"], scene.points, centers))
     light = {name: t.to(device) for name, t in recipe.shading.initial_light(generator).items()}
     environment = Environment(light, recipe.light_rates) if light else None
     gaussians = Gaussians({name: t.to(device) for name, t in tensors.items()}, recipe.learning_rates)

@@ -111,7 +111,7 @@ class Trainer:
                 recipe.densification,
                 extent=self._extent,
                 middle=self._middle,
-                prune_large=state.opacity_was_reset,
+                prune_large=recipe.densification.prunes_large(state.step, self.settings.steps),
                 empty=self._empty,
                 limit=self._limit,
                 generator=seeded(self.settings.seed, 2, state.step),

@@ -123,6 +123,18 @@ def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = 0.25) -
     return scalar_to_rgb((shown(pred_linear.detach().cpu()) - true).abs().mean(-1), 0.0, high, "inferno")
 
 
+def scale_bar(low: float, high: float, colormap: str) -> Picture:
+    """The colors of ``scalar_to_rgb`` from ``low`` to ``high``, with both numbers below: uint8 RGB [44, 256, 3]."""
+    drawn: Picture = np.full((44, 256, 3), 255, np.uint8)
+    drawn[:22] = scalar_to_rgb(torch.linspace(low, high, 256).expand(22, -1), low, high, colormap)
+    for number, last in ((low, False), (high, True)):
+        text = f"{number:g}"
+        (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+        origin = (256 - width if last else 0, 39)
+        cv2.putText(drawn, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (32, 32, 32), 1, cv2.LINE_AA)
+    return drawn
+
+
 def write_png(path: str | Path, rgb8: Picture) -> None:
     """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
 

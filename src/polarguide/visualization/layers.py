@@ -14,12 +14,24 @@ from polarguide.visualization.sheet import Picture
 
 
 def layer_picture(
-    result: RenderResult, name: str, camera: Camera, depths: tuple[float, float] | None = None
+    result: RenderResult,
+    name: str,
+    camera: Camera,
+    depths: tuple[float, float] | None = None,
+    *,
+    exposed: bool = False,
 ) -> Picture | None:
-    """One layer as an 8-bit picture, or None where the recipe has no such layer; ``depths`` sets depth's colors."""
+    """One layer as an 8-bit picture, or None where the recipe has no such layer.
+
+    Args:
+        result, camera: the rendering. name: of the layer. depths: nearest and farthest, for depth's colors.
+        exposed: show radiance darker where more than 1 % of the pixels would clip.
+    """
     values: Tensor | None = getattr(result, name)
     if values is None:
         return None
+    if exposed:
+        values = values * clipping_exposure(values)
     near, far = depths or (0.0, 1.0)
     if name == "depth" and depths is None:
         near, far = depth_range(values, result.alpha > 0.5)
@@ -30,6 +42,13 @@ def layer_picture(
         "alpha": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
     }
     return draw.get(name, figures.radiance_to_rgb)(values)
+
+
+def clipping_exposure(values: Tensor) -> float:
+    """The factor, 1 or less, with which under 1 % of the pixels of radiance [H, W, 3] exceed 1 in some channel."""
+    brightest = values.detach().nan_to_num(0.0, 0.0, 0.0).amax(dim=-1).flatten().sort().values
+    limit = float(brightest[max(0, brightest.numel() - 1 - brightest.numel() // 101)])
+    return min(1.0, 1.0 / limit) if limit > 0 else 1.0
 
 
 def depth_range(depth: Tensor, seen: Tensor) -> tuple[float, float]:

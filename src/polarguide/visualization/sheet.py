@@ -25,6 +25,7 @@ def contact_sheet(
     row_labels: Sequence[str],
     column_labels: Sequence[str],
     *,
+    footer: Sequence[Picture | None] = (),
     minimum_width: int = 256,
     maximum_width: int = 640,
     gutter: int = 8,
@@ -39,6 +40,7 @@ def contact_sheet(
         rows: the pictures, uint8 RGB [H, W, 3]; None, or a row that ends early, leaves the place blank.
         row_labels: one per row.
         column_labels: one per column. Characters outside ASCII are drawn as "?".
+        footer: pictures below the columns, such as scales, as wide as a tile and as high as they then are.
         minimum_width, maximum_width: bounds of a tile's width in pixels.
         gutter: pixels between tiles and around the sheet.
 
@@ -74,7 +76,20 @@ def contact_sheet(
         for j, cell in enumerate(row):
             if cell is not None:
                 _place(sheet[y : y + height, left + j * (width + gutter) :][:, :width], cell)
-    return sheet
+    if not any(cell is not None for cell in footer):
+        return sheet
+    return np.concatenate((sheet, _strip(footer, sheet.shape[1], width, left, gutter)))
+
+
+def _strip(cells: Sequence[Picture | None], across: int, width: int, left: int, gutter: int) -> Picture:
+    """One more row, as high as its pictures need, ``across`` pixels wide."""
+    height = max(round(width * cell.shape[0] / cell.shape[1]) for cell in cells if cell is not None)
+    strip: Picture = np.full((height + gutter, across, 3), BACKGROUND, np.uint8)
+    for j, cell in enumerate(cells):
+        if cell is not None:
+            check_picture(cell, "contact sheet")
+            _place(strip[:height, left + j * (width + gutter) :][:, :width], cell)
+    return strip
 
 
 def check_picture(picture: Picture, name: str) -> None:

@@ -1,0 +1,135 @@
+"""Errors by object and material, pooled over the pixels of all views, against loops over pixels."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from known_scene import HEIGHT, NAMES, WIDTH, known_scene, rendered
+
+from polarguide.evaluation.facts import SceneFacts
+from polarguide.evaluation.maps import ErrorsByObject
+from polarguide.evaluation.scores import score_view
+from polarguide.evaluation.target import ViewTarget
+
+CPU = torch.device("cpu")
+SEEDS = (5, 6)
+
+
+def errors(scene, *, layers=True):
+    facts = SceneFacts.of(scene)
+    pool = ErrorsByObject(facts.objects)
+    for view, seed in zip(scene.views, SEEDS, strict=True):
+        result, stokes, _ = rendered(view, seed)
+        if not layers:
+            result.specular = result.diffuse = stokes = None
+        score_view(ViewTarget.of_view(view, facts, CPU), result, stokes=stokes, by_object=pool)
+    return pool.records()
+
+
+def srgb(v):
+    v = np.clip(np.asarray(v, np.float64), 0, 1)
+    return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def by_loop(scene, numbers):
+    """The errors over the pixels with these object numbers."""
+    squares = {"psnr": [], "specular_psnr": [], "diffuse_psnr": []}
+    angles, error, size, views = [], 0.0, 0.0, set()
+    for view, seed in zip(scene.views, SEEDS, strict=True):
+        result, stokes, _ = rendered(view, seed)
+        truth = view.ground_truth
+        true = {
+            "psnr": view.photograph(),
+            "specular_psnr": truth.specular / 2,
+            "diffuse_psnr": truth.diffuse / 2,
+        }
+        made = {"psnr": result.final, "specular_psnr": result.specular, "diffuse_psnr": result.diffuse}
+        four = view.codes.numpy().astype(np.float64) / 65535
+        for y in range(HEIGHT):
+            for x in range(WIDTH):
+                if int(truth.object_ids[y, x]) not in numbers or view.invalid[y, x]:
+                    continue
+                views.add(view.name)
+                for key in squares:
+                    squares[key] += list((srgb(made[key][y, x]) - srgb(true[key][y, x])) ** 2)
+                n = truth.normal[y, x].double().numpy()
+                if np.linalg.norm(n) > 0:
+                    m = result.normal[y, x].double().numpy()
+                    cosine = n @ m / np.linalg.norm(n) / np.linalg.norm(m)
+                    angles.append(math.degrees(math.acos(np.clip(cosine, -1, 1))))
+                if not view.saturated[y, x]:
+                    i0, i45, i90, i135 = four[:, y, x]
+                    for component, measured in ((1, i0 - i90), (2, i45 - i135)):
+                        error += np.abs(stokes[component, y, x].double().numpy() - measured).sum()
+                        size += np.abs(measured).sum()
+    found = {key: -10 * math.log10(np.mean(values)) for key, values in squares.items()}
+    return found | {
+        "normal_mae_deg": np.mean(angles),
+        "stokes_error": error / size,
+        "pixels": len(squares["psnr"]) // 3,
+        "views": len(views),
+    }
+
+
+def test_errors_of_each_object():
+    scene = known_scene()
+    by_object, _ = errors(scene)
+    assert set(by_object) == {"cup", "spoon", "cloth", "clay"}
+    for name, number in (("cup", 2), ("spoon", 3), ("cloth", 4), ("clay", 7)):
+        found = dict(by_object[name])
+        kind = found.pop("material")
+        assert (
+            kind
+            == {"cup": "dielectric", "spoon": "metal", "cloth": "rough dielectric", "clay": "matte"}[name]
+        )
+        assert found == pytest.approx(by_loop(scene, (number,)), rel=1e-5), name
+    assert (by_object["cup"]["views"], by_object["clay"]["views"]) == (2, 1)
+
+
+def test_errors_of_each_class_of_material():
+    by_object, materials = errors(known_scene())
+    assert list(materials) == ["dielectric", "matte", "metal", "rough dielectric"]
+    assert materials["metal"] == {k: v for k, v in by_object["spoon"].items() if k != "material"}
+
+
+def test_a_class_is_pooled_over_its_objects():
+    scene = known_scene()
+    cup, cloth = scene.objects[1], scene.objects[3]
+    alike = type(cloth)(cloth.id, cloth.name, material=cup.material)
+    objects = tuple(alike if item.id == cloth.id else item for item in scene.objects)
+    _, materials = errors(dataclasses.replace(scene, objects=objects))
+    assert materials["dielectric"] == pytest.approx(by_loop(scene, (2, 4)), rel=1e-5)
+    assert materials["dielectric"]["views"] == len(NAMES)
+
+
+def test_what_a_recipe_has_not_is_none():
+    by_object, _ = errors(known_scene(), layers=False)
+    for key in ("specular_psnr", "diffuse_psnr", "stokes_error"):
+        assert by_object["cup"][key] is None
+    assert by_object["cup"]["psnr"] is not None
+
+
+def test_an_object_that_no_test_view_shows():
+    scene = known_scene()
+    hidden = type(scene.objects[1])(9, "hidden", material=scene.objects[1].material)
+    by_object, _ = errors(dataclasses.replace(scene, objects=(*scene.objects, hidden)))
+    found = by_object["hidden"]
+    assert (found["pixels"], found["views"]) == (0, 0)
+    assert {found[key] for key in found if key not in ("pixels", "views", "material")} == {None}
+
+
+def test_views_without_numbers_add_nothing():
+    scene = known_scene()
+    truth = dataclasses.replace(scene.views[1].ground_truth, object_ids=None)
+    views = (scene.views[0], dataclasses.replace(scene.views[1], ground_truth=truth))
+    by_object, _ = errors(dataclasses.replace(scene, views=views))
+    assert by_object["cup"]["views"] == 1
+    bare = tuple(
+        dataclasses.replace(v, ground_truth=dataclasses.replace(v.ground_truth, object_ids=None))
+        for v in views
+    )
+    assert errors(dataclasses.replace(scene, views=bare)) == ({}, {})
