@@ -14,7 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from browsers import PATIENCE, chromium
+import viser
+from browsers import PATIENCE, REBOUND, chromium
 from random_runs import ring
 from viewer_scenes import photograph, shown
 
@@ -145,3 +146,50 @@ def test_names_run_nothing_and_nothing_is_asked_of_others(opened):
     ours = opened.viewer.address.removeprefix("http://")
     strangers = [url for url in opened.requests if ours not in url and not url.startswith(("data:", "blob:"))]
     assert strangers == []
+
+
+TALK = """(address) => new Promise((done) => {
+    const socket = new WebSocket(address, [PROTOCOL]);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = () => done("pictures");
+    socket.onerror = () => done("refused");
+})""".replace("PROTOCOL", f'"viser-v{viser.__version__}"')
+FRAME = """(address) => new Promise((done) => {
+    const frame = document.createElement("iframe");
+    frame.onload = () => setTimeout(() => done(frame.contentDocument === null ? "none" : "own"), 500);
+    frame.src = address;
+    document.body.append(frame);
+})"""
+
+
+@pytest.mark.parametrize(
+    "site", ["http://hostile.example/", "https://hostile.example/", "http://localhost:9/"]
+)
+def test_a_hostile_page_sees_nothing(opened, site):
+    """The page is another site's in the same browser; a sandboxed one has no origin at all."""
+    page = opened.page.context.browser.new_page()
+    page.route("**/*", lambda route: route.fulfill(body="<p>win</p>", content_type="text/html")
+               if route.request.url.startswith(site) else route.continue_())  # fmt: skip
+    page.goto(site)
+    address = opened.viewer.address.replace("http", "ws")
+    before = len(opened.viewer._sessions)
+    if not site.startswith("https"):  # from there, the browser itself allows none
+        assert page.evaluate(TALK, address) == "refused"
+    page.evaluate(FRAME, opened.viewer.address)
+    assert not any("Layer" in frame.content() for frame in page.frames)
+    assert len(opened.viewer._sessions) == before
+    page.close()
+
+
+def test_a_name_that_was_bound_to_this_machine_sees_nothing(opened):
+    page = opened.page.context.browser.new_page()
+    port = opened.viewer.address.rpartition(":")[2]
+    answer = page.goto(f"http://{REBOUND}:{port}/")
+    assert answer.status == 403
+    assert "--allow-host" in answer.text()
+    assert page.evaluate(TALK, f"ws://{REBOUND}:{port}") == "refused"
+    page.close()
+
+
+def test_the_viewers_own_page_does_talk(opened):
+    assert opened.page.evaluate(TALK, opened.viewer.address.replace("http", "ws")) == "pictures"

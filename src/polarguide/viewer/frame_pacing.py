@@ -7,6 +7,7 @@ BUDGET = 0.1  # seconds per picture while the camera moves
 FIRST_HEIGHT = 360
 LEAST_HEIGHT = 90
 GREATEST_HEIGHT = 1080
+GREATEST_WIDTH = 3840
 
 
 class FramePacing:
@@ -41,7 +42,10 @@ class FramePacing:
         """Width and height in pixels of the next picture of this kind, given those of the window."""
         limit = GREATEST_HEIGHT if kind == "sharp" else round(self._height)
         height = max(1, min(window[1], limit))
-        return max(1, round(window[0] * height / max(1, window[1]))), height
+        width = max(1, round(window[0] * height / max(1, window[1])))
+        if width > GREATEST_WIDTH:
+            height = max(1, round(height * GREATEST_WIDTH / width))
+        return min(width, GREATEST_WIDTH), height
 
     def begin_frame(self) -> int:
         """The version of the scene that is about to be rendered, for ``end_frame``."""

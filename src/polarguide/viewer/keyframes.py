@@ -9,6 +9,7 @@ from polarguide.camera import Camera
 from polarguide.trajectory import camera_record, interpolated
 
 FRAMES_PER_SECOND = 30
+MOST_KEYFRAMES = 50
 
 
 class Keyframes:
@@ -23,7 +24,9 @@ class Keyframes:
         self.cameras: list[Camera] = []
 
     def add(self, camera: Camera) -> None:
-        """Append a keyframe; its vertical field of view is kept."""
+        """Append a keyframe, up to ``MOST_KEYFRAMES``; its vertical field of view is kept."""
+        if len(self.cameras) >= MOST_KEYFRAMES:
+            return
         width, height = self._size
         focal = camera.fy * height / camera.height
         self.cameras.append(

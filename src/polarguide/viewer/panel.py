@@ -8,8 +8,12 @@ from typing import Any
 
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.appearance import MEASURED, Appearance, Crop
+from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 
 FREE_VIEW = "(free)"
+STEPS = ("previous", "next")
+# Ranges of the controls.
+EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-4.0, 4.0), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,9 @@ class Panel:
 
     Names of views come from files, so they are shown as plain text only: Markdown in the browser may run code.
 
+    Attributes:
+        accepts: what a browser may set each control to, by viser's name of the control.
+
     Args:
         gui: viser's handle of the session's controls.
         options: the controls to show.
@@ -48,30 +55,47 @@ class Panel:
         self.layer = gui.add_dropdown(
             "Layer", (*layers, *MEASURED), hint="The last four need a photograph's pose"
         )
-        self.exposure = gui.add_slider("Exposure", -4.0, 4.0, 0.1, 0.0, hint="In stops")
-        self.strength = gui.add_slider("Reflection", 0.0, 2.0, 0.05, 1.0, visible="specular" in layers)
+        self.exposure = gui.add_slider("Exposure", *EXPOSURE, 0.1, 0.0, hint="In stops")
+        self.strength = gui.add_slider("Reflection", *STRENGTH, 0.05, 1.0, visible="specular" in layers)
         hint = "Rotates the environment light, in degrees; the scene stays"
-        self.turn = gui.add_slider("Environment", -180, 180, 1, 0, hint=hint, visible=options.turns)
+        self.turn = gui.add_slider("Environment", *TURN, 1, 0, hint=hint, visible=options.turns)
         with gui.add_folder("Photographs"):
             self.view = gui.add_dropdown("Go to", (FREE_VIEW, *options.views))
-            self.step = gui.add_button_group("", ("previous", "next"))
+            self.step = gui.add_button_group("", STEPS)
             self.frusta = gui.add_checkbox("Show cameras", True)
         with gui.add_folder("Crop", expand_by_default=False):
             self._use_crop = gui.add_checkbox("Crop", False)
             self.box = gui.add_checkbox("Show box", True)
             for label in ("Left, right", "Down, up", "Front, back"):
-                self._crop.append(gui.add_multi_slider(label, -150, 150, 1, (-40, 40), min_range=1))
+                self._crop.append(gui.add_multi_slider(label, *CROP, 1, (-40, 40), min_range=1))
         with gui.add_folder("Picture and camera path", expand_by_default=False):
             self.screenshot = gui.add_button("Save picture")
             self.keyframes = gui.add_text("Keyframes", "0", disabled=True)
             self.add_keyframe = gui.add_button("Add keyframe")
             self.remove_keyframe = gui.add_button("Remove last keyframe")
-            self.seconds = gui.add_slider("Seconds per segment", 0.5, 10.0, 0.5, 2.0)
+            self.seconds = gui.add_slider("Seconds per segment", *SECONDS, 0.5, 2.0)
             self.play = gui.add_button("Play")
             self.save_path = gui.add_button("Save path")
+        self.accepts = self._accepted([*layers, *MEASURED], options.views)
         shown = (self.layer, self.exposure, self.strength, self.turn, self._use_crop, *self._crop)
         for control in shown:
             control.on_update(lambda _: changed())
+
+    def _accepted(self, layers: Sequence[str], views: Sequence[str]) -> dict[str, Accepts]:
+        pushed = (self.screenshot, self.add_keyframe, self.remove_keyframe, self.play, self.save_path)
+        controls = [
+            (self.layer, choice(layers)),
+            (self.exposure, number(*EXPOSURE)),
+            (self.strength, number(*STRENGTH)),
+            (self.turn, number(*TURN)),
+            (self.view, choice([FREE_VIEW, *views])),
+            (self.step, choice(STEPS)),
+            (self.seconds, number(*SECONDS)),
+            *((control, flag) for control in (self.pause, self.frusta, self.box, self._use_crop)),
+            *((control, pair(*CROP)) for control in self._crop),
+            *((control, push) for control in pushed),
+        ]
+        return {control._impl.uuid: accepts for control, accepts in controls}
 
     def show_status(self, *lines: str) -> None:
         """Show status lines; they must not contain names from files."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import socket
@@ -12,10 +13,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
-from polarguide.options import LOOPBACK
+from polarguide.options import LOOPBACK, VisitorOptions
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.model import ShadingModel
 from polarguide.viewer.frusta import Photograph
+from polarguide.viewer.gate import Gate
+from polarguide.viewer.guard import guarded
+from polarguide.viewer.messages import Accepts, checked
 from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.session import Session
 from polarguide.viewer.shown import Shown
@@ -23,6 +27,7 @@ from polarguide.viewer.shown import Shown
 REFRESH = 1.0  # least seconds between two pictures of a training,
 SHARE = 10.0  # which are also at least this multiple of the time that the last one took
 TICK = 0.02
+REACH = 1e4  # how far a camera goes from the scene, as a multiple of the cameras' distance
 
 
 def viewing_address(host: str, port: int) -> str:
@@ -41,10 +46,12 @@ class Viewer:
         photographs: of the scene by name, at least one; sessions start at the first one.
         shading: model of the recipe. trains: whether the panel can pause a training.
         host, port: address to listen at; another port is used if this one is taken.
+        visitors: who may look besides pages of this machine.
         title: plain text.
+        warn: told why a browser was let go.
 
     Raises:
-        PolarguideError: viser is not installed, or the server cannot listen at the address.
+        PolarguideError: viser is not installed or not as it was tested, or the server cannot listen at the address.
     """
 
     def __init__(
@@ -56,9 +63,11 @@ class Viewer:
         trains: bool = False,
         host: str = LOOPBACK[0],
         port: int = 8080,
+        visitors: VisitorOptions = VisitorOptions(),
         title: str = "polarguide",
+        warn: Callable[[str], None] = lambda text: None,
     ) -> None:
-        viser = optional_import("viser", "the viewer", install="'viser>=1.1'")
+        viser = optional_import("viser", "the viewer", install="'viser==1.1.*'")
         # viser warns of pictures for a browser that has just disconnected.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self._current, self._photographs = current, photographs
@@ -70,7 +79,15 @@ class Viewer:
         self._wake = threading.Event()
         self._refreshed = time.monotonic()
         self._cost = 0.0
-        self._server = _listening(viser, host, port, title)
+        self._warn, self._warned = warn, set[str]()
+        around = self._scene_frame
+        reach = float(around.center.abs().max()) + REACH * around.distance
+        gate = Gate(host, visitors.allow_host, visitors.allow_origin)
+        with contextlib.ExitStack() as stack:
+            with guarded(gate, lambda raw: checked(raw, self._control, reach)):
+                self._server = _listening(viser, host, port, title)
+                stack.callback(self.close)
+            stack.pop_all()
         self._server.scene.set_up_direction(tuple(self._scene_frame.up.tolist()))
         self._server.scene.world_axes.visible = False
         self.address = viewing_address(host, self._server.get_port())
@@ -84,11 +101,38 @@ class Viewer:
             return any(session.paused for session in self._sessions.values())
 
     def _connected(self, client: Any) -> None:
-        session = Session(client, self._photographs, self._scene_frame, self._options, self._wake.set)
-        session.go(next(iter(self._photographs)))
+        def drop(error: Exception) -> None:
+            self._drop(client.client_id, error)
+
+        try:
+            session = Session(
+                client, self._photographs, self._scene_frame, self._options, self._wake.set, drop=drop
+            )
+            session.go(next(iter(self._photographs)))
+        except Exception as error:
+            drop(error)
+            return
         with self._lock:
             self._sessions[client.client_id] = session
         self._wake.set()
+
+    def _control(self, name: str) -> Accepts | None:
+        """What a control of any session takes; viser itself looks for it among those of the one that sends."""
+        with self._lock:
+            tables = [session.panel.accepts for session in self._sessions.values()]
+        return next((table[name] for table in tables if name in table), None)
+
+    def _drop(self, client_id: int, error: Exception) -> None:
+        """Let a browser go; the server and a training go on."""
+        with self._lock:
+            known = self._sessions.pop(client_id, None) is not None
+        text = f"the viewer let a browser go: {type(error).__name__}: {error}"
+        if known and text not in self._warned:
+            self._warned.add(text)
+            self._warn(text)
+        connection = self._server._websock_server._live_connections.get(client_id)
+        if connection is not None:
+            asyncio.run_coroutine_threadsafe(connection.close(1011), self._server.get_event_loop())
 
     def _disconnected(self, client: Any) -> None:
         with self._lock:
@@ -110,7 +154,10 @@ class Viewer:
             if due is not None:
                 session, kind = due
                 began = time.monotonic()
-                session.draw(self._current(), kind)
+                try:
+                    session.draw(self._current(), kind)
+                except Exception as error:  # in what one browser asked for
+                    self._drop(session.client_id, error)
                 self._cost = time.monotonic() - began
                 return True
             left = deadline - time.monotonic()
@@ -123,7 +170,11 @@ class Viewer:
         with self._lock:
             sessions = sorted(self._sessions.values(), key=lambda session: session.pacing.last_frame)
         for session in sessions:
-            kind = session.due()
+            try:
+                kind = session.due()
+            except Exception as error:
+                self._drop(session.client_id, error)
+                continue
             if kind is not None:
                 return session, kind
         return None

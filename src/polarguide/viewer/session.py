@@ -23,7 +23,12 @@ from polarguide.visualization.figures import Picture, png_bytes
 
 PATH_FILE, PICTURE_FILE = "camera_path.json", "polarguide.png"
 JPEG_QUALITY = 75
+BETWEEN_FILES = 0.5  # least seconds between two files of a kind, or two paths that are played
 NO_LAYER = "This layer is not available here: go to a photograph, or choose another layer"
+
+
+def _raise(error: Exception) -> None:
+    raise error
 
 
 class Session:
@@ -34,6 +39,7 @@ class Session:
     Args:
         client: viser's handle. photographs: by name. scene_frame: of the scene.
         options: of the panel. wake: called when a picture may be due.
+        drop: called with what a callback has raised, to let the browser go.
     """
 
     def __init__(
@@ -43,21 +49,33 @@ class Session:
         scene_frame: SceneFrame,
         options: PanelOptions,
         wake: Callable[[], None],
+        *,
+        drop: Callable[[Exception], None] = _raise,
     ) -> None:
-        self._client, self._photographs = client, photographs
+        self._client, self._photographs, self._drop = client, photographs, drop
         self._scene_frame, self._wake = scene_frame, wake
         self._lock = threading.Lock()
         self._painter = Painter(scene_frame)
         self.pacing = FramePacing()
         self._view_pose: ViewPose | None = None
-        self._screenshot = False
+        self._screenshot, self._asked = False, dict[str, float]()
         self._playing: tuple[float, list[Camera]] | None = None
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
         self._keyframes = Keyframes(self._size)
-        self.panel = Panel(client.gui, options, self._changed)
-        self._frusta = Frusta(client.scene, list(photographs.values()), scene_frame, self.go)
+        self.panel = Panel(client.gui, options, lambda: self._caught(self._changed)(None))
+        self._frusta = Frusta(
+            client.scene,
+            list(photographs.values()),
+            scene_frame,
+            lambda name: self._caught(lambda: self.go(name))(None),
+        )
         self._connect()
+
+    @property
+    def client_id(self) -> int:
+        """viser's number of the browser."""
+        return int(self._client.client_id)
 
     @property
     def paused(self) -> bool:
@@ -66,18 +84,38 @@ class Session:
 
     def _connect(self) -> None:
         panel = self.panel
-        self._client.camera.on_update(lambda _: self._moved())
-        panel.view.on_update(lambda _: self._selected(panel.view.value))
-        panel.step.on_click(lambda _: self._step(1 if panel.step.value == "next" else -1))
-        panel.frusta.on_update(lambda _: self._frusta.show(panel.frusta.value))
-        panel.box.on_update(lambda _: self._changed())
-        panel.pause.on_update(lambda _: self._wake())
-        panel.screenshot.on_click(lambda _: self._request_screenshot())
-        panel.add_keyframe.on_click(lambda _: self._add_keyframe())
-        panel.remove_keyframe.on_click(lambda _: self._remove_keyframe())
-        panel.seconds.on_update(lambda _: self._show_count())
-        panel.play.on_click(lambda _: self._play())
-        panel.save_path.on_click(lambda _: self._save_path())
+        self._client.camera.on_update(self._caught(self._moved))
+        panel.view.on_update(self._caught(lambda: self._selected(panel.view.value)))
+        panel.step.on_click(self._caught(lambda: self._step(1 if panel.step.value == "next" else -1)))
+        panel.frusta.on_update(self._caught(lambda: self._frusta.show(panel.frusta.value)))
+        panel.box.on_update(self._caught(self._changed))
+        panel.pause.on_update(self._caught(self._wake))
+        panel.screenshot.on_click(self._caught(self._request_screenshot))
+        panel.add_keyframe.on_click(self._caught(self._add_keyframe))
+        panel.remove_keyframe.on_click(self._caught(self._remove_keyframe))
+        panel.seconds.on_update(self._caught(self._show_count))
+        panel.play.on_click(self._caught(self._play))
+        panel.save_path.on_click(self._caught(self._save_path))
+
+    def _caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
+        """A callback whose faults cost this browser its connection, and nobody else anything."""
+
+        def called(_: Any) -> None:
+            try:
+                act()
+            except Exception as error:
+                self._drop(error)
+
+        return called
+
+    def _soon_again(self, what: str) -> bool:
+        """Whether this was asked for only just now, too: what takes time or memory is passed over then."""
+        now = time.monotonic()
+        with self._lock:
+            soon = now - self._asked.get(what, -BETWEEN_FILES) < BETWEEN_FILES
+            if not soon:
+                self._asked[what] = now
+        return soon
 
     def _changed(self) -> None:
         with self._lock:
@@ -118,8 +156,9 @@ class Session:
         self.go(names[(at + by) % len(names)])
 
     def _request_screenshot(self) -> None:
-        self._screenshot = True
-        self._wake()
+        if not self._soon_again("picture"):
+            self._screenshot = True
+            self._wake()
 
     def _add_keyframe(self) -> None:
         camera = self._view_pose.view.camera if self._view_pose else self._camera(self._size)
@@ -136,11 +175,13 @@ class Session:
         self.panel.keyframes.value = f"{count}" + (f", {seconds:g} s" if count > 1 else "")
 
     def _save_path(self) -> None:
-        if self._keyframes.cameras:
+        if self._keyframes.cameras and not self._soon_again("path"):
             text = self._keyframes.to_json(float(self.panel.seconds.value))
             self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
 
     def _play(self) -> None:
+        if self._soon_again("play"):
+            return
         path = self._keyframes.path(float(self.panel.seconds.value))
         if len(path) > 1:
             with self._lock:
@@ -162,7 +203,7 @@ class Session:
             self._playing = None
             return
         camera, target = self._client.camera, path[frame]
-        ahead = float(np.linalg.norm(camera.look_at - camera.position))
+        ahead = float(np.linalg.norm(camera.look_at - camera.position)) or self._scene_frame.distance
         with self._client.atomic():
             camera.position = target.center.numpy()
             camera.up_direction = (-target.rotation[1]).numpy()

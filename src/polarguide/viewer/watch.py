@@ -8,7 +8,7 @@ from contextlib import closing, contextmanager
 
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
-from polarguide.options import LOOPBACK
+from polarguide.options import LOOPBACK, VisitorOptions
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
@@ -22,26 +22,39 @@ PATIENCE = 0.2  # seconds between two looks at whether a paused training should 
 
 
 def view_run(
-    run: OpenedRun, *, host: str = LOOPBACK[0], port: int = 8080, reporter: Reporter = SILENT
+    run: OpenedRun,
+    *,
+    host: str = LOOPBACK[0],
+    port: int = 8080,
+    visitors: VisitorOptions = VisitorOptions(),
+    reporter: Reporter = SILENT,
 ) -> None:
     """Serve a run to browsers: its layers from any side, beside the photographs. KeyboardInterrupt ends it.
 
     Args:
         run: the run; its scene is read.
         host: address to listen at. port: the next free one is taken if it is in use.
+        visitors: who may look besides pages of this machine.
         reporter: told the address.
 
     Raises:
         PolarguideError: the address cannot be listened at.
     """
     shown, name = shown_run(run), run.folder.resolve().name
-    with _opened(lambda: shown, run.scene, run.model.shading, name, host, port, reporter) as viewer:
+    place = (host, port, visitors)
+    with _opened(lambda: shown, run.scene, run.model.shading, name, place, reporter) as viewer:
         while True:
             viewer.serve(1.0)
 
 
 @contextmanager
-def watched(trainer: Trainer, host: str, port: int, reporter: Reporter = SILENT) -> Iterator[Look]:
+def watched(
+    trainer: Trainer,
+    host: str,
+    port: int,
+    visitors: VisitorOptions = VisitorOptions(),
+    reporter: Reporter = SILENT,
+) -> Iterator[Look]:
     """A viewer over a training; yields what is to be called between steps.
 
     Raises:
@@ -63,19 +76,34 @@ def watched(trainer: Trainer, host: str, port: int, reporter: Reporter = SILENT)
             viewer.serve(PATIENCE)
 
     current = functools.partial(shown_training, trainer)
-    with _opened(current, scene, trainer.shading, scene.name, host, port, reporter, trains=True) as viewer:
+    place = (host, port, visitors)
+    with _opened(current, scene, trainer.shading, scene.name, place, reporter, trains=True) as viewer:
         yield look
 
 
 @contextmanager
 def _opened(
-    current: Callable[[], Shown], scene: Scene, shading: ShadingModel, name: str, host: str, port: int,
-    reporter: Reporter, *, trains: bool = False,
-) -> Iterator[Viewer]:  # fmt: skip
+    current: Callable[[], Shown],
+    scene: Scene,
+    shading: ShadingModel,
+    name: str,
+    place: tuple[str, int, VisitorOptions],
+    reporter: Reporter,
+    *,
+    trains: bool = False,
+) -> Iterator[Viewer]:
     """A viewer: says where to look, and warns of strangers."""
-    title = f"polarguide {name}"
+    host, port, visitors = place
     viewer = Viewer(
-        current, photographs(scene), shading=shading, trains=trains, host=host, port=port, title=title
+        current,
+        photographs(scene),
+        shading=shading,
+        trains=trains,
+        host=host,
+        port=port,
+        visitors=visitors,
+        title=f"polarguide {name}",
+        warn=reporter.warn,
     )
     with closing(viewer):
         if host not in LOOPBACK:

@@ -1,0 +1,327 @@
+"""The viewer against messages that no browser of ours sends: viser's own server, and a client that speaks to it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import random
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+import viser
+from viewer_scenes import photographs, shown
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from polarguide.errors import PolarguideError
+from polarguide.viewer import Viewer, guard
+from polarguide.viewer.gate import Gate
+from polarguide.viewer.messages import LARGEST, Refused, checked, choice, flag, number, pair
+
+PATIENCE = 30.0
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, -4], "fov": 0.8, "near": 0.01,
+    "far": 1000, "image_height": 48, "image_width": 64, "look_at": [0, 0, 0], "up_direction": [0, -1, 0],
+}  # fmt: skip
+NUMBERS = [
+    math.nan,
+    math.inf,
+    -math.inf,
+    0,
+    -1,
+    1e300,
+    -1e300,
+    2**62,
+    3_000_000,
+    1e-300,
+    True,
+    None,
+    "x",
+    [],
+    {},
+]
+
+
+class Served:
+    """A viewer over random Gaussians, served by a thread as a training would."""
+
+    def __init__(self) -> None:
+        self.seen = shown()
+        self.warned: list[str] = []
+        self.viewer = Viewer(
+            lambda: self.seen, photographs(self.seen), shading=self.seen.shading, trains=True, port=18180,
+            warn=self.warned.append,
+        )  # fmt: skip
+        self.ends, self.failed = threading.Event(), None
+        self.thread = threading.Thread(target=self._serve)
+        self.thread.start()
+
+    def _serve(self) -> None:
+        while not self.ends.is_set():
+            self.viewer.serve(0.05)
+
+    def close(self) -> None:
+        self.ends.set()
+        self.thread.join()
+        self.viewer.close()
+
+    def browser(self, **headers: str) -> ClientConnection:
+        address = self.viewer.address.replace("http", "ws")
+        return connect(
+            address,
+            subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
+            additional_headers=headers,
+            max_size=None,
+        )
+
+    def is_well(self) -> bool:
+        """Whether a browser that behaves is sent a picture."""
+        with self.browser() as browser:
+            browser.send(msgspec.msgpack.encode(CAMERA))
+            deadline = time.monotonic() + PATIENCE
+            while time.monotonic() < deadline:
+                if b"BackgroundImageMessage" in _unpacked(browser.recv(PATIENCE)):
+                    return self.thread.is_alive()
+        return False
+
+    def controls(self) -> dict[str, Any]:
+        with self.viewer._lock:
+            return {name: None for s in self.viewer._sessions.values() for name in s.panel.accepts}
+
+
+def _drain(browser: ClientConnection) -> None:
+    while True:
+        browser.recv(PATIENCE)
+
+
+def _unpacked(data: Any) -> bytes:
+    import zstandard
+
+    size = int.from_bytes(data[8:16], "little")
+    return zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    serving = Served()
+    yield serving
+    serving.close()
+
+
+def malformed(seed: int, controls: list[str]) -> bytes:
+    """A message with something wrong about it."""
+    rng = random.Random(seed)
+    kind = rng.randrange(8)
+    if kind < 3:
+        message: dict[str, Any] = {**CAMERA}
+        for _ in range(rng.randint(1, 3)):
+            key = rng.choice([key for key in CAMERA if key != "type"])
+            value: Any = rng.choice(NUMBERS)
+            if isinstance(CAMERA[key], list) and rng.random() < 0.8:
+                value = [rng.choice([0.0, value]) for _ in range(rng.choice([0, 1, 3, 4, 5]))]
+            message[key] = value
+        if rng.random() < 0.2:
+            message.pop(rng.choice([key for key in CAMERA if key != "type"]))
+        return msgspec.msgpack.encode(message)
+    if kind < 6:
+        value = rng.choice(
+            [*NUMBERS, [1], [2, 1, 0], [math.nan, 3], [9e9, -9e9], "no such layer", "x" * 9999, 2000]
+        )
+        name = rng.choice([*controls, "no such control"])
+        prop = rng.choice(["value", "value", "value", "order", "update_cb", "__class__", "sync_cb"])
+        return msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": name, "updates": {prop: value}})
+    if kind == 6:
+        other = rng.choice(
+            ["ShareUrlRequest", "FileTransferStartUpload", "FileTransferPart", "GetRenderResponseMessage", "Message",
+             "RunJavascriptMessage", "GuiFormDirtyMessage", "SceneNodeDragMessage", "ResetGuiMessage", "x" * 999]
+        )  # fmt: skip
+        more = {
+            "source_component_uuid": rng.choice(controls), "transfer_uuid": "t", "filename": "../x", "uuid": "u",
+            "mime_type": "x", "part_count": 2**31, "size_bytes": 2**60, "part_index": -1, "content": b"x" * 999,
+        }  # fmt: skip
+        return msgspec.msgpack.encode({"type": other, **more})
+    whole = msgspec.msgpack.encode(CAMERA)
+    broken = [
+        whole[: rng.randrange(len(whole))], rng.randbytes(rng.randrange(200)), b"\x81" * 5000, b"\x91" * 60_000,
+        b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff\xa1", msgspec.msgpack.encode(["type"]),
+        b"\xa0" * (LARGEST + 9),
+    ]  # fmt: skip
+    return rng.choice(broken)
+
+
+def test_a_browser_that_behaves_is_sent_pictures(served: Served) -> None:
+    assert served.is_well()
+
+
+def test_300_malformed_messages_end_nothing_but_their_sender(
+    served: Served, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with served.browser() as first:
+        first.send(msgspec.msgpack.encode(CAMERA))
+        first.recv(PATIENCE)
+        deadline = time.monotonic() + PATIENCE
+        while not (controls := list(served.controls())) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert len(controls) > 10
+    browser = None
+    for seed in range(300):
+        browser = browser or served.browser()
+        try:
+            browser.send(msgspec.msgpack.encode(CAMERA))
+            known = list(served.controls()) or controls
+            browser.send(malformed(seed, known))
+            if seed % 7 == 0:
+                browser.send(b"")
+        except ConnectionClosed:
+            browser = None
+        assert served.thread.is_alive(), seed
+    if browser is not None:
+        browser.close()
+    assert served.is_well()
+    assert served.viewer._server._share_tunnel is None
+    assert served.warned == []
+    said = capfd.readouterr()
+    assert "Traceback" not in said.out + said.err
+    assert "Error" not in said.out + said.err
+
+
+def test_what_fails_for_one_browser_lets_that_one_go_with_a_line(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise ValueError("a fault of ours")
+
+    with monkeypatch.context() as patch, served.browser() as browser:
+        patch.setattr("polarguide.viewer.appearance.Painter.paint", fail)
+        browser.send(msgspec.msgpack.encode(CAMERA))
+        with pytest.raises(ConnectionClosed):
+            _drain(browser)
+    assert served.warned == ["the viewer let a browser go: ValueError: a fault of ours"]
+    served.warned.clear()
+    assert served.is_well()
+
+
+@pytest.mark.parametrize(
+    "headers", [{"Origin": "https://evil.example"}, {"Origin": "null"}, {"Host": "evil.example:18180"}]
+)
+def test_strangers_pages_are_turned_away(served: Served, headers: dict[str, str]) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        served.browser(**headers)
+    assert refused.value.response.status_code == 403
+    request = urllib.request.Request(served.viewer.address, headers=headers)
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request, timeout=PATIENCE)
+
+
+def test_the_page_cannot_be_framed_by_others(served: Served) -> None:
+    with urllib.request.urlopen(served.viewer.address, timeout=PATIENCE) as answer:
+        assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'self'"
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_a_flood_is_read_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept = []
+
+    class Flood:
+        async def recv(self) -> bytes:
+            return b"x"
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+
+    async def read(count: int) -> None:
+        for _ in range(count):
+            await connection.recv()
+
+    monkeypatch.setattr("polarguide.viewer.guard.time.monotonic", lambda: 5.0)
+    monkeypatch.setattr("polarguide.viewer.guard.asyncio.sleep", sleep)
+    connection = guard._Connection(Flood(), lambda raw: raw)
+    asyncio.run(read(int(guard.BURST)))
+    assert slept == []
+    asyncio.run(read(2))
+    assert slept == pytest.approx([1 / guard.MESSAGES_PER_SECOND, 2 / guard.MESSAGES_PER_SECOND])
+
+
+def test_a_browser_that_takes_nothing_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    aborted = []
+
+    class Stuck:
+        class transport:
+            abort = staticmethod(lambda: aborted.append(True))
+
+        async def send(self, data: bytes) -> None:
+            await asyncio.sleep(PATIENCE)
+
+    monkeypatch.setattr("polarguide.viewer.guard.SENDING_SECONDS", 0.01)
+    asyncio.run(guard._Connection(Stuck(), lambda raw: raw).send(b"x"))
+    assert aborted
+
+
+def test_a_viser_that_listens_otherwise_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = shown()
+    closed = []
+
+    class Server:
+        def stop(self) -> None:
+            closed.append(True)
+
+    monkeypatch.setattr("polarguide.viewer.server._listening", lambda *_: Server())
+    with pytest.raises(PolarguideError, match=r"viser==1\.1"):
+        Viewer(lambda: seen, photographs(seen), shading=seen.shading)
+    assert closed
+
+
+def test_servers_of_others_are_left_alone() -> None:
+    from websockets.asyncio import server
+
+    async def handler(_: Any) -> None:
+        pass
+
+    before = server.serve
+    with contextlib.suppress(PolarguideError), guard.guarded(Gate("127.0.0.1"), lambda raw: None):
+        assert server.serve is not before
+        with pytest.raises(RuntimeError, match="no running event loop"):  # it was handed on as it is
+            server.serve(handler, "127.0.0.1", 0)
+    assert server.serve is before
+
+
+@pytest.mark.parametrize(
+    ("accepts", "value", "found"),
+    [(number(-4, 4), 2000, 4.0), (number(0.5, 10), -1e300, 0.5), (pair(-5, 5), [9e9, -1], [-1.0, 5.0]),
+     (choice(["a"]), "a", "a"), (flag, True, True)],
+)  # fmt: skip
+def test_what_is_out_of_range_is_clamped(accepts: Any, value: Any, found: Any) -> None:
+    assert accepts(value) == found
+
+
+@pytest.mark.parametrize(
+    ("accepts", "value"),
+    [(number(0, 1), math.nan), (number(0, 1), True), (number(0, 1), "1"), (pair(0, 1), [1]), (pair(0, 1), 1),
+     (pair(0, 1), [0, math.inf]), (choice(["a"]), "b"), (choice(["a"]), ["a"]), (flag, 1)],
+)  # fmt: skip
+def test_what_is_no_value_is_refused(accepts: Any, value: Any) -> None:
+    with pytest.raises(Refused):
+        accepts(value)
+
+
+def test_a_camera_is_clamped() -> None:
+    wild = {
+        **CAMERA,
+        "fov": 0.0,
+        "image_width": 2e9,
+        "position": [1e300, 0, 0],
+        "wxyz": [2, 0, 0, 0],
+        "more": 1,
+    }
+    found = msgspec.msgpack.decode(checked(msgspec.msgpack.encode(wild), lambda _: None, 50.0) or b"")
+    assert (found["fov"], found["image_width"], found["position"]) == (0.01, 8192, [50.0, 0.0, 0.0])
+    assert found["wxyz"] == [1.0, 0.0, 0.0, 0.0]
+    assert "more" not in found
