@@ -11,12 +11,14 @@ import sys
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from polarguide.cli.app import run
+from polarguide.system import keep_freed_memory
 
 
 def main() -> None:
     """Entry point of the command line."""
     # As Ctrl-C does, so that whatever is open is closed.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    keep_freed_memory()
     sys.exit(run(sys.argv[1:]))
 
 

@@ -20,7 +20,7 @@ from polarguide.export import formats
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
 from polarguide.inspection.record import write_inspection
 from polarguide.inspection.settings import InspectSettings
-from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOptions
+from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOptions, VisitorOptions
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
@@ -91,7 +91,13 @@ def train(
         KeyboardInterrupt: it was stopped; the state is saved, and ``resume=True`` goes on to the same result.
     """
 
-    host, port = session.viewer_host, session.viewer_port
+    looking = partial(
+        watch.watched,
+        host=session.viewer_host,
+        port=session.viewer_port,
+        visitors=VisitorOptions(session.allow_host, session.allow_origin),
+        reporter=reporter,
+    )
     opened = training.train(
         scene,
         out,
@@ -102,7 +108,7 @@ def train(
         resume=resume,
         reporter=reporter,
         should_stop=should_stop,
-        watch=partial(watch.watched, host=host, port=port, reporter=reporter) if session.viewer else None,
+        watch=looking if session.viewer else None,
     )
     return Run.of(opened)
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from typing import Any
+
+EXPORT_EXTRA = "'polarguide[export]'"
 
 
 class PolarguideError(Exception):
@@ -31,7 +34,21 @@ class PolarguideWarning(UserWarning):
     """Something that the user should know before relying on a result."""
 
 
-def optional_import(module: str, what: str, *, install: str = "'polarguide[export]'") -> Any:
+def require_package(module: str, what: str, *, install: str = EXPORT_EXTRA) -> None:
+    """Check that a package is there, without loading it: before work begins, not after.
+
+    Raises:
+        PolarguideError: it is not installed.
+    """
+    try:
+        there = importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # a package that says itself that it is none
+        there = False
+    if not there:
+        raise _missing(module, what, install)
+
+
+def optional_import(module: str, what: str, *, install: str = EXPORT_EXTRA) -> Any:
     """Import a library that most verbs do without.
 
     Args:
@@ -43,9 +60,13 @@ def optional_import(module: str, what: str, *, install: str = "'polarguide[expor
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise PolarguideError(
-            what,
-            expected=f"the Python package {module.partition('.')[0]}",
-            found="that it is not installed",
-            remedy=f"Install it: pip install {install}.",
-        ) from None
+        raise _missing(module, what, install) from None
+
+
+def _missing(module: str, what: str, install: str) -> PolarguideError:
+    return PolarguideError(
+        what,
+        expected=f"the Python package {module.partition('.')[0]}",
+        found="that it is not installed",
+        remedy=f"Install it: pip install {install} (or 'polarguide[all]').",
+    )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
+import shutil
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,11 +13,15 @@ from pathlib import Path
 from polarguide.errors import PolarguideError
 
 _LARGEST_FILE = 1 << 31
+_MASK = os.umask(0)  # what rights new files do not get; it can only be asked for by setting it
+os.umask(_MASK)
 
 
 @contextlib.contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Write to a temporary file that takes the place of ``path`` only when it is complete and on disk.
+
+    What processes that were killed have left of the same file is removed.
 
     Yields:
         The temporary file's path, in the same folder.
@@ -23,16 +29,78 @@ def atomic(path: Path) -> Iterator[Path]:
     Raises:
         PolarguideError: it cannot be written, for example because the disk is full.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _temporary(path)
     with writing(path):
         try:
             yield temporary
             with open(temporary, "rb") as file:
                 os.fsync(file.fileno())
+            os.chmod(temporary, 0o666 & ~_MASK)  # some libraries write for the owner alone
             os.replace(temporary, path)
             _sync_folder(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """A folder beside ``path`` for work on it, which is removed afterwards, and at the next call after a kill.
+
+    Raises:
+        PolarguideError: it cannot be written, for example because the disk is full.
+    """
+    temporary = _temporary(path)
+    with writing(path):
+        try:
+            temporary.mkdir(parents=True)
+            yield temporary
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Write into a temporary folder whose files then take their places in ``path``, each as a whole.
+
+    Yields:
+        The temporary folder, beside ``path``, which is made.
+
+    Raises:
+        PolarguideError: it cannot be written, for example because the disk is full.
+    """
+    make_folder(path)
+    with temporary_folder(path) as temporary:
+        yield temporary
+        for made in sorted(temporary.iterdir()):
+            with open(made, "rb") as file:
+                os.fsync(file.fileno())
+        for made in sorted(temporary.iterdir()):
+            os.replace(made, path / made.name)
+        _sync_folder(path)
+
+
+def _temporary(path: Path) -> Path:
+    """The temporary name of a file or folder in this process; removes those of processes that are no more."""
+    with contextlib.suppress(OSError):
+        for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp*"):
+            process = old.name.removeprefix(f".{path.name}.").partition(".")[0]
+            if process.isdigit() and int(process) != os.getpid() and not _is_alive(int(process)):
+                with contextlib.suppress(OSError):
+                    shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+def _is_alive(process: int) -> bool:
+    """Whether there may be such a process; elsewhere than on POSIX, asking would end it."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def write_whole(path: Path, data: bytes) -> int:
@@ -92,6 +160,18 @@ def require_folder(path: Path, *, expected: str, remedy: str) -> None:
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
         raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+
+
+def require_file(path: Path, *, expected: str, remedy: str) -> None:
+    """Check that something is an ordinary file: reading a pipe or a device may never end.
+
+    Raises:
+        PolarguideError: it is something else, or there is nothing.
+    """
+    if path.is_file():
+        return
+    found = "a folder" if path.is_dir() else "a pipe or device" if path.exists() else "nothing"
+    raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
 
 
 def check_out(path: Path) -> None:

@@ -5,6 +5,7 @@ The command line reads names, types, defaults and texts from these classes.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,20 +16,48 @@ from polarguide.errors import PolarguideError
 DeviceName = Literal["auto", "cpu", "cuda"]
 Transfer = Literal["linear", "srgb"]
 ExportFormat = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
+PictureFormat = Literal["png", "exr", "npy"]
+EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
+    "spz": ("gaussforge",),
+    "mesh": ("skimage", "trimesh"),
+    "environment": ("OpenEXR",),
+}
+"""Optional packages that formats need."""
 PathLike = str | os.PathLike[str]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
-def check_count(name: str, value: int, minimum: int = 1) -> None:
+MOST = 10**9
+"""The largest count that any option takes."""
+MOST_THREADS = 1024
+
+
+def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> None:
     """Check an option's value.
 
     Raises:
-        PolarguideError: it is less than ``minimum``.
+        PolarguideError: it is less than ``minimum`` or more than ``most``.
     """
     if value < minimum:
         raise PolarguideError(
             name, expected=f"{minimum} or more", found=str(value), remedy="Give a larger number."
         )
+    if value > most:
+        raise PolarguideError(
+            name, expected=f"up to {most}", found=str(value), remedy="Give a smaller number."
+        )
+
+
+def check_finite(name: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
+    """Check an option's value.
+
+    Raises:
+        PolarguideError: it is not a finite number from ``least`` to ``most``.
+    """
+    if not (math.isfinite(value) and least <= value <= most):
+        whole = math.isinf(least) and math.isinf(most)
+        expected = "a finite number" if whole else f"{least:g} to {most:g}"
+        raise PolarguideError(name, expected=expected, found=str(value), remedy="Correct the number.")
 
 
 def check_range(name: str, value: int, least: int, most: int) -> None:
@@ -62,13 +91,16 @@ class SceneOptions:
     Attributes:
         downscale: Average the pictures over boxes of this many pixels first.
         transfer: How the files encode radiance. Polarization needs linear; srgb undoes the display curve of JPEGs.
+        memory: GiB that the pictures may take, as their headers state; 0 is 80 % of what is free.
     """
 
     downscale: int = 1
     transfer: Transfer = "linear"
+    memory: float = 0.0
 
     def __post_init__(self) -> None:
         check_count("downscale", self.downscale)
+        check_finite("memory", self.memory, 0.0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -82,7 +114,7 @@ class ThreadOptions:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        check_count("threads", self.threads, 0)
+        check_count("threads", self.threads, 0, MOST_THREADS)
 
 
 @dataclass(frozen=True)
@@ -97,7 +129,20 @@ class ComputeOptions(ThreadOptions):
 
 
 @dataclass(frozen=True)
-class SessionOptions(ComputeOptions):
+class VisitorOptions:
+    """Which web pages may talk to the viewer, besides those that it sends itself to an address of its machine.
+
+    Attributes:
+        allow_host: Names, such as a tunnel's, by which the viewer may be asked for, besides addresses and localhost.
+        allow_origin: Names of sites, such as a proxy, whose pages may talk to the viewer.
+    """
+
+    allow_host: tuple[str, ...] = ()
+    allow_origin: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SessionOptions(VisitorOptions, ComputeOptions):
     """What a training's result does not depend on.
 
     Attributes:
@@ -115,3 +160,4 @@ class SessionOptions(ComputeOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("checkpoint_every", self.checkpoint_every)
+        check_range("viewer_port", self.viewer_port, 1, 65535)

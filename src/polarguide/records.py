@@ -21,6 +21,7 @@ _WORDS = {
     "array": "a list", "bool": "true or false", "float": "a number", "int": "a whole number", "null": "null",
     "object": "a JSON object {...}", "str": "text",
 }  # fmt: skip
+_DEEPEST = 50
 _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 
 
@@ -53,6 +54,7 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
     """
     try:
         value = json.loads(data) if isinstance(data, bytes) else data
+        _require_shallow(value)
         record = msgspec.convert(value, kind)
     except PolarguideError as error:  # of a type's own check
         place = f"{where} ({error.where})"
@@ -62,12 +64,33 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         raise PolarguideError(
             f"{where} ({field})" if field else where, expected=expected, found=found, remedy=remedy
         ) from None
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError, OverflowError) as error:
         raise PolarguideError(
             where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
         ) from None
     _require_finite(msgspec.to_builtins(record, enc_hook=str), where, remedy)
     return record
+
+
+def _require_shallow(value: Any) -> None:
+    """Refuse lists in lists in lists, which take more of the stack than there is.
+
+    Raises:
+        RecursionError: they are nested more deeply than any record of ours.
+    """
+    level = [value]
+    for _ in range(_DEEPEST):
+        level = [
+            item
+            for outer in level
+            for item in (
+                outer.values() if isinstance(outer, dict) else outer if isinstance(outer, list) else ()
+            )
+            if isinstance(item, dict | list)
+        ]
+        if not level:
+            return
+    raise RecursionError(f"nested more than {_DEEPEST} deep")
 
 
 def option_name(field: str) -> str:

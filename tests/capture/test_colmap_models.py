@@ -185,7 +185,7 @@ def test_points_that_are_not_finite_are_left_out(capture: TinyCapture) -> None:
     model.write_binary(str(model_folder(capture)))
     scene = load_scene(capture.root)
     assert scene.points.shape == (2, 3)
-    assert scene.warnings == ("2 of 4 3D points are not finite and were left out.",)
+    assert scene.warnings == ("2 of 4 3D points are not finite, or farther than 1e+09, and were left out.",)
 
 
 def test_picture_without_a_pose(capture: TinyCapture) -> None:

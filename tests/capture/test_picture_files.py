@@ -205,10 +205,8 @@ def test_floating_point_pictures(capture: TinyCapture) -> None:
     for angle in ANGLES:
         capture.picture("v001", angle).unlink()
         path = capture.picture("v001", angle, ".tif")
-        assert cv2.imwrite(str(path), np.zeros((10, 12, 3), np.float32))
-    fails(
-        capture.root, "v001_000.tif", "8 or 16 bits a channel", "found values of type float32", "16-bit PNG"
-    )
+        assert cv2.imwrite(str(path), np.full((10, 12, 3), 900.0, np.float32))
+    fails(capture.root, "v001_000.tif", "floating-point values from 0 to 1", "found up to 900", "16-bit")
 
 
 def test_pictures_of_one_view_differ(capture: TinyCapture) -> None:

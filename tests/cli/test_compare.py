@@ -81,7 +81,7 @@ def test_interrupted_failed_and_finished(
     lines = [json.loads(line) for line in (first / LOG).read_text().splitlines()]
     assert [line["step"] for line in lines] == list(range(9, 200, 10))
     assert lines[: len(before)] == before, "it went on instead of starting over"
-    assert "| `3dgs` |  |" in (out / "results.md").read_text()
+    assert "| `3dgs` (failed) |  |" in (out / "results.md").read_text()
 
     # What is finished is not done again, in a comparison with other recipes neither.
     stamp = (first / "metrics.json").stat().st_mtime_ns

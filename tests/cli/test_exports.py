@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 from pathlib import Path
@@ -170,7 +171,7 @@ def test_a_missing_library_is_named(
     def missing(name: str) -> object:
         raise ImportError(name)
 
-    monkeypatch.setattr(errors, "importlib", SimpleNamespace(import_module=missing))
+    monkeypatch.setattr(errors, "importlib", SimpleNamespace(import_module=missing, util=importlib.util))
     line = refused("export", trained, "--format", kind, "--out", tmp_path)
     assert module.partition(".")[0] in line
     assert "pip install 'polarguide[export]'" in line

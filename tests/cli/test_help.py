@@ -71,7 +71,7 @@ def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["fly"], ["train"], ["eval", "run", "--wings", "2"], ["demo", "--steps", "many"]]
+    "arguments", [[], ["train"], ["eval", "run", "--wings", "2"], ["demo", "--steps", "many"]]
 )
 def test_what_cannot_be_parsed_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:

@@ -60,14 +60,19 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
     assert record["schema"] == 2
     assert record["scene"]["posed_views"] == 0
-    for key in ("poses", "coverage", "angle_order", "handedness", "zero_offset"):
+    for key in ("poses", "coverage"):
         assert verdicts.pop(key) == "n/a"
+    for key in ("angle_order", "handedness", "zero_offset"):
+        assert verdicts.pop(key) == "not verified"
     assert set(verdicts.values()) == {"ok"}
-    assert record["verdict"] == "ok"
+    assert record["verdict"] == "not verified"
     assert len(record["views"]) == 3
     printed = capsys.readouterr()
     assert "Traceback" not in printed.out + printed.err
     assert "inspection.html" in printed.out
+    said = "verdict: not verified: order of the angles, sense of the angles, zero of the angles"
+    assert said in printed.out
+    assert printed.out.count("Give the scene poses") == 1
     tags = Tags()
     tags.feed(page)
     assert tags.open == []
@@ -90,7 +95,7 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
 def test_a_capture_with_poses_and_points_alone(demo_scene: Path, tmp_path: Path) -> None:
     record, _ = inspected(demo_scene, tmp_path / "out", "--normals", "points")
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
-    assert verdicts["angle_order"] == "n/a"  # its few small views leave too few observations
+    assert verdicts["angle_order"] == "not verified"  # its few small views leave too few observations
     assert record["angles"]["sources"][0]["usable"] is False
     assert verdicts["coverage"] == "ok"
     assert record["scene"]["posed_views"] == 27

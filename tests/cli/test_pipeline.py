@@ -14,6 +14,7 @@ import pytest
 from plyfile import PlyData
 from safetensors.torch import load_file
 
+import polarguide
 from polarguide.cli.app import run
 from polarguide.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, LOG, PLY
@@ -40,7 +41,7 @@ def differing(a: Path, b: Path) -> list[str]:
 
 def test_a_training_leaves_a_whole_run(trained: Path) -> None:
     assert {path.name for path in trained.iterdir()} >= {CONFIGURATION, CHECKPOINT, LOG, PLY}
-    assert not list(trained.glob(".*"))
+    assert {path.name for path in trained.glob(".*")} <= {".lock"}
     lines = [json.loads(line) for line in (trained / LOG).read_text().splitlines()]
     assert [line["step"] for line in lines] == [9, 19, 29, 39]
     assert all(np.isfinite(line["loss"]) and np.isfinite(line["psnr"]) for line in lines)
@@ -64,7 +65,7 @@ def test_the_ply_opens_in_an_independent_reader(trained: Path) -> None:
 
 
 def test_eval_writes_a_valid_record(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(trained, tmp_path / "run")
     assert run(["eval", str(tmp_path / "run"), "--threads", "1"]) == 0
@@ -79,6 +80,26 @@ def test_eval_writes_a_valid_record(
     shown = capsys.readouterr().out
     assert f"{record['psnr']:.3f}" in shown
     assert "metrics.json" in shown
+    assert "errors.png" in shown
+    assert picture(tmp_path / "run" / "errors.png").shape[0] > len(TEST_VIEWS) * SIZE[0]
+    table = json.loads((demo_scene / "scene.json").read_text())["objects"]
+    assert list(record["objects"]) == [item["name"] for item in table if item["foreground"]]
+    assert "sphere_black" in shown
+    assert "all dielectric" in shown
+    assert (
+        sum(item["pixels"] for item in record["objects"].values())
+        == record["materials"]["dielectric"]["pixels"]
+    )
+    for key in (
+        "stokes_error",
+        "depth_error_median_percent",
+        "haze",
+        "mesh_fscore_1",
+        "specular_psnr_dielectric",
+    ):
+        assert record[key] is not None, key
+    for key in ("coverage_error", "alpha_outside"):
+        assert record[key] is None, key
 
 
 def test_render_writes_every_layer_of_every_test_view(trained: Path, tmp_path: Path) -> None:
@@ -89,8 +110,8 @@ def test_render_writes_every_layer_of_every_test_view(trained: Path, tmp_path: P
     assert {path.name for path in out.iterdir()} == wanted
     assert all(picture(out / name).shape[:2] == SIZE for name in wanted if name != "contact_sheet.png")
     sheet = picture(out / "contact_sheet.png")
-    assert sheet.shape[0] >= 2 * len(TEST_VIEWS) * SIZE[0]
-    assert sheet.shape[1] >= len(layers) * SIZE[1]
+    assert sheet.shape[0] >= len(TEST_VIEWS) * SIZE[0]
+    assert sheet.shape[1] >= (len(layers) + 5) * SIZE[1]  # five of them have a ground truth
     seen = {layer: picture(out / f"v000_{layer}.png").tobytes() for layer in layers}
     assert seen.pop("base") == seen["diffuse"], "Fresnel-weighted light is added to the base as it is"
     assert len(set(seen.values())) == len(layers) - 1
@@ -102,6 +123,29 @@ def test_render_of_chosen_views_and_layers(trained: Path, tmp_path: Path) -> Non
     assert run(["render", str(trained), *arguments]) == 0
     names = {f"{view}_{layer}.png" for view in ("v003", "v071") for layer in ("alpha", "final")}
     assert {path.name for path in out.iterdir()} == names | {"contact_sheet.png"}
+
+
+@pytest.mark.parametrize("kind", ["npy", "exr"])
+def test_layers_as_linear_numbers(trained: Path, tmp_path: Path, kind: str) -> None:
+    """Read by NumPy and by OpenCV or the OpenEXR package, compared with what the API renders."""
+    out = tmp_path / "pictures"
+    arguments = ["--views", "v000", "--layers", "final,normal,depth", "--format", kind, "--out", str(out)]
+    assert run(["render", str(trained), *arguments]) == 0
+    names = {f"v000_{layer}.{kind}" for layer in ("final", "normal", "depth")}
+    assert {path.name for path in out.iterdir()} == names | {"contact_sheet.png", "layers.json"}
+    units = json.loads((out / "layers.json").read_text())
+    assert units["final"].startswith("linear radiance")
+    assert "scene's units" in units["depth"]
+    expected = polarguide.open_run(trained).render("v000", ["final", "normal", "depth"])
+    for layer, values in expected.items():
+        path = out / f"v000_{layer}.{kind}"
+        if kind == "npy":
+            found = np.load(path)
+        else:
+            with pytest.importorskip("OpenEXR").File(str(path)) as file:
+                found = file.channels()["RGB"].pixels
+                found = found[..., 0] if layer == "depth" else found
+        np.testing.assert_allclose(found, values.numpy(), rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("with_run", [False, True])

@@ -57,7 +57,7 @@ def test_mosaics_to_a_trained_scene(
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        ([], "--sensor: expected the sensor of raw mosaics"),
+        ([], "raw mosaics with --sensor, or a published dataset"),
         (["--sensor", "IMX250MYR", "--order", "0,90"], "--order: expected four angles such as 90,45,0,135"),
         (["--sensor", "IMX250MYR", "--calibration", "none.json"], "none.json: expected a readable file"),
         (["--sensor", "IMX250MYR", "--zero", "nan"], "calibration (zero): expected a finite number"),

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 
 import pytest
+from rich.console import Console
 
+from polarguide.cli import progress
 from polarguide.cli.console import warnings_printed
 from polarguide.cli.job_progress import JobReporter
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.progress import ConsoleReporter, Lines, bars
 from polarguide.errors import PolarguideWarning
 
 
@@ -49,3 +52,31 @@ def test_the_console_shows_brackets_as_they_are(capsys: pytest.CaptureFixture[st
         advance(2, total=2, note="[z]")
     out = capsys.readouterr().out
     assert "[bold]view[/] 1\nwarning: [x] is odd\n" in out
+
+
+def test_eighty_columns_hold_step_total_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    terminal = Console(file=screen, force_terminal=True, width=80, highlight=False, color_system=None)
+    monkeypatch.setattr(progress, "console", terminal)
+    display = bars()
+    task = display.add_task("training stage all of them", total=50000, note="")
+    display.update(task, completed=100, note="all  loss 0.0312  31,415 Gaussians  step 0.123 s  and more yet")
+    terminal.print(display.get_renderable())
+    (line,) = [line for line in screen.getvalue().splitlines() if line.strip()]
+    assert len(line) <= 80
+    assert "100/50000" in line
+    assert "-:--:--" in line  # nothing is known of the speed yet
+    assert "loss 0.0312" in line
+
+
+def test_without_a_terminal_a_line_every_so_often(capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    told = Lines("training", 1000, clock=lambda: now[0])
+    for step in range(0, 1001, 10):
+        now[0] = step / 10
+        told(step, note=f"loss {step}")
+    told.close(last=True)
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "training 150/1000, 0:01:25 left  loss 150"
+    assert len(said) == 7
+    assert said[-1] == "training 1000/1000  loss 1000"

@@ -15,6 +15,9 @@ from other_device import BACKEND, OtherDevice
 from polarguide.api import Run, open_run
 from polarguide.capture import load_scene
 from polarguide.cli.render import render
+from polarguide.evaluation.facts import SceneFacts
+from polarguide.evaluation.maps import ErrorsByObject
+from polarguide.evaluation.measures import HAZE_DEPTH
 from polarguide.evaluation.scores import score_view
 from polarguide.evaluation.target import ViewTarget
 from polarguide.inspection.short_run import short_run, surface_of
@@ -39,16 +42,21 @@ def run(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_scores_are_made_there_and_read_once_a_view(run: Path) -> None:
     with OtherDevice() as device:
         opened = open_run(run)
-        before = device.waits
         record = opened.evaluate()
-        assert device.waits - before == len(record["views"]) > 1
-        view = opened.scene.test_views[0]
-        given = view.photograph(), view.invalid, view.ground_truth
-        result = opened.model.render(view.camera)
-        there = score_view(ViewTarget.of(*given, BACKEND.device), result)
-        here = score_view(ViewTarget.of(*given, torch.device("cpu")), result.to("cpu"))
+        view, facts = opened.scene.test_views[0], SceneFacts.of(opened.scene)
+        result = opened.model.render(view.camera, depth=True)
+        stokes = opened.model.stokes(result, view.camera)
+        cpu, target = torch.device("cpu"), ViewTarget.of_view(view, facts, BACKEND.device)
+        in_front = opened.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
+        before = device.waits
+        there = score_view(
+            target, result, stokes=stokes, in_front=in_front, by_object=ErrorsByObject(facts.objects)
+        )
+        assert device.waits - before == 1
+        given = {"stokes": stokes.to(cpu), "in_front": in_front.to(cpu)}
+        here = score_view(ViewTarget.of_view(view, facts, cpu), result.to("cpu"), **given)
         with pytest.raises(RuntimeError, match="mixes devices"):
-            score_view(ViewTarget.of(*given, torch.device("cpu")), result)
+            score_view(ViewTarget.of_view(view, facts, cpu), result)
     assert there == here == record["views"][view.name]
     by_cpu = open_run(run, device="cpu").evaluate()
     assert record["psnr"] == pytest.approx(by_cpu["psnr"], abs=0.01)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 from pathlib import Path
@@ -178,3 +179,43 @@ def test_a_run_whose_configuration_is_wrong(
     path = tmp_path / "run" / CONFIGURATION
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
     assert said in refused("eval", tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [("trian", "train"), ("evaluate", "eval"), ("exprot", "export"), ("Inspect", "inspect")],
+)
+def test_a_verb_that_is_nearly_one(refused, word: str, meant: str) -> None:
+    assert f"Perhaps polarguide {meant} is meant." in refused(word, "scene")
+
+
+def test_a_word_that_is_no_verb(refused) -> None:
+    assert "fly: expected a verb: demo, prepare" in refused("fly")
+
+
+def test_viewing_a_file_says_what_is_wanted(refused, tmp_path: Path) -> None:
+    (tmp_path / "point_cloud.ply").write_bytes(b"ply")
+    line = refused("view", tmp_path / "point_cloud.ply")
+    assert "expected a run folder: what train wrote under --out" in line
+    assert f"polarguide view {tmp_path}" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "package"),
+    [
+        (("export", "RUN", "--format", "environment"), "OpenEXR"),
+        (("export", "RUN", "--format", "spz"), "gaussforge"),
+        (("export", "RUN", "--format", "mesh"), "skimage"),
+        (("render", "RUN", "--path", "orbit", "--video", "a.mp4"), "imageio_ffmpeg"),
+        (("render", "RUN", "--environment", "a.exr"), "OpenEXR"),
+    ],
+)
+def test_missing_packages_are_named_before_anything_is_read(
+    refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], package: str
+) -> None:
+    """The run does not even exist: what is missing is said first."""
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else there(name))
+    line = refused(*(str(tmp_path / "run") if word == "RUN" else word for word in arguments))
+    assert f"expected the Python package {package}" in line
+    assert "polarguide[all]" in line

@@ -189,6 +189,50 @@ def test_keyboard_moves(fresh: Opened) -> None:
         assert fresh.look()["eye"] != before, key
 
 
+def test_keys_work_without_a_click_and_sliders_keep_theirs(fresh: Opened) -> None:
+    fresh.page.evaluate("document.activeElement.blur()")
+    before = fresh.look()
+    fresh.page.keyboard.press("ArrowLeft")
+    fresh.page.keyboard.press("2")
+    after = fresh.look()
+    assert after["eye"] != before["eye"]
+    assert after["looks"]["layer"] != before["looks"]["layer"]
+    fresh.page.focus("#exposure")
+    fresh.page.keyboard.press("ArrowRight")
+    assert fresh.look()["eye"] == after["eye"]
+    assert fresh.look()["looks"]["exposure"] > 1
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (390, 844)])
+def test_title_and_picture_fit_without_scrolling(fresh: Opened, size: tuple[int, int]) -> None:
+    fresh.page.set_viewport_size({"width": size[0], "height": size[1]})
+    for name in ("h1", "header p", "#picture", "#panel"):
+        box = fresh.page.locator(name).bounding_box()
+        assert box is not None
+        assert box["x"] >= 0
+        assert box["y"] >= 0
+        assert box["x"] + box["width"] <= size[0]
+        assert box["y"] + box["height"] <= size[1]
+    picture = fresh.page.locator("#picture").bounding_box()
+    assert picture is not None
+    assert picture["height"] > 0.6 * size[1]
+
+
+def test_the_subject_is_in_the_middle_when_it_opens(fresh: Opened) -> None:
+    shown = """() => {
+        const camera = polarguide.navigation.camera(400, 800), point = polarguide.scene.center;
+        const local = add(apply(camera.rotation, point), camera.translation);
+        return [camera.fx * local[0] / local[2] + camera.cx, camera.fy * local[1] / local[2] + camera.cy, camera.fx];
+    }"""
+    fresh.page.click("#reset")
+    x, y, upright = fresh.page.evaluate(shown)
+    assert abs(x - 200) < 20
+    assert abs(y - 400) < 40
+    fresh.page.keyboard.press("n")
+    fresh.page.keyboard.press("p")
+    assert fresh.page.evaluate(shown)[2] < upright  # at a photograph's pose, all of it is shown
+
+
 def test_fingers_turn_and_pinch(fresh: Opened) -> None:
     send = fresh.page.context.new_cdp_session(fresh.page).send
 

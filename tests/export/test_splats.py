@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from random_runs import random_state
+from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
 from polarguide.color import srgb_encode
@@ -18,7 +20,7 @@ COUNT = 7
 FIELDS = {
     "3dgs": {"linear_dc", "linear_rest"},
     "3dgs-dr": {"linear_dc", "linear_rest", "strength"},
-    "ref-gs": {"albedo", "roughness", "feature"},
+    "ref-gs": {"linear_dc", "linear_rest", "albedo", "roughness", "feature", "surface"},
 }
 
 
@@ -52,3 +54,23 @@ def test_a_directional_gaussian_shows_its_albedo_and_the_light_in_its_mirror() -
     linear = shading.colors(gaussians, state.light, ray.expand(COUNT, 3), facing)
     expected = srgb_encode(linear.detach().clamp(0, 1))
     torch.testing.assert_close(shown_colors(state, shading, ray)[:, 0], expected)
+
+
+def test_normals_are_the_learned_ones_and_face_the_nearest_camera(tmp_path: Path) -> None:
+    """Read by trimesh, which takes nx, ny, nz for the normals of its vertices."""
+    trimesh = pytest.importorskip("trimesh")
+    state, shading = random_state("3dgs", 50)
+    centers = torch.tensor([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]])
+    write_run_ply(tmp_path / "run.ply", state, shading, centers)
+    raw = trimesh.load(tmp_path / "run.ply").metadata["_ply_raw"]["vertex"]["data"]
+    normals = torch.from_numpy(
+        np.stack([raw[name] for name in ("nx", "ny", "nz")], axis=1).astype(np.float64)
+    )
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(50, dtype=torch.float64), atol=1e-5, rtol=0)
+    means = state.gaussians["means"].detach().double()
+    rotations = Rotation.from_quat(state.gaussians["quaternions"].detach().double()[:, [1, 2, 3, 0]].numpy())
+    axes = torch.from_numpy(rotations.as_matrix())
+    shortest = axes[torch.arange(50), :, state.gaussians["log_scales"].detach().argmin(dim=1)]
+    assert bool(((normals * shortest).sum(dim=1).abs() > 0.9999).all())
+    nearest = centers.double()[(means[:, :1] < 0).long()[:, 0]]
+    assert bool(((normals * (nearest - means)).sum(dim=1) >= -1e-6).all())

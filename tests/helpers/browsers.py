@@ -14,6 +14,8 @@ FLAGS = (
     "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--ignore-gpu-blocklist"
 )
+# A stranger's name that points to this machine (DNS rebinding).
+REBOUND = "rebound.example"
 PATIENCE = 240  # seconds; software rendering on a busy machine is slow
 
 
@@ -25,7 +27,8 @@ def chromium() -> Iterator[Any]:
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="no Playwright -> pip install '.[browser]'"
     )
+    flags = [*FLAGS.split(), f"--host-resolver-rules=MAP {REBOUND} 127.0.0.1"]
     with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
+        browser = running.chromium.launch(executable_path=CHROMIUM, args=flags)
         yield browser
         browser.close()

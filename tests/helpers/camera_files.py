@@ -121,9 +121,10 @@ def write_shots(
 def read_polar(scene: Path, view: str) -> np.ndarray:
     """The four pictures that were written, [4, H, W, 3] in [0, 1]."""
     paths = [scene / "polar" / f"{view}_{angle:03d}.png" for angle in ANGLES]
-    pictures = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1] for path in paths]
+    pictures = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths]
     assert all(picture.dtype == np.uint16 for picture in pictures)
-    return np.stack(pictures) / 65535.0
+    colored = [p[..., ::-1] if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
+    return np.stack(colored) / 65535.0
 
 
 def read_invalid(scene: Path, view: str) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any
 
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.aggregate import aggregate
-from polarguide.experiments.results import FORMAT, Results, validate_results
+from polarguide.experiments.results import FORMAT, Results, differences_of, validate_results
 
 
 def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:
@@ -22,17 +22,29 @@ def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str
         "metrics": values,
         "lpips_reason": None if values["lpips"] is not None else "no weights",
         "views": {"v0": dict(values)},
+        "objects": {},
+        "materials": {},
     }
+
+
+def part(material: str | None = None, **metrics: float | None) -> dict[str, Any]:
+    """What a run scores on an object or a material."""
+    return {"material": material, "pixels": 100, "views": 2, "metrics": metrics}
 
 
 def unfinished(scene: str, recipe: str, seed: int, error: str | None = None) -> dict[str, Any]:
     """A run that failed with an error, or that has not run."""
-    blank = {"metrics": None, "views": {}, "lpips_reason": None}
+    blank = {"metrics": None, "views": {}, "lpips_reason": None, "objects": {}, "materials": {}}
     return run(scene, recipe, seed) | blank | {"state": "failed" if error else "missing", "error": error}
 
 
-def results(runs: list[dict[str, Any]], **provenance: Any) -> dict[str, Any]:
-    """A record of these runs."""
+def results(
+    runs: list[dict[str, Any]],
+    against: str | None = None,
+    black: tuple[str, ...] = (),
+    **provenance: Any,
+) -> dict[str, Any]:
+    """A record of these runs; ``black`` are the scenes on black."""
     scenes, recipes = (list(dict.fromkeys(r[key] for r in runs)) for key in ("scene", "recipe"))
     record = Results(
         format=FORMAT,
@@ -52,10 +64,22 @@ def results(runs: list[dict[str, Any]], **provenance: Any) -> dict[str, Any]:
             "refractive_index": 1.5,
             "threads": 1,
             "jobs": 1,
+            "against": against,
         },
-        scenes=[{"name": name, "digest": "d" * 64, "views": 3, "test_views": ["v0"]} for name in scenes],
+        scenes=[
+            {
+                "name": name,
+                "digest": "d" * 64,
+                "views": 3,
+                "test_views": ["v0"],
+                "black_share": 0.6 if name in black else 0.0,
+            }
+            for name in scenes
+        ],
         recipes=[{"name": name, "about": f"about {name}", "data": {}} for name in recipes],
         runs=runs,
         table=aggregate(runs, scenes, recipes),
+        differences=[],
     )
+    record["differences"] = differences_of(record)
     return validate_results(record)

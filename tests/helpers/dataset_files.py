@@ -151,10 +151,35 @@ def pisr_inner() -> np.ndarray:
     return np.array([[1500.0, 0, 620], [0, 1510, 500], [0, 0, 1]])
 
 
+def write_phygap(root: Path, light: Callable[[int], np.ndarray] = light_of) -> Path:
+    """EXR files with the channels of Mitsuba, whose angles count from the vertical; cameras in one file."""
+    import OpenEXR
+
+    poses_ = []
+    for index, (rotation, translation) in enumerate(poses()):
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        channels = {}
+        for part, plane, sign in zip(range(3), light(index), (1, -1, -1), strict=True):
+            for c, color in enumerate("RGB"):
+                channels[f"S{part}.{color}"] = np.ascontiguousarray(sign * plane[..., c], np.float32)
+        (root / "images_full").mkdir(parents=True, exist_ok=True)
+        OpenEXR.File(header, channels).write(str(root / "images_full" / f"{index:03d}.exr"))
+        write_picture(root / "masks" / f"{index:03d}.png", disc().astype(float), bits=8)
+        rigid = np.eye(4)
+        rigid[:3] = np.column_stack([rotation, translation])
+        poses_.append(rigid)
+    np.savez(
+        root / "camera_params.npz",
+        intrinsics=INNER, extrinsics=np.stack(poses_), image_width=WIDTH, image_height=HEIGHT, fov=30.0,
+    )  # fmt: skip
+    return root
+
+
 WRITERS: dict[str, Callable[[Path], Path]] = {
     "pandora": write_pandora,
     "pisr": write_pisr,
     "nersp": write_nersp,
     "neisf": write_neisf,
     "gnerp": write_gnerp,
+    "phygap": write_phygap,
 }

@@ -16,6 +16,7 @@ class Control:
 
     def __init__(self, value: Any = None) -> None:
         self._value, self.visible, self._callbacks = value, True, []
+        self._impl = SimpleNamespace(uuid=str(id(self)))
 
     @property
     def value(self) -> Any:

@@ -75,6 +75,7 @@ def pictures_of(
             torch.zeros(0, dtype=torch.uint16),
             torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
             torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
+            torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
             camera,
             checks.Measures(0.0, (0.0, 0.0, 0.0), np.zeros(5)),
             60000,

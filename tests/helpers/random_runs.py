@@ -43,6 +43,9 @@ def random_state(name: str, count: int = 300) -> tuple[TrainingState, ShadingMod
     for key, spread in {"strength_logits": 1.0, "local_dc": 0.3, "local_rest": 0.1}.items():
         if key in gaussians:
             gaussians[key] = spread * normal(*gaussians[key].shape)
+    if "surface" in gaussians:
+        gaussians["surface"][::5] = 0
+        gaussians["sh_rest"][::5] = 0  # for which a page has no room
     if recipe.oriented:
         gaussians["outward"] = normal(count, 3)
         gaussians["outward"][::5] = 0  # not seen by any view

@@ -102,5 +102,8 @@ def make_busy_recipe() -> Recipe:
             dense_share=0.02,
             minimum_opacity=0.006,
             pixels_each=100.0,
+            maximum_scale_share=0.3,
+            large_from=18 / STEPS,
+            large_minimum=1,
         ),
     )

@@ -8,6 +8,7 @@ import pytest
 import torch
 from glossy_ball import INDEX, mistaken, model_of, surfaces, views_around
 
+from polarguide.capture.calibration import Calibration
 from polarguide.inspection.angle_checks import combine_evidence, handedness_check, order_check, zero_check
 from polarguide.inspection.dielectric import dielectric_check, exceeds_dielectric
 from polarguide.inspection.likelihood import posterior
@@ -85,7 +86,7 @@ def test_wrong_normals_are_not_used(ball_views) -> None:
     evidence = normal_evidence(sample_surfaces(pairs), INDEX)
     assert not evidence.usable
     check = order_check(combine_evidence([evidence], 0))
-    assert check.verdict == "n/a"
+    assert check.verdict == "not verified"
     assert evidence.note in check.finding
 
 
@@ -135,3 +136,39 @@ def test_polarization_beyond_any_dielectric_is_flagged(ball_views) -> None:
 def test_evidence_is_not_certain_beyond_its_failures(ball_views) -> None:
     evidence, _ = point_evidence(ball_views, model_of(ball_views), INDEX)
     assert max(posterior(evidence).probabilities) < 0.995
+
+
+@pytest.mark.parametrize(
+    ("applied", "true", "expected"),
+    [
+        # Read as clockwise, and rightly so: nothing to do. Read as clockwise, and wrongly: the sense goes back.
+        (Calibration(sense="cw"), Calibration(sense="ccw"), "--order 0,45,90,135 --sense ccw --zero 0"),
+        (Calibration(sense="ccw"), Calibration(sense="cw"), "--order 0,45,90,135 --sense cw --zero 0"),
+        (
+            Calibration(sense="cw"),
+            Calibration(sense="ccw", zero=45),
+            "--order 0,45,90,135 --sense ccw --zero 45",
+        ),
+        (Calibration(zero=90), Calibration(sense="cw", zero=90), "--order 0,45,90,135 --sense cw --zero 90"),
+    ],
+)
+def test_the_remedy_is_the_whole_calibration(
+    ball_views, applied: Calibration, true: Calibration, expected: str
+) -> None:
+    """Pictures of an instrument that counts as ``true``, prepared as if it counted as ``applied``."""
+    named = [true.true_angles()[0][applied.true_angles()[0].index(angle)] for angle in ORDERS[0].files()]
+    views = tuple(mistaken(view, files=tuple(named)) for view in ball_views)
+    evidence, _ = point_evidence(views, model_of(views), INDEX)
+    angles = combine_evidence([evidence], 0, applied)
+    checks = [order_check(angles), handedness_check(angles)]
+    assert {check.verdict for check in checks} <= {"wrong", "ok"}
+    for check in checks:
+        assert check.verdict == "ok" or f"repeat prepare with {expected} " in check.remedy
+    assert checks[0].verdict == "wrong"
+    assert f"was prepared with {applied.options()}" in checks[0].remedy
+
+
+def test_a_scene_of_another_origin_is_only_offered_the_fix(ball_views) -> None:
+    views = tuple(mistaken(view, files=ORDERS[4].files()) for view in ball_views)
+    evidence, _ = point_evidence(views, model_of(views), INDEX)
+    assert order_check(combine_evidence([evidence], 0)).remedy == "Write a corrected scene with --fix FOLDER."

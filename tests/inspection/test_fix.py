@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -117,3 +118,29 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path, monkeypatch) -> None:
     with pytest.raises(PolarguideError, match="No space left"):
         fix.fix_scene(capture, Calibration(order=(90, 45, 0, 135)), tmp_path / "fixed")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s"]
+
+
+@pytest.mark.parametrize("name", ["gt", "masks/v0.png", "split.json"])
+def test_no_link_that_leaves_the_scene_is_copied(tmp_path, name: str) -> None:
+    """A scene from somebody else, whose copy is handed on: what a link points to is none of its files."""
+    root = write_scene(tmp_path / "wrong")
+    secret = tmp_path / "secret"
+    secret.mkdir()
+    (secret / "key").write_text("mine")
+    (root / name).parent.mkdir(exist_ok=True)
+    (root / name).symlink_to(secret if name == "gt" else secret / "key")
+    capture = replace(read_capture(write_scene(tmp_path / "right")), root=root)
+    change = Calibration(order=ORDERS[3].files(PAIRINGS[0]))
+    with pytest.raises(PolarguideError, match=r"found a link to .*secret.*nothing was written"):
+        fix.fix_scene(capture, change, tmp_path / "fixed")
+    assert not (tmp_path / "fixed").exists()
+
+
+def test_a_link_within_the_scene_is_copied(tmp_path) -> None:
+    root = write_scene(tmp_path / "scene")
+    (root / "masks").mkdir()
+    (root / "masks" / "v0.png").symlink_to(root / "polar" / "v0_000.png")
+    fix.fix_scene(read_capture(root), Calibration(order=ORDERS[3].files(PAIRINGS[0])), tmp_path / "fixed")
+    copy = tmp_path / "fixed" / "masks" / "v0.png"
+    assert not copy.is_symlink()
+    assert copy.read_bytes() == (root / "polar" / "v0_000.png").read_bytes()

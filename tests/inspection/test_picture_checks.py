@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from captures import gained, one_view, write_scene
@@ -76,6 +77,26 @@ def test_saturation_is_flagged_with_its_views(tmp_path) -> None:
     assert checked(write_scene(tmp_path / "t", lambda v: v * 4))["saturation"].verdict == "wrong"
 
 
+def test_a_sound_capture_on_black_is_not_flagged(tmp_path) -> None:
+    def on_black(values: np.ndarray) -> np.ndarray:
+        values = values.copy()
+        values[:, :, :50] = 0.0  # five eighths of every picture
+        return values
+
+    root = write_scene(tmp_path / "s", on_black)
+    found = checked(root)
+    assert flagged(found) == {}
+    assert found["saturation"].figures["saturated"] == 0.0
+    assert found["saturation"].figures["dark"] == pytest.approx(5 / 8, abs=0.01)
+    # As prepare writes it: black pixels are marked invalid.
+    (root / "invalid").mkdir()
+    for index in range(3):
+        invalid = np.zeros((60, 80), np.uint8)
+        invalid[:, :50] = 255
+        assert cv2.imwrite(str(root / "invalid" / f"v{index}.png"), invalid)
+    assert flagged(checked(root)) == {}
+
+
 def test_noise_is_flagged(tmp_path) -> None:
     rng = np.random.default_rng(0)
     found = checked(write_scene(tmp_path / "s", lambda v: v + rng.normal(0, 0.05, v.shape)))
@@ -87,6 +108,31 @@ def test_unpolarized_light_is_flagged_and_its_encoding_not_judged(tmp_path) -> N
     found = checked(write_scene(tmp_path / "s", lambda v: v.mean(axis=0, keepdims=True).repeat(4, 0)))
     assert found["low_dolp"].verdict == "wrong"
     assert found["encoding"].verdict == "n/a"
+
+
+@pytest.mark.parametrize("share", [0.0, 0.04])
+def test_a_reversed_or_missing_filter_is_suspected(tmp_path, share: float) -> None:
+    """Reversed, a circular polarizer of a real plate leaves a few percent of the modulation."""
+    rng = np.random.default_rng(3)
+
+    def reversed_filter(values: np.ndarray) -> np.ndarray:
+        mean = values.mean(axis=0, keepdims=True)
+        return mean + share * (values - mean) + rng.normal(0, 1e-3, values.shape)
+
+    check = checked(write_scene(tmp_path / "s", reversed_filter))["low_dolp"]
+    assert check.verdict == "wrong"
+    assert "No modulation: was the filter reversed, or missing?" in check.finding
+    assert "LCD screen" in check.remedy
+
+
+def test_weak_polarization_is_no_reversed_filter(tmp_path) -> None:
+    def weak(values: np.ndarray) -> np.ndarray:
+        mean = values.mean(axis=0, keepdims=True)
+        return mean + 0.1 * (values - mean)
+
+    check = checked(write_scene(tmp_path / "s", weak))["low_dolp"]
+    assert check.verdict == "warning"
+    assert "filter reversed" not in check.finding
 
 
 def test_one_view_with_another_exposure_is_named(tmp_path) -> None:

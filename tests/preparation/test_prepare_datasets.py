@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from dataset_files import (
     write_pisr,
 )
 from heard import Heard
+from tiny_capture import write_picture
 
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration
@@ -43,9 +45,10 @@ NAMES = {
     "nersp": ["0000", "0001", "0002", "0003"],
     "neisf": ["img_001", "img_002", "img_003", "img_004"],
     "gnerp": ["0", "1", "2", "3"],
+    "phygap": ["000", "001", "002", "003"],
 }
 # PANDORA's files share an exponent between channels, GNeRP's pictures have 8 bits.
-TOLERANCE = {"pandora": 1e-2, "nersp": 2e-5, "neisf": 2e-5, "gnerp": 1e-2}
+TOLERANCE = {"pandora": 1e-2, "nersp": 2e-5, "neisf": 2e-5, "gnerp": 1e-2, "phygap": 2e-5}
 
 
 def summary(scene: Path) -> dict:
@@ -53,7 +56,7 @@ def summary(scene: Path) -> dict:
 
 
 def written(name: str, root: Path) -> Path:
-    if name == "neisf":
+    if name in ("neisf", "phygap"):
         pytest.importorskip("OpenEXR")
     return WRITERS[name](root)
 
@@ -263,3 +266,20 @@ def test_known_matrices_are_what_they_should_be() -> None:
     local = rotation @ point[:3] + translation
     assert seen[:2] / seen[2] == pytest.approx(local[:2] / local[2] * [90, 92] + [33, 23])
     assert smooth_light(4, 4).shape == (3, 4, 4, 3)
+
+
+def test_nersp_under_other_names(tmp_path: Path) -> None:
+    """Masks beside the pictures, I-sum, cameras_new.npz with padded numbers."""
+    root = WRITERS["nersp"](tmp_path / "in")
+    shutil.rmtree(root / "input_azimuth_maps")
+    (root / "image").rename(root / "I-sum")
+    with np.load(root / "cameras.npz") as arrays:
+        padded = {f"{key[:-1]}{int(key[-1]):02d}": arrays[key] for key in arrays}
+    np.savez(root / "cameras_new.npz", **padded)
+    (root / "cameras.npz").unlink()
+    for index in range(4):
+        write_picture(root / "mask" / f"{index:04d}.png", disc().astype(float), bits=8)
+    done = prepare_scene(root, tmp_path / "out", PLAIN)
+    assert done.views == NAMES["nersp"]
+    path = tmp_path / "out" / "masks" / "0000.png"
+    np.testing.assert_array_equal(decode_mask(path, path.read_bytes(), any_value=False), disc())

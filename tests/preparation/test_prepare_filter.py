@@ -15,6 +15,7 @@ from tiny_capture import encode_srgb, write_picture
 
 from polarguide.capture.filter.align import estimate_shifts
 from polarguide.capture.filter.exif import apply_orientation, orientation
+from polarguide.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 
@@ -57,6 +58,30 @@ def test_transfer_is_told_by_the_light(tmp_path: Path, suffix: str, bits: int, s
     assert np.abs(read_polar(tmp_path / "out", "v") - light).mean() < 0.01
 
 
+def test_files_named_like_the_angles_alone_are_one_view(tmp_path: Path) -> None:
+    for angle, values in zip(ANGLES, behind(smooth_light()), strict=True):
+        write_picture(tmp_path / "cup" / f"I{angle}.png", values, bits=16)
+    assert prepare_scene(tmp_path / "cup", tmp_path / "out", PLAIN).views == ["cup"]
+
+
+def test_floating_point_pictures(tmp_path: Path) -> None:
+    light = behind(smooth_light())
+    for angle, values in zip(ANGLES, light, strict=True):
+        (tmp_path / "in" / str(angle)).mkdir(parents=True)
+        stored = values[..., ::-1].astype(np.float32).copy()
+        stored[3, 4] = 1.7
+        assert cv2.imwrite(str(tmp_path / "in" / str(angle) / "v.tif"), stored)
+    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
+    invalid = read_invalid(tmp_path / "out", "v")
+    assert invalid[3, 4]
+    assert invalid.sum() == 1
+    off = np.abs(read_polar(tmp_path / "out", "v") - light)[:, ~invalid]
+    assert off.max() < 2e-5
+    assert cv2.imwrite(str(tmp_path / "in" / "0" / "v.tif"), (light[0] * 4000).astype(np.float32))
+    with pytest.raises(PolarguideError, match="floating-point values from 0 to 1"):
+        prepare_scene(tmp_path / "in", tmp_path / "out2", PLAIN)
+
+
 @pytest.mark.parametrize(("suffix", "transfer"), [(".jpg", "srgb"), (".png", "linear")])
 def test_unpolarized_light_leaves_the_transfer_undecided(tmp_path: Path, suffix: str, transfer: str) -> None:
     flat = np.full((4, 48, 64, 3), 0.4)
@@ -64,7 +89,7 @@ def test_unpolarized_light_leaves_the_transfer_undecided(tmp_path: Path, suffix:
     prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, transfer="auto"))
     found = summary(tmp_path / "out")
     assert found["transfer"] == transfer
-    assert any("do not decide" in note for note in found["notes"])
+    assert any("too few pixels are polarized" in note for note in found["notes"])
 
 
 def with_orientation(path: Path, code: int) -> None:

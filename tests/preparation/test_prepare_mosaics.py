@@ -202,3 +202,15 @@ def test_views_are_read_in_order_and_provenance_is_kept(tmp_path: Path) -> None:
     assert found["clipped_share"] == 0.0
     assert not (tmp_path / "out" / "prepare.json").exists()
     assert read_polar(tmp_path / "out", "v002").shape == (4, 24, 32, 3)
+
+
+def test_a_monochrome_capture_is_written_as_one_channel(tmp_path: Path) -> None:
+    for color, channels in ((False, 1), (True, 3)):
+        folder = tmp_path / str(color)
+        write_mosaics(folder / "in", 1, color=color)
+        prepare_scene(folder / "in", folder / "out", COLORED if color else GRAY)
+        data = (folder / "out" / "polar" / "v000_045.png").read_bytes()
+        assert data[25] == (0 if channels == 1 else 2)  # IHDR: gray or RGB
+        assert np.ptp(read_polar(folder / "out", "v000"), axis=-1).max() == (
+            0 if channels == 1 else pytest.approx(0.3, abs=0.2)
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import shutil
@@ -91,7 +92,7 @@ MOSAICS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
         lambda d: (d / "a.raw").write_bytes(b"1" * 100), RAW, "a.raw: expected 4608 bytes for 64x48.*found 100"
     ),
     "width of other files": (lambda d: None, replace(MOSAIC, width=32), "expected 32x48 .*found 64x48"),
-    "no sensor": (lambda d: None, replace(MOSAIC, sensor=None), "--sensor: expected the sensor"),
+    "no sensor": (lambda d: None, replace(MOSAIC, sensor=None), "with --sensor, .*3 pictures .* --sensor IMX250MYR"),
     "unknown sensor": (lambda d: None, replace(MOSAIC, sensor="IMX1"), "--sensor: expected IMX250MYR, .*IMX1"),
     "gray white balance": (
         lambda d: None, replace(MOSAIC, sensor="IMX250MZR", white_balance="gray"), "--white-balance"
@@ -102,7 +103,7 @@ MOSAICS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
     "saturation": (lambda d: None, replace(MOSAIC, saturation=70000), "--saturation"),
     "bits": (lambda d: None, replace(MOSAIC, bits=12), "--bits: expected values below 4096"),
     "bits out of range": (lambda d: None, replace(MOSAIC, bits=99), "--bits: expected 8 to 16"),
-    "negative offset": (lambda d: None, replace(MOSAIC, offset_x=-1), "--offset-x: expected 0 or more"),
+    "negative offset": (lambda d: None, replace(MOSAIC, offset_x=-1), "--offset-x: expected 0 to 1048576"),
     "missing dark frame": (lambda d: None, replace(MOSAIC, dark_frame="none.png"), "none.png: .*readable file"),
     "dark frame of another size": (
         lambda d: picture(d.parent / "dark.png", np.ones((16, 16), np.uint16)),
@@ -322,3 +323,41 @@ def test_a_calibration_file(tmp_path: Path) -> None:
     )
     expected = Calibration(gains=(1.01, 0.99, 1.0, 1.0), order=(90, 45, 0, 135), zero=3.0)
     assert read_calibration(path) == expected
+
+
+@pytest.mark.parametrize(
+    "stranger", ["../victim.txt", "/victim.txt", "polar/../../victim.txt", "polar/other_000.png"]
+)
+@pytest.mark.parametrize("view", [None, "../v000"])
+def test_nothing_is_removed_at_the_word_of_a_journal(tmp_path: Path, stranger: str, view: str | None) -> None:
+    """An unfinished preparation from somebody else, which names files as those of a view without a pose."""
+    source, out = tmp_path / "source", tmp_path / "out"
+    write_mosaics(source)
+    prepare_scene(source, out, MOSAIC)
+    victim = out.parent / "victim.txt"
+    victim.write_text("mine")
+    named = str(victim) if stranger.startswith("/") else stranger
+    journal = json.loads((out / "scene.json").read_text())
+    views = journal["prepare"]["views"]
+    views["v000"]["files"][named] = 4
+    if view is not None:
+        views[view] = views.pop("v000")
+    (out / "scene.json").unlink()
+    (out / "prepare.json").write_text(json.dumps(journal))
+    with pytest.raises(PolarguideError, match=r"prepare\.json .*nothing was written"):
+        prepare_scene(source, out, MOSAIC)
+    assert victim.read_text() == "mine"
+
+
+def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
+    source, out, elsewhere = tmp_path / "source", tmp_path / "out", tmp_path / "elsewhere"
+    write_mosaics(source)
+    prepare_scene(source, out, MOSAIC)
+    shutil.move(out / "polar", elsewhere)
+    (out / "polar").symlink_to(elsewhere)
+    for path in elsewhere.iterdir():
+        path.write_bytes(b"mine")
+    (out / "scene.json").rename(out / "prepare.json")
+    with pytest.raises(PolarguideError, match="a link to another place"):
+        prepare_scene(source, out, MOSAIC)
+    assert {path.read_bytes() for path in elsewhere.iterdir()} == {b"mine"}

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +13,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+import polarguide
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.files import atomic
+from polarguide.options import SceneOptions
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import (
     CHECKPOINT,
@@ -22,6 +27,7 @@ from polarguide.runs.folder import (
     RunLog,
     load_checkpoint,
     save_checkpoint,
+    writing_to,
 )
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
@@ -95,10 +101,10 @@ def test_a_crash_while_saving_leaves_the_old_checkpoint(
 
 
 def test_scalars_survive_a_checkpoint(tmp_path: Path, state: TrainingState, busy_recipe: Recipe) -> None:
-    state.step, state.opacity_frozen_until, state.opacity_was_reset = 2**40, 2**40 + 9, True
+    state.step, state.opacity_frozen_until = 2**40, 2**40 + 9
     save_checkpoint(tmp_path, state)
     loaded = load_checkpoint(tmp_path, busy_recipe)
-    assert (loaded.step, loaded.opacity_frozen_until, loaded.opacity_was_reset) == (2**40, 2**40 + 9, True)
+    assert (loaded.step, loaded.opacity_frozen_until) == (2**40, 2**40 + 9)
     assert loaded.frozen is None
 
 
@@ -192,3 +198,66 @@ def test_the_log_is_cut_at_a_step_and_forgives_a_torn_line(tmp_path: Path) -> No
     assert log.elapsed() == (1.9, False)
     log.cut(0)
     assert log.elapsed() == (0.0, True)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ['{"step": "9"}', '{"step": 1e400}', '{"step": null}', "[]", "{}", "[" * 5000, "\0", '{"step": -1}', "9",
+     '{"step": 9, "seconds": "x"}', '{"step": 9, "seconds": NaN}', '{"step": 9, "alone": []}', '{"step": true}'],
+)  # fmt: skip
+def test_lines_that_are_none_of_ours_are_dropped(tmp_path: Path, line: str) -> None:
+    good = '{"step": 3, "stage": "x", "seconds": 1.5, "alone": true, "more": 1}'
+    (tmp_path / LOG).write_text(f"{good}\n{line}\n")
+    log = RunLog(tmp_path)
+    assert [row["step"] for row in log.rows()] == [3]
+    assert log.elapsed() == (1.5, True)
+    log.cut(10)
+    assert (tmp_path / LOG).read_text() == good + "\n"
+
+
+def test_one_training_at_a_time_writes_to_a_run(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with writing_to(run):
+        with pytest.raises(PolarguideError, match="another training at work"), writing_to(run):
+            pass
+        pid = os.fork()
+        if not pid:  # another process
+            try:
+                with writing_to(run):
+                    os._exit(0)
+            except PolarguideError:
+                os._exit(3)
+        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 3
+    pid = os.fork()
+    if not pid:  # one that is killed with the lock in its hands
+        with writing_to(run):
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(pid, 0)
+    with writing_to(run):
+        pass
+
+
+def test_a_second_training_into_a_run_is_refused(demo_scene: Path, tmp_path: Path, trained: Path) -> None:
+    run = tmp_path / "run"
+    reading, settings = SceneOptions(downscale=4), TrainSettings(40)
+    with writing_to(run), pytest.raises(PolarguideError, match="another training at work"):
+        polarguide.train(demo_scene, run, settings=settings, reading=reading)
+    shutil.copytree(trained, tmp_path / "old")
+    before = (tmp_path / "old" / CHECKPOINT).read_bytes()
+    with writing_to(tmp_path / "old"), pytest.raises(PolarguideError, match="another training at work"):
+        polarguide.train(demo_scene, tmp_path / "old", settings=settings, reading=reading, resume=True)
+    assert (tmp_path / "old" / CHECKPOINT).read_bytes() == before
+
+
+def test_a_checkpoint_has_the_rights_of_other_files(tmp_path: Path, state: TrainingState) -> None:
+    save_checkpoint(tmp_path, state)
+    (tmp_path / "other").write_text("x")
+    assert (tmp_path / CHECKPOINT).stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+def test_the_same_state_is_the_same_bytes(tmp_path: Path, state: TrainingState) -> None:
+    found = set()
+    for _ in range(12):
+        save_checkpoint(tmp_path, state)
+        found.add((tmp_path / CHECKPOINT).read_bytes())
+    assert len(found) == 1

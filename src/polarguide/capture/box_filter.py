@@ -38,6 +38,13 @@ def every(values: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
     return np.asarray(_boxed(values, factor).all(axis=(1, 3)))
 
 
+def agreed(numbers: NDArray[np.int32], factor: int) -> NDArray[np.int32]:
+    """The number that all pixels of a box share, of [H, W]; 0 where they differ."""
+    first, *others = _strided(numbers, factor)
+    same = functools.reduce(np.logical_and, (first == other for other in others), np.full(first.shape, True))
+    return np.where(same, first, 0).astype(np.int32)
+
+
 def unit_mean(normals: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     """Box means of vectors [H, W, 3], brought back to unit length; zero where they cancel."""
     average = mean(normals, factor)

@@ -62,6 +62,17 @@ class Calibration:
         """Order, sense and zero for ``scene.json``."""
         return {"order": list(self.order), "sense": self.sense or "ccw", "zero_degrees": self.zero}
 
+    def true_angles(self) -> tuple[tuple[int, ...], float]:
+        """The true angles of the pictures called 0, 45, 90 and 135: multiples of 45, and what is left for all four."""
+        sign = -1 if self.sense == "cw" else 1
+        steps = 45 * round(self.zero / 45.0)
+        return tuple((sign * angle + steps) % 180 for angle in self.order), self.zero - steps
+
+    def options(self) -> str:
+        """Order, sense and zero as options of ``prepare``."""
+        order = ",".join(map(str, self.order))
+        return f"--order {order} --sense {self.sense or 'ccw'} --zero {self.zero:g}"
+
 
 def checked(calibration: Calibration, where: object) -> Calibration:
     """The calibration, if it makes sense.
@@ -78,6 +89,33 @@ def checked(calibration: Calibration, where: object) -> Calibration:
             remedy="Correct the value.",
         )
     return calibration
+
+
+def combined(first: Calibration, second: Calibration) -> Calibration | None:
+    """One calibration in place of two: ``second`` was found on pictures to which ``first`` was applied.
+
+    Returns:
+        Order, sense and zero, without gains; None where no calibration says the same (pictures that ``first`` turned
+        by a part of 45 degrees, and ``second`` pairs otherwise).
+    """
+    (named, turn), (renamed, more) = first.true_angles(), second.true_angles()
+    angles = tuple(renamed[ANGLES.index(angle)] for angle in named)
+    senses: tuple[tuple[Sense, int], ...] = (("ccw", 1), ("cw", -1))
+    sign = next((sign for _, sign in senses if renamed == _count(sign, renamed[0])), None)
+    if sign is None and turn:
+        return None
+    rest = round((sign or 1) * turn + more, 2)
+    for sense, way in senses:
+        if angles == _count(way, angles[0]):
+            zero = round((angles[0] + rest) % 180, 2)
+            return Calibration(sense=sense, zero=zero - 180 if zero > 90 else zero)
+    first_angle, second_angle, third, fourth = angles
+    return Calibration(order=(first_angle, second_angle, third, fourth), sense="ccw", zero=rest)
+
+
+def _count(sign: int, zero: int) -> tuple[int, ...]:
+    """What 0, 45, 90 and 135 mean where angles count one way from a zero."""
+    return tuple((sign * angle + zero) % 180 for angle in ANGLES)
 
 
 class _Gains(msgspec.Struct, forbid_unknown_fields=True):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,8 @@ _SAMPLES = 20_000
 _RESIDUAL = 0.05
 # Curvature (see Measures) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
-_ENCODED_CURVATURE = -0.25
-_DECODED_CURVATURE = 0.2
+ENCODED, DECODED = (-0.12, -0.25), (0.1, 0.2)
+"""Curvatures from which files seem encoded, or decoded twice: for a doubt, and for a judgement."""
 
 
 @dataclass(frozen=True)
@@ -156,12 +156,12 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
     slope = curvature(measures)
     if swapped or slope is None:  # the slope is meaningless with wrong pairs
         return warnings
-    if transfer == "linear" and slope < _ENCODED_CURVATURE:
+    if transfer == "linear" and encoding(slope) == "srgb":
         warnings.append(
             f"The pictures look sRGB-encoded (curvature {slope:.2f}, linear ones have 0): "
             "if they are, read them with transfer srgb."
         )
-    if transfer == "srgb" and slope > _DECODED_CURVATURE:
+    if transfer == "srgb" and slope > DECODED[1]:
         warnings.append(
             f"The pictures look linear already (curvature {slope:.2f} after decoding, 0 is right): "
             "if they are, read them with transfer linear."
@@ -178,6 +178,16 @@ def curvature(measures: Sequence[Measures]) -> float | None:
     if spread < 0.005**2:
         return None
     return float((qr / count - q / count * r / count) / spread)
+
+
+def encoding(slope: float | None) -> Literal["linear", "srgb"] | None:
+    """How files are encoded that have this curvature when they are read as linear; None where it does not tell.
+
+    The one judgement of ``prepare``, ``inspect`` and the warnings of ``train``.
+    """
+    if slope is None or ENCODED[1] <= slope < ENCODED[0]:
+        return None
+    return "srgb" if slope < ENCODED[1] else "linear"
 
 
 def _is_off(residuals: tuple[float, float, float]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 import zlib
 from pathlib import Path
@@ -13,10 +12,15 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide.capture import box_filter as boxes
+from polarguide.capture.formats.arrays import unpacked
+from polarguide.capture.objects import LARGEST_ID
 from polarguide.capture.view import GroundTruth
 from polarguide.errors import PolarguideError
 
-_CHANNELS = {"normal": 3, "depth": 0, "mask": 0, "specular": 3, "diffuse": 3}
+_CHANNELS = {"normal": 3, "depth": 0, "mask": 0, "specular": 3, "diffuse": 3, "objid": 0}
+
+_LARGEST_NUMBER = 16  # bytes
+_DAMAGED = (ValueError, TypeError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor: int) -> GroundTruth:
@@ -25,15 +29,16 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
     Args:
         path: of the file, for messages.
         data: the whole file, NumPy's .npz with any of the arrays ``normal``, ``depth``, ``mask``,
-            ``specular`` and ``diffuse``; others are ignored.
+            ``specular``, ``diffuse`` and ``objid``; others are ignored.
         size: height and width of the pictures as stored.
         factor: side of the boxes to average. Normals are averaged and brought back to unit length; a pixel is
-            foreground only where its whole box is.
+            foreground only where its whole box is, has a depth only where its whole box has, and shows an object only
+            where its whole box does.
 
     Raises:
         PolarguideError: the file cannot be read, an array has another size, or values are not finite.
     """
-    arrays = _read_arrays(path, data)
+    arrays = _read_arrays(path, data, size)
     for name, array in arrays.items():
         _check(path, name, array, size)
     fields: dict[str, NDArray[Any]] = {}
@@ -42,6 +47,11 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
             fields[name] = boxes.every(array.astype(bool), factor)
         elif name == "normal":
             fields[name] = boxes.unit_mean(boxes.unit_mean(array.astype(np.float32), 1), factor)
+        elif name == "depth":
+            depth = array.astype(np.float32)
+            fields[name] = np.where(boxes.every(depth > 0, factor), boxes.mean(depth, factor), np.float32(0))
+        elif name == "objid":
+            fields["object_ids"] = boxes.agreed(array.astype(np.int32), factor)
         else:
             fields[name] = boxes.mean(array.astype(np.float32), factor)
     return GroundTruth(
@@ -49,14 +59,13 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
     )
 
 
-def _read_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
+def _read_arrays(path: Path, data: bytes, size: tuple[int, int]) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            return {name: archive[name] for name in _CHANNELS if name in archive.files}
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        return unpacked(data, _CHANNELS, _LARGEST_NUMBER * max(3, *_CHANNELS.values()) * size[0] * size[1])
+    except (*_DAMAGED, MemoryError, SyntaxError) as error:
         raise PolarguideError(
             path,
-            expected="a NumPy .npz file with normal, depth, mask, specular or diffuse",
+            expected="a NumPy .npz file with normal, depth, mask, specular, diffuse or objid",
             found="a damaged, truncated or other file",
             remedy="Write it again with numpy.savez_compressed, or remove it.",
         ) from error
@@ -70,6 +79,15 @@ def _check(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) ->
             expected=f"an array of shape {list(shape)} like the pictures",
             found=f"{array.dtype} of shape {list(array.shape)}",
             remedy="Write the ground truth at the size of the pictures.",
+        )
+    if name == "objid" and (
+        array.dtype.kind not in "iu" or not 0 <= array.min() <= array.max() <= LARGEST_ID
+    ):
+        raise PolarguideError(
+            f"{path} (objid)",
+            expected=f"whole numbers from 0 to {LARGEST_ID}, those of scene.json's objects",
+            found=f"{array.dtype} from {array.min()} to {array.max()}",
+            remedy="Write the numbers of the objects, and 0 where there is none.",
         )
     broken = int(np.count_nonzero(~np.isfinite(array)))
     if broken:

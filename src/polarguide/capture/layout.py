@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -186,8 +187,9 @@ def angle_folders(root: Path) -> dict[int, Path]:
 def index_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     """Stem -> file for the files of a folder with one of the suffixes; empty if there is no such folder."""
     files: dict[str, Path] = {}
-    if not folder.is_dir():
+    if not os.path.lexists(folder):
         return files
+    require_folder(folder, expected="a folder of files called like the views", remedy="Remove or rename it.")
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
             continue

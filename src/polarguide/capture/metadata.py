@@ -7,8 +7,10 @@ from typing import Annotated, Any
 
 import msgspec
 
+from polarguide.capture.calibration import Calibration, Sense, combined
 from polarguide.capture.view import unknown_view
 from polarguide.errors import PolarguideError
+from polarguide.polarizer import ANGLES
 from polarguide.records import decode
 
 TEST_EVERY = 8
@@ -22,11 +24,38 @@ class _Split(msgspec.Struct):
     test: list[str]
 
 
+class _Material(msgspec.Struct):
+    ior: float | None = None
+
+
+class _Object(msgspec.Struct):
+    material: _Material | str | None = None
+
+
 class _Scene(msgspec.Struct):
-    """What is read of ``scene.json``: other programs write files of this name, too."""
+    """What is read of ``scene.json``; what else it says is passed over."""
 
     refractive_index: Index | None = None
-    objects: Any = None
+    objects: list[_Object] = []
+    prepare: Any = None
+
+
+class _Angles(msgspec.Struct):
+    """A calibration as ``scene.json`` notes it."""
+
+    order: tuple[int, int, int, int] = ANGLES
+    sense: Sense = "ccw"
+    zero_degrees: float = 0.0
+
+    def calibration(self) -> Calibration:
+        return Calibration(order=self.order, sense=self.sense, zero=self.zero_degrees)
+
+
+class _Prepared(msgspec.Struct):
+    """What ``prepare`` and ``inspect --fix`` did to the angles."""
+
+    calibration: _Angles | None = None
+    corrections: list[_Angles] = []
 
 
 def held_out(path: Path, data: bytes | None, names: list[str]) -> tuple[str, ...]:
@@ -73,9 +102,29 @@ def refractive_index_of(path: Path, data: bytes | None) -> float | None:
     scene = decode(data, _Scene, path, remedy=remedy)
     if scene.refractive_index is not None:
         return scene.refractive_index
-    objects = scene.objects if isinstance(scene.objects, list) else []
-    materials = [item.get("material") for item in objects if isinstance(item, dict)]
-    found = [item["ior"] for item in materials if isinstance(item, dict) and item.get("ior") is not None]
+    materials = [item.material for item in scene.objects]
+    found = [item.ior for item in materials if isinstance(item, _Material) and item.ior is not None]
     if not found or any(index != found[0] for index in found):
         return None
     return decode(found[0], Index, f"{path} (ior)", remedy=remedy)
+
+
+def applied_calibration(path: Path, data: bytes | None) -> Calibration | None:
+    """Order, sense and zero that the pictures of a prepared scene were made with, corrections included.
+
+    Args:
+        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+
+    Returns:
+        None for a scene that ``prepare`` did not write.
+
+    Raises:
+        PolarguideError: ``prepare`` wrote it, and its calibration is damaged.
+    """
+    if data is None or decode(data, _Scene, path, remedy="Prepare the scene again.").prepare is None:
+        return None
+    scene = decode(data, _Prepared, path, remedy="Prepare the scene again.")
+    found: Calibration | None = (scene.calibration or _Angles()).calibration()
+    for correction in scene.corrections:
+        found = None if found is None else combined(found, correction.calibration())
+    return found

@@ -10,13 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unused_poses
 from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.layout import Layout, find_layout, select_views
+from polarguide.capture.memory import check_memory, stated_size
 from polarguide.capture.metadata import held_out, refractive_index_of
+from polarguide.capture.objects import objects_of
 from polarguide.capture.view import Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, read_view
 from polarguide.errors import PolarguideError
@@ -50,6 +53,7 @@ def load_scene(
     downscale: int = 1,
     transfer: str = "linear",
     views: Sequence[str] | None = None,
+    memory: float = 0.0,
     reporter: Reporter = SILENT,
 ) -> Scene:
     """Read a capture.
@@ -66,6 +70,7 @@ def load_scene(
             only where all of its box is; it is invalid or saturated where any of it is.
         transfer: how the files are encoded: "linear", or "srgb" for display-encoded pictures.
         views: names of the views to read; all if None. The split is that of the whole capture.
+        memory: GiB that the pictures may take; 0: 80 % of what is free.
         reporter: receives the progress.
 
     Returns:
@@ -84,18 +89,32 @@ def load_scene(
     for file in model.files:
         files.read(file)
     tests = held_out(root / "split.json", files.read_if_there(root / "split.json"), layout.names)
-    index = refractive_index_of(root / "scene.json", files.read_if_there(root / "scene.json"))
+    about = files.read_if_there(root / "scene.json")
+    index = refractive_index_of(root / "scene.json", about)
     for name in names:
-        model.camera(name)  # find missing poses before the pictures are read
+        # Missing poses and pictures of another size are found before a picture is decoded.
+        camera = model.camera(name)
+        size = stated_size(layout.pictures[name][0])
+        if size is not None:
+            fit_camera(camera, *size, folder=model.folder, view=name)
+    check_memory(layout, names, factor=downscale, at_once=_THREADS, limit=memory)
 
     stored = read_views(layout, names, model, downscale=downscale, transfer=transfer, reporter=reporter)
     for item in stored.data:
         files.digests.update(item.digests)
+    if all(item.invalid.all() for item in stored.data):
+        raise PolarguideError(
+            root / "invalid",
+            expected="at least one pixel that is not invalid",
+            found=f"none in {len(stored.data)} views",
+            remedy="White is invalid there: invert the pictures, or remove them.",
+        )
     posed_views = tuple(
         item.view(camera, stored.full_scale)
         for item, camera in zip(stored.data, stored.cameras, strict=True)
         if camera is not None
     )
+    told_apart = any(item.ground_truth and item.ground_truth.object_ids is not None for item in stored.data)
     warnings = [*layout.warnings, *model.warnings, *_pose_warnings(model, layout.names, stored.data)]
     return Scene(
         root=root,
@@ -109,6 +128,7 @@ def load_scene(
         transfer=transfer,
         digest=_digest_all(root, files),
         warnings=(*warnings, *_picture_warnings(stored, transfer)),
+        objects=objects_of(root / "scene.json", about) if told_apart else (),
     )
 
 
@@ -205,7 +225,30 @@ def _picture_warnings(stored: StoredViews, transfer: str) -> list[str]:
     blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in stored.data]
     largest = max(int(item.peak.max()) for item in stored.data)
     warnings = checks.exposure_warnings(names, stored.measures, blown, largest, stored.largest_value)
+    warnings += _odd_pictures(stored)
     return warnings + checks.polarization_warnings(names, stored.measures, transfer)
+
+
+def _odd_pictures(stored: StoredViews) -> list[str]:
+    """Warnings about black pictures, and about single gray pictures among those in color."""
+
+    def is_gray(picture: NDArray[np.uint16]) -> bool:
+        return bool(picture.any()) and bool((picture == picture[..., :1]).all())
+
+    count = len(stored.data)
+    # Views that are black altogether are counted by their exposure.
+    black = [item.name for item in stored.data if len({bool(picture.any()) for picture in item.codes}) > 1]
+    gray = [item.name for item in stored.data if any(map(is_gray, item.codes))]
+    warnings = []
+    if black:
+        warnings.append(
+            f"{len(black)} of {count} views have pictures that are black throughout ({listed(black)})."
+        )
+    if gray and len(gray) < count:
+        warnings.append(
+            f"{len(gray)} of {count} views have gray pictures among others in color ({listed(gray)})."
+        )
+    return warnings
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:

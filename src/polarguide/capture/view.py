@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
+from polarguide.capture.objects import SceneObject
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES as ANGLES
 
@@ -23,10 +24,11 @@ class GroundTruth:
 
     Attributes:
         normal: unit surface normals in the world, zero where there is no surface, [H, W, 3] float32.
-        depth: camera z in world units, [H, W] float32.
+        depth: camera z in world units, 0 where there is no surface or it is not known, [H, W] float32.
         mask: foreground, [H, W] bool.
         specular, diffuse: first-surface lobes as linear S0, in the exposure of the pictures, [H, W, 3]
             float32. Pictures are S0 / 2, so compare rendered layers with half of these.
+        object_ids: which object each pixel shows, as ``SceneObject.id``; 0 for none, or several, [H, W] int32.
     """
 
     normal: Tensor | None = None
@@ -34,6 +36,7 @@ class GroundTruth:
     mask: Tensor | None = None
     specular: Tensor | None = None
     diffuse: Tensor | None = None
+    object_ids: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,7 @@ class Scene:
         transfer: the assumed encoding of the files, "linear" or "srgb". The views are always linear.
         digest: SHA-256 over the names and contents of all files that were read, as hexadecimal digits.
         warnings: about possible faults that do not prevent the use of the scene.
+        objects: the objects that ``scene.json`` lists, if the ground truth of some view tells objects apart.
     """
 
     root: Path
@@ -108,6 +112,7 @@ class Scene:
     transfer: str
     digest: str
     warnings: tuple[str, ...]
+    objects: tuple[SceneObject, ...] = ()
 
     @property
     def train_views(self) -> tuple[View, ...]:

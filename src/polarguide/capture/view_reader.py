@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ class Files:
 
     def read_if_there(self, path: Path) -> bytes | None:
         """The bytes of a file, or None if there is no such file."""
-        return self.read(path) if path.exists() else None
+        return self.read(path) if os.path.lexists(path) else None  # a link to nowhere is no absence
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,12 @@ from numpy.typing import NDArray
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.files import make_folder, write_whole
 
+_PNG = (
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_ALL_FILTERS),
+    *(cv2.IMWRITE_PNG_COMPRESSION, 6),
+)
+"""The best filter of each row, by libpng's estimate: files of 0.5 to 0.85 of OpenCV's default."""
+
 
 def intensity_codes(intensities: NDArray[np.float32], invalid: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Linear intensities [4, H, W, 3] in [0, 1] as 16-bit codes.
@@ -39,7 +45,8 @@ def write_view(
     Args:
         root: the scene folder.
         view: name of the view.
-        codes: linear 16-bit codes at 0, 45, 90 and 135 degrees, [4, H, W, 3] RGB.
+        codes: linear 16-bit codes at 0, 45, 90 and 135 degrees, [4, H, W, 3] RGB. Where the channels are equal, as
+            those of a monochrome sensor are, one is written.
         invalid: unusable pixels, [H, W].
         mask: object mask, [H, W].
 
@@ -49,6 +56,8 @@ def write_view(
     Raises:
         PolarguideError: a file cannot be written.
     """
+    if (codes == codes[..., :1]).all():
+        codes = codes[..., 0]
     files: dict[str, NDArray[Any]] = {
         picture_name(view, angle): picture for angle, picture in zip(ANGLES, codes, strict=True)
     }
@@ -69,7 +78,7 @@ def write_png(path: Path, pixels: NDArray[Any]) -> int:
         PolarguideError: the file cannot be written.
     """
     stored = pixels[..., ::-1] if pixels.ndim == 3 else pixels
-    done, data = cv2.imencode(".png", np.ascontiguousarray(stored))
+    done, data = cv2.imencode(".png", np.ascontiguousarray(stored), _PNG)
     if not done:
         raise OSError(f"{path}: the picture cannot be encoded")
     make_folder(path.parent)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import importlib
 import sys
 from collections.abc import Callable, Sequence
@@ -29,6 +30,7 @@ VERBS = {
     "compare": "compare",
     "ablate": "ablate",
     "synth": "synth",
+    "bench": "bench",
 }
 """The module of each verb, whose function has the module's name. None of them imports torch before it is called."""
 DESCRIPTION = (
@@ -86,10 +88,32 @@ def _call(verb: str | None, arguments: Sequence[str]) -> None:
     if verb is not None:
         tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=arguments[1:])
         return
+    if arguments and not arguments[0].startswith("-"):
+        raise PolarguideError(
+            arguments[0],
+            expected=f"a verb: {', '.join(VERBS)}",
+            found="none of them",
+            remedy=_near(arguments[0]) or "polarguide --help says what they do.",
+        )
     verbs = {name: function_of(name) for name in VERBS}
     tyro.extras.subcommand_cli_from_dict(
         verbs, prog="polarguide", description=DESCRIPTION, args=arguments, sort_subcommands=False
     )
+
+
+def _near(word: str) -> str:
+    """A hint for a word that is nearly a verb; also for what other programs call it."""
+    others = {
+        "evaluate": "eval",
+        "test": "eval",
+        "viewer": "view",
+        "web": "share",
+        "new": "demo",
+        "check": "inspect",
+    }
+    near = difflib.get_close_matches(word.lower(), VERBS, 1, 0.6)
+    verb = others.get(word.lower()) or (near[0] if near else "")
+    return f"Perhaps polarguide {verb} is meant." if verb else ""
 
 
 def _as_flag(error: PolarguideError, verb: str | None) -> str:

@@ -37,6 +37,7 @@ def demo(
         evaluate(out, compute=ComputeOptions(machine.threads))
         render(out)
     console.print(
-        f"look at {out / 'render' / 'contact_sheet.png'}: rows are rendered and true pictures, columns are layers"
+        f"look at {out / 'render' / 'contact_sheet.png'}: rows are views, columns are layers, each beside the true "
+        "one if it is known"
     )
     console.print(f"look around: polarguide view {out}")

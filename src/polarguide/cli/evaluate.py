@@ -19,7 +19,7 @@ def evaluate(
     speed: bool = True,
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
-    """Score a run on its test views and write RUN/metrics.json.
+    """Score a run on its test views and write RUN/metrics.json, and RUN/errors.png, where the errors are.
 
     Args:
         run: Run folder.
@@ -31,7 +31,34 @@ def evaluate(
         f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
     )
     console.print(_table(record, title))
+    if record["objects"]:
+        console.print(_errors(record))
+    sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE
     console.print(f"metrics: {run / 'metrics.json'}")
+    console.print(f"where the errors are: {run / sheet}")
+
+
+def _errors(record: dict[str, Any]) -> Table:
+    """Errors by object and by material, over the pixels of all test views."""
+    known = importlib.import_module("polarguide.evaluation.table")
+    columns = [metric for metric in known.METRICS if metric.key in known.OBJECT_METRICS]
+    table = Table(title="by object and material, over the pixels of all test views")
+    table.add_column("object", no_wrap=True)
+    table.add_column("pixels", justify="right", no_wrap=True)
+    for metric in columns:
+        table.add_column(metric.heading, justify="right", min_width=8)
+
+    def add(name: str, errors: dict[str, Any]) -> None:
+        values = [errors[metric.key] for metric in columns]
+        texts = ["n/a" if v is None else f"{v:.{m.digits}f}" for m, v in zip(columns, values, strict=True)]
+        table.add_row(name, f"{errors['pixels']:,}", *texts)
+
+    for name, errors in record["objects"].items():
+        add(name, errors)
+    table.add_section()
+    for kind, errors in record["materials"].items():
+        add(f"all {kind}", errors)
+    return table
 
 
 def _table(record: dict[str, Any], title: str) -> Table:

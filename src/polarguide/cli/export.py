@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from polarguide.cli.console import console
 from polarguide.cli.runs import RunFolder, opened
-from polarguide.options import ExportFormat, ThreadOptions
+from polarguide.errors import require_package
+from polarguide.options import EXPORT_PACKAGES, ExportFormat, ThreadOptions
 
 
 def export(
@@ -16,6 +18,7 @@ def export(
     format: ExportFormat,
     out: Path | None = None,
     resolution: int = 192,
+    spz_version: Literal[3, 4] = 3,
     machine: ThreadOptions = ThreadOptions(),
 ) -> None:
     """Write a run as the files of other programs.
@@ -29,8 +32,13 @@ def export(
         format: ply, spz, sog, mesh, points, environment or cameras.
         out: Folder to write; RUN/export by default.
         resolution: Voxels of the mesh along its longest side.
+        spz_version: Version of the SPZ file; readers are split between the two.
     """
+    for package in EXPORT_PACKAGES.get(format, ()):
+        require_package(package, f"--format {format}")
     trained, reporter = opened(run, machine)
-    for path in trained.export(format, out, resolution=resolution, reporter=reporter):
+    for path in trained.export(
+        format, out, resolution=resolution, spz_version=spz_version, reporter=reporter
+    ):
         size = f" ({path.stat().st_size / 1e6:.1f} MB)" if path.is_file() else ""
         console.print(f"{format}: {path}{size}", markup=False)

@@ -13,7 +13,7 @@ from polarguide.cli.progress import ConsoleReporter
 from polarguide.inspection.settings import InspectSettings
 from polarguide.options import ComputeOptions
 
-COLORS = {"ok": "green", "warning": "yellow", "wrong": "bold red", "n/a": "dim"}
+COLORS = {"ok": "green", "warning": "yellow", "wrong": "bold red", "n/a": "dim", "not verified": "magenta"}
 
 
 def inspect(
@@ -46,6 +46,7 @@ def inspect(
     )
     _print_checks(found.checks)
     _print_angles(found.angles)
+    _print_verdict(found)
     console.print(f"page: {page}   figures: {record}", markup=False)
     if fix is not None:
         _fix(found, fix, reporter)
@@ -63,11 +64,21 @@ def _fix(found: Any, out: Path, reporter: ConsoleReporter) -> None:
 
 
 def _print_checks(checks: Any) -> None:
+    said = ""
     for check in checks:
-        console.print(f"[{COLORS[check.verdict]}]{check.verdict:>7}[/]  ", end="")
+        console.print(f"[{COLORS[check.verdict]}]{check.verdict:>12}[/]  ", end="")
         console.print(f"{check.title}: {check.finding}", markup=False)
-        if check.remedy and check.verdict != "ok":
-            console.print(f"         {check.remedy}", markup=False)
+        if check.remedy not in ("", said) and check.verdict != "ok":
+            said = check.remedy
+            console.print(f"{'':14}{check.remedy}", markup=False)
+
+
+def _print_verdict(found: Any) -> None:
+    """The worst of all checks, and what nobody has verified."""
+    open_ = [check.title.lower() for check in found.checks if check.verdict == "not verified"]
+    beside = f"; not verified: {', '.join(open_)}" if open_ and found.verdict != "not verified" else ""
+    beside = f": {', '.join(open_)}" if found.verdict == "not verified" else beside
+    console.print(f"verdict: [{COLORS[found.verdict]}]{found.verdict}[/]{beside}")
 
 
 def _print_angles(angles: Any) -> None:

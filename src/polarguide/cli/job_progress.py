@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from polarguide.cli.progress import ConsoleReporter, bars
+from polarguide.cli.console import console
+from polarguide.cli.progress import ConsoleReporter, bars, lines
 from polarguide.progress import Advance
 
 # Trainings log every tenth step and recipes differ in speed: a long memory keeps the time left from jumping.
@@ -22,6 +23,10 @@ class JobReporter(ConsoleReporter):
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
         """A progress bar below those that are open already."""
+        if not console.is_terminal:
+            with lines(label, total) as tell:
+                yield tell
+            return
         if not self._open:
             self._progress.start()
         self._open += 1

@@ -1,28 +1,77 @@
-"""Messages and progress bars on the console."""
+"""Messages and progress on the console: bars on a terminal, a line every so often anywhere else."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 from polarguide.cli.console import console, warn
 from polarguide.progress import Advance, Reporter
 
+LINE_SECONDS = 15.0
+"""Between two lines of progress where there is no terminal."""
+
 
 def bars(memory_seconds: float = 30.0) -> Progress:
-    """A display of progress bars; the time left follows from the speed of the last seconds."""
+    """A display of progress bars; the time left follows from the speed of the last seconds.
+
+    Step, total and time left are always shown; label and note share what room is left, and are cut.
+    """
+    label = Column(no_wrap=True, overflow="ellipsis", max_width=26)
+    note = Column(no_wrap=True, overflow="ellipsis", ratio=1)
     return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False, table_column=label),
+        BarColumn(bar_width=10),
+        MofNCompleteColumn(table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+        TextColumn("{task.fields[note]}", markup=False, table_column=note),
         console=console,
         transient=True,
+        expand=True,
         speed_estimate_period=memory_seconds,
-    )
+    )  # fmt: skip
+
+
+class Lines:
+    """Progress of one piece of work as lines, for logs: not more often than every ``LINE_SECONDS``."""
+
+    def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
+        self._label, self._total, self._clock = label, total, clock
+        self._begin = self._last = clock()
+        self._first: int | None = None
+        self._line = ""
+
+    def __call__(self, done: int, *, total: int | None = None, note: str = "") -> None:
+        """See ``progress.Advance``."""
+        now = self._clock()
+        self._total = total or self._total
+        if self._first is None:
+            # A training that goes on does not begin at 0: the speed is that of this call.
+            self._first, self._begin = done, now
+        finished = self._total is not None and done >= self._total
+        left = ""
+        if self._total is not None and done > self._first and not finished:
+            seconds = round((now - self._begin) * (self._total - done) / (done - self._first))
+            left = f", {seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d} left"
+        of = "" if self._total is None else f"/{self._total}"
+        self._line = f"{self._label} {done}{of}{left}" + (f"  {note}" if note else "")
+        if now - self._last >= LINE_SECONDS:
+            self._last = now
+            self._print()
+
+    def close(self, *, last: bool) -> None:
+        """Print the last state if it stays on a terminal, too."""
+        if last:
+            self._print()
+
+    def _print(self) -> None:
+        if self._line:
+            console.print(self._line, markup=False)
+            self._line = ""
 
 
 class ConsoleReporter(Reporter):
@@ -38,15 +87,33 @@ class ConsoleReporter(Reporter):
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
-        """A progress bar."""
+        """A progress bar, or lines where there is no terminal."""
+        if not console.is_terminal:
+            with lines(label, total) as tell:
+                yield tell
+            return
         with bars() as progress:
             task = progress.add_task(label, total=total, note="")
 
             def advance(done: int, *, total: int | None = None, note: str = "") -> None:
                 progress.live.transient = not note
-                # A note needs the room of the label, and says as much.
-                progress.update(
-                    task, completed=done, total=total, note=note, description="" if note else label
-                )
+                progress.update(task, completed=done, total=total, note=note)
 
             yield advance
+
+
+@contextlib.contextmanager
+def lines(label: str, total: int | None) -> Iterator[Advance]:
+    """Progress as lines; the last one is printed where the work had a note."""
+    told = Lines(label, total)
+    noted = False
+
+    def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+        nonlocal noted
+        noted = bool(note)
+        told(done, total=total, note=note)
+
+    try:
+        yield advance
+    finally:
+        told.close(last=noted)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from polarguide.cli.console import console
 from polarguide.cli.runs import RunFolder, opened
-from polarguide.errors import PolarguideError
-from polarguide.options import ComputeOptions
+from polarguide.errors import PolarguideError, require_package
+from polarguide.options import ComputeOptions, PictureFormat, check_range
 
 
 def render(
@@ -19,6 +19,7 @@ def render(
     path: str = "",
     frames: int = 120,
     video: Path | None = None,
+    format: PictureFormat = "png",
     environment: Path | None = None,
     rotate_environment: float = 0.0,
     out: Path | None = None,
@@ -36,6 +37,8 @@ def render(
         path: In place of views: orbit, spiral, interpolate (through the photographs), or a JSON file of cameras.
         frames: Pictures along the path (a file has its own).
         video: MP4 file to write of the path, layers side by side; PNG files if not given.
+        format: Of the layers of views: png as a display shows them, or exr and npy with the linear numbers, whose units
+            layers.json states. The contact sheet is PNG.
         environment: Panorama of linear radiance (.hdr, .exr) to be reflected in place of the learned environment.
         rotate_environment: Degrees by which to turn the environment, counter-clockwise seen from above.
         out: Folder to write; RUN/render by default.
@@ -47,6 +50,17 @@ def render(
             found=f"{video} and {path or 'no path'}",
             remedy="Write for example --path orbit --video film.mp4.",
         )
+    check_range("frames", frames, 1, 100_000)
+    if video is not None:
+        require_package("imageio_ffmpeg", "--video")
+    if environment is not None and environment.suffix.lower() == ".exr":
+        require_package("OpenEXR", str(environment))
+    if format == "exr":
+        require_package("OpenEXR", "--format exr")
+    if path and format != "png":
+        raise PolarguideError(
+            "format", expected="png along a --path", found=format, remedy="Name views in place of a path."
+        )
     names = [name.strip() for name in layers.split(",") if name.strip()]
     trained, reporter = opened(run, compute)
     trained.relight(environment, rotate_environment, reporter=reporter)
@@ -55,5 +69,5 @@ def render(
             video or out or run / "render", path=path, layers=names, frames=frames, reporter=reporter
         )
         return
-    sheet = trained.write_pictures(out, views=views, layers=names, reporter=reporter)
+    sheet = trained.write_pictures(out, views=views, layers=names, format=format, reporter=reporter)
     console.print(f"pictures: {sheet.parent}   contact sheet: {sheet}")

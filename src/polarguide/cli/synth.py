@@ -24,13 +24,13 @@ def synth(
     overrides: Annotated[Overrides, tyro.conf.arg(name="")],
     compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """Render a polarized scene with ground truth: figure, kit, car, cup, water, proof, or a scene file.
+    """Render a polarized scene with ground truth: a preset (figure, kit, car, cup, water, proof, ...) or a scene file.
 
     Needs the extra polarguide[synth]. A rendering that was stopped goes on with the same command.
     docs/reference/scene-files.md describes scene files and what is written.
 
     Args:
-        scene: Name of a preset, or path of a scene file in JSON.
+        scene: Name of a preset (docs/how-to/synthesize.md lists them), or path of a scene file in JSON.
         out: Scene folder to write.
         sweep: A family of scenes, such as views=9,18,36,63 or noise=0,1,2,4; also roughness, index and spacing.
     """

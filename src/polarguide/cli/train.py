@@ -29,7 +29,7 @@ def train(
     """Train a recipe on a scene.
 
     Can be stopped with Ctrl-C at any time: the state is saved, and --resume goes on to the same result. Several
-    processes share the views of each step: torchrun --nproc-per-node N -m polarguide train ...
+    processes share the views of each step: torchrun --nproc-per-node N --no-python polarguide train ...
 
     Args:
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP

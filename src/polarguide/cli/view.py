@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from polarguide.cli.runs import RunFolder, opened
-from polarguide.options import LOOPBACK, ComputeOptions
+from polarguide.errors import PolarguideError, require_package
+from polarguide.options import LOOPBACK, ComputeOptions, VisitorOptions
 
 
 def view(
@@ -12,6 +13,7 @@ def view(
     *,
     host: str = LOOPBACK[0],
     port: int = 8080,
+    visitors: VisitorOptions = VisitorOptions(),
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
     """Look at a run in a browser: its layers from any side, beside the photographs. Ctrl-C ends it.
@@ -21,5 +23,14 @@ def view(
         host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
         port: To listen at; the next free one is taken if it is in use.
     """
+    if run.is_file():
+        raise PolarguideError(
+            run,
+            expected="a run folder: what train wrote under --out, with run.json in it",
+            found=f"a file ({run.suffix or 'without a suffix'})",
+            remedy=f"polarguide view {run.parent} if it lies in one. Files of Gaussians alone, without the light that "
+            "they reflect, are for other viewers (SuperSplat).",
+        )
+    require_package("viser", "the viewer", install="'viser==1.1.*'")
     trained, reporter = opened(run, compute)
-    trained.view(host=host, port=port, reporter=reporter)
+    trained.view(host=host, port=port, visitors=visitors, reporter=reporter)

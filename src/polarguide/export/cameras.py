@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.files import write_text
+from polarguide.files import atomic_folder, write_text
 
 # nerfstudio's cameras look along -z with y up: OpenGL's axes, not OpenCV's.
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
@@ -40,8 +40,25 @@ def write_colmap(
         model.add_image_with_trivial_frame(image, pose)
     for place, color in zip(points.double().numpy(), colors.numpy().astype(np.uint8), strict=True):
         model.add_point3D(place, pycolmap.Track(), color)
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_text(str(folder))
+    with atomic_folder(folder) as temporary:
+        model.write_text(str(temporary))
+        _require_whole(temporary, len(cameras), len(points))
+
+
+def _require_whole(folder: Path, images: int, points: int) -> None:
+    """Read a model back: pycolmap does not say where the disk was full.
+
+    Raises:
+        OSError: it is not whole.
+    """
+    try:
+        model = pycolmap.Reconstruction()
+        model.read_text(str(folder))
+        whole = (len(model.images), len(model.points3D)) == (images, points)
+    except Exception:  # whatever C++ threw
+        whole = False
+    if not whole:
+        raise OSError("a file that was cut short, as on a full disk")
 
 
 def transforms(cameras: Mapping[str, Camera], suffix: str = ".png") -> dict[str, Any]:

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
+from polarguide.capture import read_model
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.evaluation.table import shown_metrics
 from polarguide.export.cameras import write_colmap, write_transforms
-from polarguide.export.mesh import scene_mesh, write_mesh
+from polarguide.export.mesh import write_mesh
 from polarguide.export.points import surface_points, write_points
 from polarguide.export.share import share_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
-from polarguide.files import make_folder, write_text
+from polarguide.files import make_folder, temporary_folder, write_text
 from polarguide.options import ExportFormat, PathLike, check_choice, check_range
 from polarguide.progress import SILENT, Reporter
+from polarguide.rendering.mesh import RESOLUTION, scene_mesh
 from polarguide.rendering.relight import needs_radiance, panorama, write_exr
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.point_cloud import write_run_ply
@@ -32,7 +37,8 @@ def export(
     format: ExportFormat,
     out: PathLike | None = None,
     *,
-    resolution: int = 192,
+    resolution: int = RESOLUTION,
+    spz_version: int = 3,
     reporter: Reporter = SILENT,
 ) -> list[Path]:
     """Write a run as the files of other programs.
@@ -45,6 +51,7 @@ def export(
             transforms.json.
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
+        spz_version: of the SPZ file, 3 or 4; readers are split between them.
         reporter: told how far it is.
 
     Returns:
@@ -56,7 +63,7 @@ def export(
     folder = run.folder / "export" if out is None else Path(out)
     writers: dict[str, Callable[[], list[Path]]] = {
         "ply": lambda: [_ply(run, folder / "splats.ply")],
-        "spz": lambda: [_compressed(run, folder / "splats.spz", write_spz)],
+        "spz": lambda: [_compressed(run, folder / "splats.spz", partial(write_spz, version=spz_version))],
         "sog": lambda: [_compressed(run, folder / "splats.sog", write_sog)],
         "mesh": lambda: _mesh(run, folder, resolution, reporter),
         "points": lambda: _points(run, folder),
@@ -65,6 +72,7 @@ def export(
     }
     check_choice("format", format, writers)
     check_range("resolution", resolution, 16, 1024)
+    check_range("spz_version", spz_version, 3, 4)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return writers[format]()
@@ -114,14 +122,23 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
 
 
 def _ply(run: OpenedRun, path: Path) -> Path:
-    write_run_ply(path, run.model.state, run.model.shading)
+    write_run_ply(path, run.model.state, run.model.shading, _camera_centers(run))
     return path
+
+
+def _camera_centers(run: OpenedRun) -> Tensor | None:
+    """Centers of the scene's cameras [M, 3], which tell on what side surfaces are seen; None if it is not there."""
+    try:
+        model = read_model(Path(run.configuration.scene))
+        return torch.stack([model.camera(name).center for name in model.names])
+    except PolarguideError:
+        return None
 
 
 def _compressed(run: OpenedRun, path: Path, write: Callable[[Path, Path], None]) -> Path:
     """From a PLY that is gone afterwards."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".ply-") as place:
-        write(path, _ply(run, Path(place) / "splats.ply"))
+    with temporary_folder(path.with_suffix(".ply")) as place:
+        write(path, _ply(run, place / "splats.ply"))
     return path
 
 

@@ -1,100 +1,17 @@
-"""A trained scene as a triangle mesh with the normals and the diffuse colors that were learned."""
+"""A trained scene's mesh as files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.color import srgb_encode
 from polarguide.errors import optional_import
-from polarguide.export.fusion import TRUNCATION, Box, Surface, box_around, fuse, seen_points, surface_of
 from polarguide.files import write_whole
-from polarguide.scene_frame import SceneFrame, scene_frame
-from polarguide.shading.result import RenderResult
-from polarguide.shading.visibility import seen_at
-from polarguide.vectors import dot, unit
-
-OPAQUE = 0.8
-# Pixels whose surface is seen at a flatter angle than this cosine do not give depth.
-_STEEPEST = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class ColoredMesh:
-    """A mesh with linear diffuse colors [V, 3] in [0, 1]."""
-
-    surface: Surface
-    colors: NDArray[np.float64]
-
-
-@torch.no_grad()
-def scene_mesh(
-    cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
-) -> ColoredMesh:
-    """Fuse the depth that a scene's cameras see.
-
-    Args:
-        cameras: at least two. render: gives a view with depth and normals.
-        resolution: voxels along the longest side of what the cameras see.
-
-    Raises:
-        PolarguideError: there is no surface, or a library is missing.
-    """
-    optional_import("skimage.measure", "--format mesh")
-    views = [(camera, _kept(render(camera), camera)) for camera in cameras.values()]
-    around = scene_frame(list(cameras.values()))
-    points = [seen_points(camera, seen.depth, seen.mask) for camera, seen in views]
-    box = box_around(points, around.center, around.distance, resolution)
-    field, weight = fuse(box, ((camera, seen.depth, seen.mask) for camera, seen in views))
-    return painted(surface_of(box, field, weight), views, box)
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """Of one view: depth [H, W], where it counts [H, W], diffuse color and world normal [H, W, 3]."""
-
-    depth: Tensor
-    mask: Tensor
-    diffuse: Tensor
-    normal: Tensor
-
-
-def _kept(result: RenderResult, camera: Camera) -> Seen:
-    assert result.depth is not None
-    assert result.normal is not None
-    normal = unit(result.normal, 1e-3)
-    cosine = -dot(camera.world_rays(), normal)
-    diffuse = result.base if result.diffuse is None else result.diffuse
-    return Seen(result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse, normal)
-
-
-def painted(surface: Surface, views: list[tuple[Camera, Seen]], box: Box) -> ColoredMesh:
-    """Colors and normals of the views that see each vertex, weighted by how squarely they do."""
-    vertices = torch.from_numpy(surface.vertices)
-    own = torch.from_numpy(surface.normals)
-    color, normal = torch.zeros_like(vertices), torch.zeros_like(vertices)
-    total = torch.zeros(len(vertices), dtype=torch.float64)
-    for camera, seen in views:
-        pixel, z, inside = seen_at(vertices - camera.center, camera)
-        near = (seen.depth[pixel] - z).abs() < TRUNCATION * box.size
-        squarely = dot(unit(camera.center - vertices), own).clamp(min=0)
-        weight = (inside & near & seen.mask[pixel]) * squarely
-        color += weight[:, None] * seen.diffuse[pixel]
-        normal += weight[:, None] * seen.normal[pixel]
-        total += weight
-    # What no view sees squarely keeps the normal of its surface, and the color gray.
-    learned = unit(normal, 1e-9)
-    agrees = (total > 0) & (dot(learned, own) > 0)
-    normals = torch.where(agrees[:, None], learned, own)
-    colors = torch.where((total > 0)[:, None], color / total.clamp(min=1e-9)[:, None], 0.2)
-    return ColoredMesh(Surface(surface.vertices, surface.faces, normals.numpy()), colors.clamp(0, 1).numpy())
+from polarguide.rendering.mesh import ColoredMesh
+from polarguide.scene_frame import SceneFrame
 
 
 def write_mesh(path: Path, mesh: ColoredMesh, around: SceneFrame) -> None:

@@ -14,20 +14,20 @@ from polarguide.gaussians.ply import read_ply, write_ply
 _HALF_TURN_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 
 
-def write_spz(path: Path, ply: Path) -> None:
+def write_spz(path: Path, ply: Path, version: int = 3) -> None:
     """Convert a PLY of Gaussians; our own fields in it are left out, as the format has no place for them.
 
     SPZ is in its own axes (right, up, back), so half a turn about x from ours; readers turn it back. Positions in it
     are multiples of 1/4096 of the world's unit; colors and scales keep 8 bits, harmonics 5 or 4.
 
     Args:
-        path: the file to write. ply: as ``write_run_ply`` writes it.
+        path: the file to write. ply: as ``write_run_ply`` writes it. version: 3, or 4 (zstd in place of gzip).
 
     Raises:
         PolarguideError: the converter is not installed, or refuses.
     """
     converter = optional_import("gaussforge", "--format spz").GaussForge()
-    converted = converter.convert(_half_turned(ply).read_bytes(), "ply", "spz")
+    converted = converter.convert(_half_turned(ply).read_bytes(), "ply", "spz", spz_version=version)
     if "error" in converted:
         raise PolarguideError(
             ply,

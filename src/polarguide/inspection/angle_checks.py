@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from polarguide.capture.calibration import Calibration, combined
 from polarguide.inspection.likelihood import Evidence, OrderPosterior, combine, posterior
 from polarguide.inspection.orders import IDENTITY, ORDERS, PAIRINGS, FileOrder, Order, swaps
 from polarguide.inspection.verdict import Check, Verdict
@@ -18,6 +19,7 @@ ZERO_OFF = 3.0
 ZERO_UNSURE = 3.0
 """Standard error in degrees above which a zero offset gets no verdict."""
 FIX = "Write a corrected scene with --fix FOLDER"
+UNVERIFIED: Verdict = "not verified"
 
 
 @dataclass(frozen=True)
@@ -42,11 +44,27 @@ class AngleFindings:
     Attributes:
         pairing: index into ``PAIRINGS``, from the pair sums. sources: the evidence.
         posterior: of all usable evidence together; None if there is none.
+        applied: what ``prepare`` took the angles for; None for a scene of another origin.
     """
 
     pairing: int
     sources: tuple[Evidence, ...]
     posterior: OrderPosterior | None
+    applied: Calibration | None = None
+
+    def correction(self, offset: float) -> str:
+        """What to do about a decided order and an offset beside it: the whole calibration, not the difference."""
+        if self.files is None:
+            return ""
+        if self.applied is None:
+            return f"{FIX}."
+        whole = combined(self.applied, Calibration(order=self.files, zero=round(offset, 1)))
+        if whole is None:
+            return f"{FIX}."
+        return (
+            f"{FIX}, or repeat prepare with {whole.options()} and a new --out. That is the whole calibration; the "
+            f"scene was prepared with {self.applied.options()}."
+        )
 
     @property
     def order(self) -> Order | None:
@@ -103,17 +121,21 @@ class AngleFindings:
         }
 
 
-def combine_evidence(sources: Sequence[Evidence], pairing: int) -> AngleFindings:
-    """Combine the usable sources of evidence."""
+def combine_evidence(
+    sources: Sequence[Evidence], pairing: int, applied: Calibration | None = None
+) -> AngleFindings:
+    """Combine the usable sources of evidence; ``applied`` as in ``AngleFindings``."""
     usable = [posterior(evidence) for evidence in sources if evidence.usable]
-    return AngleFindings(pairing, tuple(sources), combine(usable) if usable else None)
+    return AngleFindings(pairing, tuple(sources), combine(usable) if usable else None, applied)
 
 
 def order_check(angles: AngleFindings) -> Check:
     """Check whether the pictures are named by their true angles."""
     key, title = "angle_order", "Order of the angles"
     if angles.posterior is None:
-        return Check(key, title, "n/a", _no_evidence(angles), _more_evidence(angles), figures=angles.record())
+        return Check(
+            key, title, UNVERIFIED, _no_evidence(angles), _more_evidence(angles), figures=angles.record()
+        )
     best = angles.posterior.best
     probability = angles.posterior.probabilities[best]
     files = ORDERS[best].files(PAIRINGS[angles.pairing])
@@ -129,10 +151,9 @@ def order_check(angles: AngleFindings) -> Check:
     if files == PAIRINGS[0]:
         said = f"The file names are right with a probability of {probability:.1%}."
         return Check(key, title, "ok", said, figures=angles.record())
-    order = ",".join(map(str, files))
     return Check(
         key, title, "wrong", f"With a probability of {probability:.1%} {swaps(files)}.",
-        f"{FIX}, or repeat prepare with --order {order}.", figures=angles.record(),
+        angles.correction(angles.offset or 0.0), figures=angles.record(),
     )  # fmt: skip
 
 
@@ -140,7 +161,7 @@ def handedness_check(angles: AngleFindings) -> Check:
     """Check whether the angles increase counter-clockwise as displayed."""
     key, title = "handedness", "Sense of the angles"
     if angles.posterior is None:
-        return Check(key, title, "n/a", _no_evidence(angles), _more_evidence(angles))
+        return Check(key, title, UNVERIFIED, _no_evidence(angles), _more_evidence(angles))
     probability = angles.posterior.sense_probability
     figures = {"counter_clockwise": probability}
     if max(probability, 1 - probability) < DECIDED:
@@ -152,7 +173,7 @@ def handedness_check(angles: AngleFindings) -> Check:
     return Check(
         key, title, "wrong", f"Clockwise as displayed, with a probability of {1 - probability:.1%}: clockwise angles, "
         "a mirrored picture and two exchanged files look the same.",
-        f"{FIX}, or repeat prepare with --sense cw (or the --order named above).", figures=figures,
+        angles.correction(angles.offset or 0.0) or _more_evidence(angles), figures=figures,
     )  # fmt: skip
 
 
@@ -160,7 +181,7 @@ def zero_check(angles: AngleFindings) -> Check:
     """Check whether the zero of the angles is the image's horizontal."""
     key, title = "zero_offset", "Zero of the angles"
     if angles.posterior is None:
-        return Check(key, title, "n/a", _no_evidence(angles), _more_evidence(angles))
+        return Check(key, title, UNVERIFIED, _no_evidence(angles), _more_evidence(angles))
     offset, error = angles.posterior.offset, angles.posterior.offset_error
     figures = {"offset_degrees": offset, "error_degrees": error}
     if not math.isfinite(error) or error > ZERO_UNSURE:
@@ -172,7 +193,7 @@ def zero_check(angles: AngleFindings) -> Check:
     remedy = ""
     if abs(offset) > max(ZERO_OFF / 2, 3 * error):
         verdict = "wrong" if angles.offset is not None else "warning"
-        remedy = f"{FIX}, or repeat prepare with --zero {offset:.1f}."
+        remedy = angles.correction(offset) or _more_evidence(angles)
     return Check(key, title, verdict, said, remedy, figures=figures)
 
 

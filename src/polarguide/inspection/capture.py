@@ -13,10 +13,11 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import checks
+from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.formats.pictures import decode_picture, read_file
 from polarguide.capture.layout import Layout, find_layout, select_views
-from polarguide.capture.metadata import refractive_index_of
+from polarguide.capture.metadata import applied_calibration, refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
 from polarguide.progress import SILENT, Reporter
@@ -33,6 +34,7 @@ class InspectedView:
         name: of the view.
         codes: linear intensities as in ``View.codes``, [4, H, W, 3] uint16.
         invalid, saturated: as in ``View``, [H, W] bool.
+        black: pixels that are 0 in all angles; they count as ``saturated``, too.
         camera: at the size of ``codes``, or None.
         measures: what ``capture.checks`` measures on them.
         peak: largest stored value.
@@ -42,6 +44,7 @@ class InspectedView:
     codes: Tensor
     invalid: Tensor
     saturated: Tensor
+    black: Tensor
     camera: Camera | None
     measures: checks.Measures
     peak: int
@@ -65,6 +68,7 @@ class Capture:
         views: all views, sorted by name.
         model: its COLMAP model, or None.
         refractive_index: as ``scene.json`` gives it, or None.
+        applied: order, sense and zero that ``prepare`` made the pictures with; None for a scene of another origin.
         factor: side of the averaged pixel boxes. transfer: how the files were read.
         bits: of the files. size: width and height of the pictures as stored.
         digest: SHA-256 over the stored pictures.
@@ -76,6 +80,7 @@ class Capture:
     views: tuple[InspectedView, ...]
     model: ColmapModel | None
     refractive_index: float | None
+    applied: Calibration | None
     factor: int
     transfer: str
     bits: int
@@ -112,7 +117,7 @@ def read_capture(
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
-    index = refractive_index_of(metadata, read_file(metadata) if metadata.exists() else None)
+    said = read_file(metadata) if metadata.exists() else None
     factor = downscale or _fitting_factor(layout, names[0])
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())
@@ -122,7 +127,8 @@ def read_capture(
         layout=layout,
         views=tuple(_inspected(stored, number) for number in range(len(names))),
         model=model,
-        refractive_index=index,
+        refractive_index=refractive_index_of(metadata, said),
+        applied=applied_calibration(metadata, said),
         factor=factor,
         transfer=transfer,
         bits=8 if stored.largest_value == 255 else 16,
@@ -144,6 +150,7 @@ def _inspected(stored: StoredViews, number: int) -> InspectedView:
         codes=torch.from_numpy(item.codes),
         invalid=torch.from_numpy(item.invalid),
         saturated=torch.from_numpy(item.saturated(stored.full_scale)),
+        black=torch.from_numpy(item.black),
         camera=stored.cameras[number],
         measures=stored.measures[number],
         peak=int(item.peak.max()),

@@ -98,6 +98,7 @@ def _write(capture: Capture, change: Calibration, folder: Path, reporter: Report
     (folder / "polar").mkdir(parents=True)
     for name in COPIED:
         source = capture.root / name
+        _require_inside(capture.root, source)
         if source.is_dir():
             shutil.copytree(source, folder / name)
         elif source.exists():
@@ -110,6 +111,23 @@ def _write(capture: Capture, change: Calibration, folder: Path, reporter: Report
                 _rename_view(capture, change.order, folder, view)
             advance(done)
     write_whole(folder / METADATA, _corrected_metadata(capture, change))
+
+
+def _require_inside(root: Path, source: Path) -> None:
+    """Refuse links that leave the scene: what they point to is none of its files, and would be copied for others.
+
+    Raises:
+        PolarguideError: there is one.
+    """
+    whole = root.resolve()
+    for path in (source, *(source.rglob("*") if source.is_dir() else ())):
+        if path.exists() and not path.resolve().is_relative_to(whole):
+            raise PolarguideError(
+                path,
+                expected="a file of the scene",
+                found=f"a link to {path.resolve()}",
+                remedy="Copy into the scene what it points to, or remove it; nothing was written.",
+            )
 
 
 def _rename_view(capture: Capture, order: FileOrder, folder: Path, view: str) -> None:

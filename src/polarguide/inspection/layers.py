@@ -46,7 +46,7 @@ LAYERS: tuple[Layer, ...] = (
     Layer("dolp", "DoLP", f"0 to {DOLP_HIGH:g}", "inferno", lambda r: f"median {r.dolp[0]:.3f}, 99 % {r.dolp[1]:.2f}"),
     Layer("aolp", "AoLP", f"Angle of the field by color; dark where the DoLP is below {AOLP_FULL_DOLP:g}.", None,
           lambda r: f"{r.polarized:.0%} polarized"),
-    Layer("saturation", "Saturation", "Red: one angle at full scale, or all black. Blue: marked invalid.", None,
+    Layer("saturation", "Saturation", "Red: one angle at full scale. Blue: marked invalid, or black.", None,
           lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
     Layer("noise", "Noise", f"Of one intensity relative to the photograph: 0 to {NOISE_HIGH:.0%}", "viridis",
           lambda r: f"median {r.noise_share:.2%}"),
@@ -78,7 +78,10 @@ def layer_uris(view: InspectedView) -> dict[str, str]:
 def _marked(shown: Picture, view: InspectedView) -> Picture:
     """The photograph in dark gray, with saturated and invalid pixels in color."""
     dim = (shown.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
-    for mask, color in ((view.saturated, SATURATED_COLOR), (view.invalid, INVALID_COLOR)):
+    for mask, color in (
+        (view.black | view.invalid, INVALID_COLOR),
+        (view.saturated & ~view.black, SATURATED_COLOR),
+    ):
         dim[_dilated(mask).numpy()] = color
     return dim
 

@@ -25,8 +25,8 @@ class ViewMeasurements:
     Attributes:
         view: its name.
         bright: 99th percentile of the intensities, in [0, 1].
-        saturated, invalid, dark: shares of pixels with an angle at full scale (or black in all), marked invalid by
-            the capture, and darker than 1/256.
+        saturated, invalid, dark: shares of pixels with an angle at full scale, marked invalid by the capture though
+            they are not dark, and darker than 1/256.
         noise: median standard deviation of the noise of one intensity (mean over the colors), after averaging down.
         noise_share: the same, as a share of S0 / 2.
         pair_ratio: median of (I0 + I90) / (I45 + I135); None where too few pixels are bright enough.
@@ -68,8 +68,10 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     share = float(good.float().mean())
     noise = optics.intensity_noise(gray)
     bright = quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
-    saturated, invalid = (float(mask.float().mean()) for mask in (view.saturated, view.invalid))
-    nothing = ViewMeasurements(view.name, bright, saturated, invalid, float(dark.float().mean()))
+    # Black is no fault: prepare marks it invalid, because nothing can be read from it.
+    lost = (view.saturated & ~view.black, view.invalid & ~dark, dark)
+    saturated, invalid, black = (float(mask.float().mean()) for mask in lost)
+    nothing = ViewMeasurements(view.name, bright, saturated, invalid, black)
     if share < 0.001:
         return nothing
     i0, i45, i90, i135 = (angle[good] for angle in gray)

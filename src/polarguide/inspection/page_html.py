@@ -15,10 +15,16 @@ from polarguide.inspection.measurements import ViewMeasurements
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.progress import SILENT, Reporter
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import page_part
+from polarguide.visualization.embedded import content_policy, page_part
 
 FILE = "inspection.html"
-_CLASSES: dict[Verdict, str] = {"ok": "ok", "warning": "warning", "wrong": "wrong", "n/a": "na"}
+_CLASSES: dict[Verdict, str] = {
+    "ok": "ok",
+    "warning": "warning",
+    "wrong": "wrong",
+    "n/a": "na",
+    "not verified": "unverified",
+}
 
 
 def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
@@ -38,6 +44,7 @@ def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
     posed = f"{len(capture.posed)} with a pose" if capture.model is not None else "no poses"
     width, height = capture.size
     return Template(page_part(__package__, "inspection.html")).substitute(
+        policy=content_policy(),
         title=html.escape(f"Inspection of {capture.name}"),
         style=Template(page_part(__package__, "inspection.css")).substitute(switching=_switching()),
         summary=html.escape(f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,8 +16,6 @@ from polarguide.inspection.verdict import Check, Verdict
 
 PAIR_ERROR = 0.05
 """Median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent."""
-ENCODED, DECODED = (-0.12, -0.25), (0.1, 0.2)
-"""Curvatures (``capture.checks.curvature``) for a warning and for wrong: concave, convex."""
 UNEQUAL, VERY_UNEQUAL = 0.01, 0.04
 """Deviations of the pair ratio from 1. A picture exposed 5 % longer gives 0.025; real sensors have about 0.02."""
 UNSTEADY = 0.01
@@ -87,7 +86,7 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
         return Check(key, title, "n/a", f"The curvature of the response cannot be measured: {why}.")
     figures = {"curvature": slope}
     said = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
-    low, high = (np.sign(slope) * slope > abs(ENCODED[k] if slope < 0 else DECODED[k]) for k in (0, 1))
+    low, high = (abs(slope) > abs((checks.ENCODED if slope < 0 else checks.DECODED)[k]) for k in (0, 1))
     if not low:
         return Check(key, title, "ok", said, figures=figures)
     remedy = (
@@ -131,6 +130,7 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
         "saturated": float(np.mean(shares)),
         "worst": max(shares),
         "invalid": float(np.mean([r.invalid for r in measurements])),
+        "dark": float(np.mean([r.dark for r in measurements])),
     }
     largest = max(view.peak for view in capture.views)
     if capture.bits == 16 and 0 < largest < (FULL_CODE + 1) // 16:
@@ -140,8 +140,8 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
         )  # fmt: skip
     off = tuple(r.view for r, share in zip(measurements, lost, strict=True) if share > SATURATED)
     said = (
-        f"{np.mean(shares):.1%} of the pixels are at full scale or black, at most {max(shares):.1%} in a view; "
-        f"{figures['invalid']:.1%} are marked invalid."
+        f"{np.mean(shares):.1%} of the pixels are at full scale, at most {max(shares):.1%} in a view; "
+        f"{figures['invalid']:.1%} are marked invalid, {figures['dark']:.1%} are too dark to be used."
     )
     if not off:
         return Check(key, title, "ok", said, figures=figures)
@@ -180,9 +180,20 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
     median = float(np.median([r.dolp[0] for r in measurements]))
     said = f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
     said += f"the median DoLP is {median:.3f}."
-    figures = {"polarized": share, "median_dolp": median}
+    strongest = float(np.median([r.dolp[1] for r in measurements]))
+    noise = 3 * math.sqrt(2) / 2 * float(np.median([r.noise_share for r in measurements]))
+    figures = {"polarized": share, "median_dolp": median, "p99_dolp": strongest}
     if share >= LITTLE:
         return Check(key, title, "ok", said, figures=figures)
+    if strongest < POLARIZED and noise < POLARIZED:
+        return Check(
+            key, title, "wrong",
+            f"No modulation: was the filter reversed, or missing? The four pictures show the same light; 99 % of the "
+            f"pixels (median view) have a DoLP under {strongest:.3f}.",
+            "Hold the filter before an LCD screen and turn it: the side that is towards the screen when it goes dark "
+            "must face the scene. If the filter was right: photograph glossy surfaces obliquely (50 to 65 degrees).",
+            figures=figures,
+        )  # fmt: skip
     return Check(
         key, title, "wrong" if share < ALMOST_NONE else "warning", said,
         "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from lower "

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-Verdict = Literal["ok", "warning", "wrong", "n/a"]
-ORDER: tuple[Verdict, ...] = ("n/a", "ok", "warning", "wrong")
+Verdict = Literal["ok", "warning", "wrong", "n/a", "not verified"]
+ORDER: tuple[Verdict, ...] = ("n/a", "ok", "not verified", "warning", "wrong")
 """From no verdict to the worst."""
 
 
@@ -19,7 +19,8 @@ class Check:
     Attributes:
         key: its name in ``inspection.json``.
         title: its heading for people.
-        verdict: "ok"; "warning" where a person should decide; "wrong"; "n/a" where the check cannot be made.
+        verdict: "ok"; "warning" where a person should decide; "wrong"; "n/a" where the check cannot be made;
+            "not verified" where it cannot be made although training relies on it.
         finding: the result, one or two sentences.
         remedy: the advice; empty if nothing is to be done.
         views: the views concerned; empty for all.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import pad
 
 from polarguide.vectors import dot
 
@@ -51,7 +51,11 @@ def window_mean(planes: Tensor, window: int) -> Tensor:
     if window < 1 or window % 2 == 0:
         raise ValueError(f"window: expected an odd number of pixels, found {window}")
     margin = window // 2
-    return avg_pool2d(pad(planes[None], (margin,) * 4, mode="replicate"), window, stride=1)[0]
+    _, height, width = planes.shape
+    padded = pad(planes[None], (margin,) * 4, mode="replicate")[0]
+    # Along the columns, then along the rows: 2 window sums a pixel, not window^2; and torch's pooling is slow.
+    columns = sum((padded[:, k : k + height] for k in range(1, window)), padded[:, :height])
+    return sum((columns[..., k : k + width] for k in range(1, window)), columns[..., :width]) / window**2
 
 
 def check_leading(tensor: Tensor, count: int, name: str) -> None:

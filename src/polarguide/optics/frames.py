@@ -79,7 +79,8 @@ def normal_from_angles(zenith: Tensor, azimuth: Tensor, rays: Tensor) -> Tensor:
     Returns:
         [..., 3] unit.
     """
-    x_ref, up_ref = lens_frame(rays)
     sine = torch.sin(zenith)
-    across = (sine * torch.cos(azimuth))[..., None] * x_ref + (sine * torch.sin(azimuth))[..., None] * up_ref
-    return across - torch.cos(zenith)[..., None] * rays
+    right, up, back = sine * torch.cos(azimuth), sine * torch.sin(azimuth), torch.cos(zenith)
+    # Component by component: torch is slow where the last axis of three broadcasts.
+    axes = zip(*(vectors.unbind(-1) for vectors in (*lens_frame(rays), rays)), strict=True)
+    return torch.stack([right * x + up * y - back * ray for x, y, ray in axes], dim=-1)

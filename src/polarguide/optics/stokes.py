@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from polarguide.optics._numerics import check_leading, safe_atan2
+from polarguide.optics._numerics import check_leading, safe_atan2, safe_sqrt
 from polarguide.polarizer import malus, stokes_of_four
 
 
@@ -65,7 +65,8 @@ def dolp(stokes: Tensor) -> Tensor:
     size = torch.where(live, s0, torch.ones_like(s0))
     # |S1|, |S2| <= S0 for real light; clamping them first bounds the quotient, and with it the gradient.
     parts = torch.minimum(torch.maximum(stokes[1:], -size), size) / size
-    degree = torch.linalg.vector_norm(parts, dim=0).clamp(max=1)
+    # Written out: torch's norm over two is slow.
+    degree = safe_sqrt(parts[0] ** 2 + parts[1] ** 2).clamp(max=1)
     return torch.where(live, degree, torch.zeros_like(degree))
 
 

@@ -7,6 +7,7 @@ A folder without ``scene.json`` is not finished; the same command goes on with i
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,18 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.write import intensity_codes, write_view
+from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.view import ANGLES
+from polarguide.capture.write import intensity_codes, picture_name, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, make_folder, write_whole
-from polarguide.records import decode, read_record, to_json
+from polarguide.records import decode, read_record, shortened, to_json
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
 SFM = ".sfm"
+FOLDERS = ("polar", "invalid", "masks", "sparse")
+"""What is written into."""
 REMEDY = "Give another --out; nothing was written."
 _OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 
@@ -39,13 +44,15 @@ class _Request(msgspec.Struct):
 
 class _View(msgspec.Struct):
     files: dict[str, int]
-    geometry: dict[str, Any]
+    geometry: Geometry
     clipped_share: float
+    warp: Any
 
 
 class _State(msgspec.Struct):
     request: _Request
     views: dict[str, _View] = {}
+    measured: dict[str, Any] | None = None
 
 
 class _Journal(msgspec.Struct):
@@ -71,13 +78,14 @@ class SceneFolder:
         self.request = request
         self.measured: dict[str, Any] | None = None
         self.views: dict[str, dict[str, Any]] = {}
-        self.finished = False
+        self.finished = self.begun = False
         self._follows_none = False
         check_out(root)
         whole, journal = root / SCENE, root / JOURNAL
         path = journal if journal.exists() else whole
         if path.exists():
             self._go_on(path)
+            self.begun = True
             self.finished = path == whole and not self._follows_none
         elif root.exists() and any(root.iterdir()):
             raise PolarguideError(
@@ -96,7 +104,9 @@ class SceneFolder:
                 found=f"a {path.name} of another origin",
                 remedy=REMEDY,
             )
-        decode(content, _Journal, path, remedy=REMEDY)
+        journal = decode(content, _Journal, path, remedy=REMEDY)
+        for view, record in journal.prepare.views.items():
+            _require_own_files(path, view, record.files)
         state = content["prepare"]
         before, now = json.loads(json.dumps(state["request"])), json.loads(json.dumps(self.request))
         if before["settings"].get("white_balance") == "grey":  # its name in earlier journals
@@ -119,6 +129,14 @@ class SceneFolder:
 
     def start(self) -> None:
         """Create the folder and take note of the request."""
+        for name in (*FOLDERS, SFM):
+            if (self.root / name).is_symlink():
+                raise PolarguideError(
+                    self.root / name,
+                    expected="a folder in the scene",
+                    found="a link to another place",
+                    remedy="Remove the link, or give another --out; nothing was written.",
+                )
         make_folder(self.root / "polar")
         make_folder(self.root / "invalid")
         self.save()
@@ -168,6 +186,23 @@ class SceneFolder:
         return {"request": self.request, "measured": self.measured, "views": self.views}
 
 
+def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
+    """Refuse a journal that counts files as a view's that are not: what is noted there may be removed.
+
+    Raises:
+        PolarguideError: there is one.
+    """
+    own = {*(picture_name(view, angle) for angle in ANGLES), f"invalid/{view}.png", f"masks/{view}.png"}
+    strangers = sorted(set(files) - own)
+    if strangers or "/" in view or "\\" in view or "\0" in view:
+        raise PolarguideError(
+            f"{journal} (views, {shortened(view)})",
+            expected=f"pictures of this view, {picture_name('VIEW', 0)} and so on",
+            found=shortened(strangers[0] if strangers else view),
+            remedy=REMEDY,
+        )
+
+
 def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> tuple[str, str, str] | None:
     """Name, old and new value of the first thing that differs."""
     for part in sorted(before.keys() | now.keys()):
@@ -175,7 +210,8 @@ def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> tuple[str,
         if old == new:
             continue
         if isinstance(old, dict) and isinstance(new, dict):
-            key = next(k for k in sorted(old.keys() | new.keys()) if old.get(k) != new.get(k))
+            keys = sorted(old.keys() | new.keys())
+            key = next(k for k in keys if (k in old) != (k in new) or old[k] != new[k])
             if part == "settings":
                 return key, str(old.get(key)), str(new.get(key))
             return f"{part} {key}", "as it was", "that was changed, added or removed"

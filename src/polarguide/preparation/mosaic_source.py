@@ -14,6 +14,7 @@ from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_g
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.layout import index_files
+from polarguide.capture.sensor.color_filters import SIDE, color_filters
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.packing import PACKINGS
 from polarguide.capture.sensor.pattern import SENSORS, sensor_pattern, tiled
@@ -82,6 +83,7 @@ class MosaicSource(Source):
         largest = used = 0
         container, shape = 0, None
         samples: list[NDArray[Any]] = []
+        blocks: list[NDArray[Any]] = []
         for count, path in enumerate(self._files.values(), 1):
             values = read_mosaic(path, self._raw)
             shape = shape or (values.shape, values.dtype)
@@ -89,6 +91,7 @@ class MosaicSource(Source):
             container = self._container(path, values)
             largest, used = max(largest, int(values.max())), used | int(np.bitwise_or.reduce(values, None))
             samples.append(sample_blocks(self._cut(values), 2 * self._pattern.period))
+            blocks.append(sample_blocks(self._cut(values), SIDE))
             advance(count)
         assert shape is not None
         asked = self._settings
@@ -97,6 +100,8 @@ class MosaicSource(Source):
         )
         if self._dataset is not None:
             levels = replace(levels, gamma=self._dataset.gamma)
+        else:
+            self._require_kind(np.concatenate(blocks), levels)
         dark = self._dark(shape[0])
         floor = None if dark is None else sample_blocks(dark, 2 * self._pattern.period)
         angles, colors, usable = block_intensities(samples, levels, floor, self._pattern)
@@ -171,6 +176,20 @@ class MosaicSource(Source):
                 found=f"{values.shape[1]}x{values.shape[0]}",
                 remedy="Give the whole picture of the sensor.",
             )
+
+    def _require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
+        """Refuse mosaics of the other kind of sensor: nothing later would tell."""
+        found = color_filters(blocks, levels.saturation, levels.black)
+        color = self._pattern.colors is not None
+        if found is None or (found == "color") == color:
+            return
+        other = next(name for name, colored in SENSORS.items() if colored != color)
+        raise PolarguideError(
+            "--sensor",
+            expected=f"mosaics of {self._settings.sensor}, a {'color' if color else 'monochrome'} sensor",
+            found="no sign of color filters" if color else "the Bayer pattern of color filters",
+            remedy=f"Use --sensor {other}, or that of your camera with this pattern.",
+        )
 
     def _cut(self, values: NDArray[Any]) -> NDArray[Any]:
         """Crop to whole cells."""

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets import detect_dataset, open_dataset
 from polarguide.capture.datasets.pisr import SENSOR as PISR_SENSOR
-from polarguide.capture.filter.shots import find_shots
-from polarguide.capture.layout import angle_folders, describe_contents
+from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
+from polarguide.capture.formats.integrity import declared_size
+from polarguide.capture.formats.pictures import read_file
+from polarguide.capture.layout import angle_folders, describe_contents, index_files
+from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
+from polarguide.capture.pose_files import read_pose_file
+from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
+from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
 from polarguide.preparation.filter_source import FilterSource
@@ -34,6 +41,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
         if kind == "filter" and not angle_folders(root):
             several = any(len(files) > 1 for files in find_shots(root).values())
             kind = "filter" if several else "mosaic"
+            if kind == "mosaic" and settings.sensor is None:
+                raise _unknown_layout(root)
     check_format(settings, kind)
     found = _source(root, settings, kind)
     if not found.views:
@@ -46,6 +55,47 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             remedy="See docs/reference/formats.md for the layouts.",
         )
     return found if settings.masks is None else MaskedSource(found, settings.masks)
+
+
+def _unknown_layout(root: Path) -> PolarguideError:
+    """The error that nothing tells mosaics from ordinary pictures: what is there, and the commands for either."""
+    photographs = index_files(root, tuple(set(SHOT_SUFFIXES) - set(RAW_SUFFIXES)))
+    mosaics = index_files(root, RAW_SUFFIXES)
+    folders = sorted(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
+    named = (
+        listed(sorted(path.name for path in {**photographs, **mosaics}.values()))
+        if photographs or mosaics
+        else ""
+    )
+    found = (
+        f"{len(photographs) + len(mosaics)} pictures without angles in their names ({named})" if named else ""
+    )
+    found = " and ".join(part for part in (found, f"folders {listed(folders)}" if folders else "") if part)
+    out = f"--out {shlex.quote(root.resolve().name + '-scene')}"
+    source = shlex.quote(str(root))
+    remedy = (
+        "Four shots through a filter: name the folders 0, 45, 90 and 135, or the files <view>_0 to <view>_135, then "
+        f"polarguide prepare {source} {out}."
+    )
+    if mosaics:
+        remedy = f"Raw mosaics: polarguide prepare {source} {out} --sensor IMX250MYR (color) or IMX250MZR. {remedy}"
+    if photographs and not mosaics:
+        remedy += " Ordinary photographs, one a view, carry no polarization."
+    expected = "four shots per view, raw mosaics with --sensor, or a published dataset"
+    return PolarguideError(root, expected=expected, found=found or "nothing to read", remedy=remedy)
+
+
+def poses_beside(root: Path) -> list[str]:
+    """Names of what holds poses in a folder of pictures, for a hint."""
+    names = (
+        "sparse",
+        "transforms.json",
+        "cameras.xml",
+        "cameras.npz",
+        "cameras_new.npz",
+        "cameras_sphere.npz",
+    )
+    return [name for name in names if (root / name).exists()]
 
 
 def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
@@ -82,4 +132,15 @@ def known_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
     if origin == "dataset":
         assert pictures.cameras is not None
         return Poses.of_cameras(pictures.cameras, root, pictures.views)
-    return Poses.read(Path(origin), pictures.views)
+    path = Path(origin)
+    if path.suffix.lower() in POSE_FILES and path.is_file():
+        size = declared_size(read_file(pictures.paths[0])) or (0, 0)
+        if path.suffix.lower() == ".npz" and 0 in size:
+            raise PolarguideError(
+                path,
+                expected="PNG, JPEG or TIFF pictures beside cameras of .npz, which do not state a size",
+                found=pictures.paths[0].name,
+                remedy="Give a COLMAP model, transforms.json or cameras.xml.",
+            )
+        return Poses.of_cameras(read_pose_file(path, pictures.views, size), path, pictures.views, [path])
+    return Poses.read(path, pictures.views)

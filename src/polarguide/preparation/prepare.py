@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,14 +18,18 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
-from polarguide.preparation.folder import SFM, SceneFolder
-from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses
+from polarguide.preparation.folder import JOURNAL, SCENE, SFM, SceneFolder
+from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
 from polarguide.preparation.working_folder import PHOTOGRAPHS, Workshop
 from polarguide.progress import Reporter
 
+MOSTLY = 0.5
+"""Share of saturated pixels from which on a view is warned of."""
 _PARTIAL = ".sparse.partial"
+_NOTES = 4
+"""Notes on single views that are printed; sixty alike hide what matters."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,12 @@ def prepare_scene(
         reporter.say(f"{target} is complete already; nothing to do.")
         return _outcome(folder, pictures, settings, new=False)
     reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
+    beside = poses_beside(root) if settings.poses == "sfm" else []
+    if beside:
+        ways = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in beside)
+        reporter.say(
+            f"Poses by structure from motion. The folder holds poses, too: {ways} takes them instead."
+        )
     if folder.measured is None:
         with reporter.track("measuring", len(pictures.views)) as advance:
             folder.measured = pictures.measure(advance)
@@ -135,6 +146,8 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
     views = pictures.views if poses is None else poses.views
     for view in folder.views.keys() - set(views):
         folder.drop(view)
+    faults: list[str] = []
+    notes: list[str] = []
     with reporter.track("writing views", len(views)) as advance:
         for count, view in enumerate(views, 1):
             known = folder.views.get(view)
@@ -142,15 +155,36 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
             if known is not None and poses is not None:
                 warp = poses.warp(view, msgspec.convert(known["geometry"], Geometry)).record()
             if not folder.has(view, warp):
-                _write_view(folder, pictures, view, poses, reporter)
+                fault, found = _write_view(folder, pictures, view, poses)
+                faults += fault
+                notes += found
             advance(count)
+    for fault in faults[:_NOTES]:
+        reporter.warn(fault)
+    if len(faults) > _NOTES:
+        reporter.warn(f"{len(faults) - _NOTES} more views are black or saturated; {SCENE} has their figures.")
+    for note in notes[:_NOTES]:
+        reporter.say(note)
+    if len(notes) > _NOTES:
+        reporter.say(f"... and {len(notes) - _NOTES} more notes on views; {SCENE} has their figures.")
 
 
 def _write_view(
-    folder: SceneFolder, pictures: Source, view: str, poses: Poses | None, reporter: Reporter
-) -> None:
+    folder: SceneFolder, pictures: Source, view: str, poses: Poses | None
+) -> tuple[list[str], tuple[str, ...]]:
+    """Write the pictures of a view; returns what makes it useless, and the notes about it."""
     assert folder.measured is not None
-    done = pictures.develop(view, folder.measured)
+    try:
+        done = pictures.develop(view, folder.measured)
+    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+        if not folder.begun:
+            raise
+        raise PolarguideError(
+            folder.root / JOURNAL,
+            expected="what an earlier call has measured",
+            found=f"something else ({type(error).__name__}: {error})",
+            remedy="Remove the folder, and begin anew.",
+        ) from None
     intensities, invalid, mask, warped = done.intensities, done.invalid, done.mask, None
     if poses is not None:
         warp = poses.warp(view, done.geometry)
@@ -159,8 +193,12 @@ def _write_view(
         warped = warp.record()
     record = {**done.record, "geometry": asdict(done.geometry), "warp": warped}
     folder.write_view(view, intensities, invalid, record, mask)
-    for note in done.notes:
-        reporter.say(note)
+    faults = []
+    if record["clipped_share"] > MOSTLY:
+        faults.append(f"{view}: {record['clipped_share']:.0%} of its pixels are saturated.")
+    elif not all(picture.any() for picture in intensities):
+        faults.append(f"{view}: a picture of it is black throughout.")
+    return faults, done.notes
 
 
 def _write_model(folder: SceneFolder, poses: Poses) -> None:

@@ -17,7 +17,7 @@ from polarguide.capture.calibration import Calibration, Sense, checked, read_cal
 from polarguide.errors import PolarguideError
 from polarguide.records import check_options, option_name
 
-Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp"]
+Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")
 """What poses can be instead of a path."""
 _MOSAIC_ONLY = (
@@ -31,8 +31,8 @@ _OPTIONS = {
     "gnerp": ("transfer",),
 }
 """Options that mean something for some formats only."""
-_NotNegative = Annotated[int, Meta(ge=0)]
-_Positive = Annotated[int, Meta(ge=1)]
+_NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
+_Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,13 @@ class PrepareSettings:
         demosaic: half, quarter or full resolution of the sensor.
         interpolation: How half and full fill in colors and angles.
         register: Bring the four angles of half size, which lie half a pixel apart, to one place.
-        transfer: Encoding of filter shots (auto: the one under which the pair sums agree best) and of GNeRP.
+        transfer: Encoding of filter shots (auto: by the curvature of the response, as inspect judges it) and of GNeRP.
         align: Estimate and correct small shifts between the four shots of a filter.
         gains: auto corrects what the light tells of the gains of the angles; none leaves them. Gains of a calibration
             go first.
         calibration: gains, order, sense and zero of the angles.
-        poses: sfm, dataset, none, or the path of a COLMAP model; auto takes those of a dataset, else sfm.
+        poses: sfm, dataset, none, or the path of a COLMAP model, transforms.json (nerfstudio), cameras.xml (Metashape)
+            or cameras.npz (IDR); auto takes those of a dataset, else sfm.
         matching: Pairs that SfM compares: all, or neighbors in the order of their names.
         sfm_pictures: What SfM finds features in: the photograph, or the minimum over the angles, which has less glare.
         intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all pictures as developed, for SfM; without it they are estimated.

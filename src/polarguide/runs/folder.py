@@ -11,11 +11,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import torch
+from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -23,9 +27,10 @@ from torch import Tensor
 from polarguide import __version__
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, write_text
+from polarguide.files import atomic, make_folder, read_file, require_file, write_text, writing
 from polarguide.options import Transfer
 from polarguide.records import decode
+from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
@@ -33,6 +38,7 @@ from polarguide.training.state import TrainingState
 CONFIGURATION = "run.json"
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
+LOCK = ".lock"
 PLY = "point_cloud.ply"
 
 
@@ -87,16 +93,15 @@ class RunConfiguration:
             PolarguideError: not a run folder, a run of another version, or a file that is no configuration.
         """
         path = run / CONFIGURATION
-        try:
-            data = path.read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
+        if not os.path.lexists(path):
             raise PolarguideError(
                 run,
                 expected=f"a run folder with {CONFIGURATION}",
                 found="none",
                 remedy="Give the folder that a training wrote.",
-            ) from None
+            )
         remedy = "Restore the file, or train again into a new folder."
+        data = read_file(path, remedy=remedy)
         written = decode(data, _Written, path, remedy=remedy).version
         if _series(written) != _series(__version__):
             raise PolarguideError(
@@ -121,9 +126,17 @@ def _series(version: str) -> str:
 
 
 def save_checkpoint(run: Path, state: TrainingState) -> None:
-    """Write the state so that a kill at any moment leaves either the old checkpoint or the new one."""
+    """Write the state so that a kill at any moment leaves either the old checkpoint or the new one.
+
+    Raises:
+        PolarguideError: it cannot be written; the old one stays.
+    """
     with atomic(run / CHECKPOINT) as path:
-        save_file(state.tensors(), path, metadata={"step": str(state.step), "version": __version__})
+        try:
+            # One entry: safetensors writes several in any order, and the same state should be the same bytes.
+            save_file(state.tensors(), path, metadata={"polarguide": f"{__version__}, step {state.step}"})
+        except SafetensorError as error:  # in place of an OSError, as on a full disk
+            raise OSError(str(error)) from None
 
 
 def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState:
@@ -140,18 +153,48 @@ def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu
             found="none",
             remedy="Train first, or without --resume.",
         )
+    require_file(path, expected="a checkpoint of this program", remedy="Train again into a new folder.")
     try:
         with safe_open(path, framework="pt") as file:
             names = list(file.keys())
-            tensors: dict[str, Tensor] = {key: file.get_tensor(key).to(device) for key in names}
-        return TrainingState.from_tensors(tensors, recipe)
-    except (SafetensorError, KeyError, ValueError) as error:
+            tensors: dict[str, Tensor] = {key: file.get_tensor(key) for key in names}
+        refuse_foreign(tensors, recipe)
+    except (SafetensorError, ValueError, OSError, RuntimeError) as error:
         raise PolarguideError(
             path,
             expected="a checkpoint of this program",
-            found=f"damaged or foreign data ({error})",
+            found=f"damaged or foreign data ({str(error)[:300]})",
             remedy="Train again into a new folder.",
         ) from None
+    return TrainingState.from_tensors({name: values.to(device) for name, values in tensors.items()}, recipe)
+
+
+@contextlib.contextmanager
+def writing_to(run: Path) -> Iterator[None]:
+    """Keep others from writing to a run folder, which is made; the lock of a process that was killed is nobody's.
+
+    Raises:
+        PolarguideError: another training writes to it.
+    """
+    make_folder(run)
+    lock = FileLock(run / LOCK, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise PolarguideError(
+            run,
+            expected="a run folder that nobody is writing to",
+            found="another training at work in it",
+            remedy="Wait for it, or name another folder.",
+        ) from None
+    except OSError as error:
+        found = error.strerror or str(error)
+        remedy = "Make room or give rights."
+        raise PolarguideError(run / LOCK, expected="to lock this file", found=found, remedy=remedy) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class RunLog:
@@ -161,26 +204,49 @@ class RunLog:
         self._path = run / LOG
 
     def append(self, **values: Any) -> None:
-        """Write one line."""
-        with open(self._path, "a") as file:
+        """Write one line.
+
+        Raises:
+            PolarguideError: it cannot be written.
+        """
+        with writing(self._path), open(self._path, "a", encoding="utf-8") as file:
             file.write(json.dumps(values) + "\n")
 
     def cut(self, step: int) -> None:
-        """Drop lines at or after a step: they will be written again after a resume."""
-        if self._path.exists():
-            kept = [row for row in self.rows() if row["step"] < step]
-            write_text(self._path, "".join(json.dumps(row) + "\n" for row in kept))
+        """Drop lines at or after a step, which a resumed training writes again, and what are no lines of ours."""
+        if os.path.lexists(self._path):
+            kept = [line for line, row in self._lines() if row["step"] < step]
+            write_text(self._path, "".join(f"{line}\n" for line in kept))
 
     def rows(self) -> list[dict[str, Any]]:
-        """The lines that are whole, none where there is no log; a kill can cut one short."""
-        rows = []
-        for line in self._path.read_text().splitlines() if self._path.exists() else ():
-            with contextlib.suppress(json.JSONDecodeError):
-                row = json.loads(line)
-                rows += [row] if isinstance(row, dict) and "step" in row else []
-        return rows
+        """The lines that are whole, none where there is no log; a kill can cut one short.
+
+        Raises:
+            PolarguideError: it cannot be read.
+        """
+        return [row for _, row in self._lines()]
+
+    def _lines(self) -> list[tuple[str, dict[str, Any]]]:
+        """Lines that are ours, as they stand there and as values."""
+        if not os.path.lexists(self._path):
+            return []
+        found = []
+        for line in read_file(self._path, remedy="Remove it: a training needs none.").split(b"\n"):
+            with contextlib.suppress(PolarguideError):
+                row: dict[str, Any] = msgspec.to_builtins(decode(line, _Row, self._path))
+                found.append((line.decode(), row))
+        return found
 
     def elapsed(self) -> tuple[float, bool]:
         """Training seconds that the log accounts for, and whether the machine worked for nobody else."""
         rows = self.rows()
-        return (float(rows[-1]["seconds"]), bool(rows[-1]["alone"])) if rows else (0.0, True)
+        return (rows[-1]["seconds"], rows[-1]["alone"]) if rows else (0.0, True)
+
+
+class _Row(msgspec.Struct):
+    """A line of the log, as far as something reads it."""
+
+    step: Annotated[int, msgspec.Meta(ge=0)]
+    seconds: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    alone: bool = True
+    psnr: float | None = None

@@ -18,9 +18,10 @@ from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend, choose_backend
+from polarguide.raster.in_front import alpha_in_front
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import render, splats
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.training.recipe import Recipe
@@ -71,6 +72,18 @@ class GaussianModel:
             normals=normals,
             depth=depth,
         )
+
+    @torch.no_grad()
+    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
+        """The Stokes vectors [3, H, W, 3] that a rendered picture predicts; None without both layers and a normal."""
+        if any(layer is None for layer in (result.specular, result.diffuse, result.normal)):
+            return None
+        return self.shading.predicted_stokes(result, camera)
+
+    @torch.no_grad()
+    def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
+        """Share of each pixel's alpha that lies nearer than a depth [H, W], see ``raster.in_front``."""
+        return alpha_in_front(splats(self.state.gaussians), camera, depth, self.backend.rasterize)
 
 
 Opened = TypeVar("Opened", bound="OpenedRun")
@@ -260,7 +273,13 @@ def read_scene(
     Raises:
         PolarguideError: it cannot be read.
     """
-    scene = load_scene(folder, downscale=options.downscale, transfer=options.transfer, reporter=reporter)
+    scene = load_scene(
+        folder,
+        downscale=options.downscale,
+        transfer=options.transfer,
+        memory=options.memory,
+        reporter=reporter,
+    )
     for warning in scene.warnings:
         reporter.warn(warning)
     return scene

@@ -49,8 +49,30 @@ def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directio
 
 
 @torch.no_grad()
-def write_run_ply(path: Path, state: TrainingState, shading: ShadingModel) -> None:
-    """Write the trained Gaussians; see the module's text."""
+def learned_normals(gaussians: Parameters, centers: Tensor | None) -> Tensor:
+    """Unit normals of all Gaussians, [N, 3]: their shortest axes, turned toward the nearest camera.
+
+    Args:
+        gaussians: the Gaussians.
+        centers: [M, 3] of the cameras, or None: then turned away from the middle of the Gaussians.
+    """
+    means = gaussians["means"].detach().cpu()
+    quaternions, log_scales = (gaussians[name].detach().cpu() for name in ("quaternions", "log_scales"))
+    normals = shortest_axis_normals(means, quaternions, log_scales, means.new_zeros(3))
+    if centers is None:
+        side = means - means.median(dim=0).values
+    else:
+        places = centers.to(means)
+        nearest = torch.cat([torch.cdist(part, places).argmin(dim=1) for part in means.split(1 << 16)])
+        side = places[nearest] - means
+    return torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
+
+
+@torch.no_grad()
+def write_run_ply(
+    path: Path, state: TrainingState, shading: ShadingModel, centers: Tensor | None = None
+) -> None:
+    """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras."""
     gaussians = state.gaussians
     dc, rest = refit_sh_to_display(
         lambda directions: shown_colors(state, shading, directions).cpu(), len(gaussians)
@@ -61,4 +83,4 @@ def write_run_ply(path: Path, state: TrainingState, shading: ShadingModel) -> No
     }
     plain["quaternions"] = torch.nn.functional.normalize(plain["quaternions"], dim=-1)
     extra = {name: field.detach().cpu() for name, field in shading.fields(gaussians).items()}
-    write_ply(path, **plain, sh_dc=dc, sh_rest=rest, extra=extra)
+    write_ply(path, **plain, sh_dc=dc, sh_rest=rest, normals=learned_normals(gaussians, centers), extra=extra)

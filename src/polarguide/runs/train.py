@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +14,6 @@ import torch
 
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder
 from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import use_threads
@@ -27,6 +26,7 @@ from polarguide.runs.folder import (
     RunLog,
     load_checkpoint,
     save_checkpoint,
+    writing_to,
 )
 from polarguide.runs.opened import GaussianModel, OpenedRun, read_scene
 from polarguide.runs.point_cloud import write_run_ply
@@ -34,6 +34,7 @@ from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.state import TrainingState
 from polarguide.training.stopwatch import Stopwatch
 from polarguide.training.trainer import Trainer
 
@@ -92,7 +93,7 @@ def train(
     out = Path(out)
     use_threads(session.threads)
     chosen = recipe_named(recipe) if isinstance(recipe, str) else recipe
-    with process_group(session.device, out) as ranks:
+    with process_group(session.device, out) as ranks, ExitStack() as locked:
         leads = ranks.rank == 0
         reporter = reporter if leads else SILENT
         _check_out(out, resume, ranks)
@@ -101,21 +102,30 @@ def train(
         )
         backend = backend_of(ranks, session.device, reporter)
         loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
+        _check_scene(loaded)
         configuration = RunConfiguration.of(loaded, chosen, settings, backend.device)
         state = None
         if resume:
+            if leads:
+                locked.enter_context(writing_to(out))
             _check_same(RunConfiguration.load(out), configuration, out)
-            state = load_checkpoint(out, chosen, backend.device) if (out / CHECKPOINT).exists() else None
+            if (out / CHECKPOINT).exists():
+                state = load_checkpoint(out, chosen, backend.device)
+                _check_slots(state, settings, out)
         trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
-                make_folder(out)
+                if not resume:
+                    locked.enter_context(writing_to(out))
+                    if problem := _unsuitable(out, resume):  # another training has begun meanwhile
+                        raise problem
                 configuration.save(out)
             _Loop(trainer, out, session.checkpoint_every, reporter, should_stop, look).run()
         model = GaussianModel(trainer.state, trainer.shading, backend)
         if leads:
-            write_run_ply(out / PLY, model.state, model.shading)
+            centers = torch.stack([view.camera.center for view in loaded.views])
+            write_run_ply(out / PLY, model.state, model.shading, centers)
     return OpenedRun(out, configuration, chosen, model, scene=loaded, reporter=reporter)
 
 
@@ -261,6 +271,31 @@ def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
         else ("a new folder", "a run", "Add --resume (resume=True) to go on with it, or name another folder.")
     )
     return PolarguideError(out, expected=expected, found=found, remedy=remedy)
+
+
+def _check_scene(scene: Scene) -> None:
+    """Refuse a scene that says nothing about space: views from one place alone."""
+    centers = torch.stack([view.camera.center for view in scene.train_views])
+    if float((centers - centers[0]).norm(dim=1).max()) <= 1e-9 * max(1.0, float(centers.abs().max())):
+        raise PolarguideError(
+            scene.root,
+            expected="training views from at least two places",
+            found=f"{len(centers)} from one",
+            remedy="Add views, or correct the poses.",
+        )
+
+
+def _check_slots(state: TrainingState, settings: TrainSettings, out: Path) -> None:
+    """Refuse sums of the density control for another number of views a step than ``run.json`` states."""
+    sums = state.statistics.gradient
+    found = sums.shape[0] if sums.ndim == 2 else 1
+    if found != settings.views_per_step:
+        raise PolarguideError(
+            out / CHECKPOINT,
+            expected=f"the state of a training with {settings.views_per_step} views a step",
+            found=f"one with {found}",
+            remedy="Train again into a new folder.",
+        )
 
 
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:

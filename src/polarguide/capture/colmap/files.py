@@ -24,7 +24,9 @@ def check_model_files(folder: Path, kind: str) -> None:
     Raises:
         PolarguideError: a file is truncated, damaged, or has trailing bytes.
     """
-    walkers: dict[str, Callable[[bytes], int]] = {"cameras": _cameras, "images": _images, "points3D": _points}
+    walkers: dict[str, Callable[[bytes], int]] = {
+        "cameras": _cameras, "images": _images, "points3D": _points, "rigs": _rigs, "frames": _frames,
+    }  # fmt: skip
     for name, walk in walkers.items():
         path = folder / (name + kind)
         if not path.exists():
@@ -78,6 +80,32 @@ def _points(data: bytes) -> int:
     for _ in range(_at_most(count, len(data) // 51)):
         (track,) = struct.unpack_from("<Q", data, at + 43)
         at += 51 + 8 * _at_most(track, (len(data) - at) // 8)
+    return at
+
+
+def _rigs(data: bytes) -> int:
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    for _ in range(_at_most(count, len(data) // 8)):
+        _, sensors = struct.unpack_from("<II", data, at)
+        at += 8
+        for sensor in range(_at_most(sensors, (len(data) - at) // 8)):
+            at += 8
+            if sensor:  # the first is the rig's own place
+                (has_pose,) = struct.unpack_from("<B", data, at)
+                at += 1 + 56 * bool(has_pose)
+        if at > len(data):
+            raise ValueError("a rig without its end")
+    return at
+
+
+def _frames(data: bytes) -> int:
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    for _ in range(_at_most(count, len(data) // 68)):
+        (pictures,) = struct.unpack_from("<I", data, at + 64)
+        at += 68
+        at += 16 * _at_most(pictures, (len(data) - at) // 16)
     return at
 
 

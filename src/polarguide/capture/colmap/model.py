@@ -20,6 +20,8 @@ from polarguide.capture.colmap.files import check_model_files
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
+FARTHEST = 1e9
+"""The largest coordinate and focal length; single precision tells nothing apart beyond."""
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 # Perspective models that are a plain pinhole when all of their distortion parameters are zero.
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -102,7 +104,8 @@ def read_model(root: Path) -> ColmapModel:
             found="none",
             remedy="Triangulate points with the known poses (colmap point_triangulator).",
         )
-    warning = f"{dropped} of {dropped + len(points)} 3D points are not finite and were left out."
+    beyond = f"not finite, or farther than {FARTHEST:g}, and were left out."
+    warning = f"{dropped} of {dropped + len(points)} 3D points are {beyond}"
     warnings = (warning,) if dropped else ()
     return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks)
 
@@ -205,9 +208,18 @@ def _whole(folder: Path, kind: str) -> Iterator[Path]:
 def posed_images(model: Any) -> dict[str, list[Any]]:
     """The images with a pose of pycolmap's ``Reconstruction``, by name without folder and suffix."""
     images: dict[str, list[Any]] = {}
-    for image in model.images.values():
+    for number, image in model.images.items():
         if image.has_pose:
-            images.setdefault(PurePosixPath(image.name.replace("\\", "/")).stem, []).append(image)
+            try:
+                name = image.name
+            except UnicodeDecodeError:
+                raise PolarguideError(
+                    f"the COLMAP model (image {number})",
+                    expected="a name in UTF-8",
+                    found="another encoding",
+                    remedy="Rename the picture, and export the model again.",
+                ) from None
+            images.setdefault(PurePosixPath(name.replace("\\", "/")).stem, []).append(image)
     return images
 
 
@@ -230,11 +242,11 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     rotation = np.asarray(placed.rotation.matrix(), dtype=np.float64)
     translation = np.asarray(placed.translation, dtype=np.float64)
     inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    sound = np.isfinite([*translation, *inner]).all() and min(inner[:2]) > 0
+    sound = bool((np.abs([*translation, *inner]) <= FARTHEST).all()) and min(inner[:2]) > 1 / FARTHEST
     if not sound or abs(float(np.linalg.norm(placed.rotation.quat)) - 1.0) > 1e-6:
         raise PolarguideError(
             where,
-            expected="a unit quaternion, a finite translation and positive focal lengths",
+            expected=f"a unit quaternion, a translation up to {FARTHEST:g} and positive focal lengths",
             found=f"quaternion {placed.rotation.quat}, translation {translation}, intrinsics {inner}",
             remedy="Export the model again.",
         )
@@ -249,7 +261,7 @@ def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...],
     with np.errstate(over="ignore"):
         places = np.array([point.xyz for point in points]).reshape(-1, 3).astype(np.float32)
     colors = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
-    finite = np.isfinite(places).all(axis=1)
+    finite = (np.abs(places) <= FARTHEST).all(axis=1)
     tracks = tuple(
         tuple(element.image_id for element in point.track.elements)
         for point in (points[place] for place in np.flatnonzero(finite))

@@ -73,11 +73,13 @@ class Poses:
         return cls(load_model(folder, kind), folder, views, [file for file in files if file.exists()])
 
     @classmethod
-    def of_cameras(cls, cameras: Mapping[str, PosedCamera], where: Path, views: list[str]) -> Poses:
+    def of_cameras(
+        cls, cameras: Mapping[str, PosedCamera], where: Path, views: list[str], files: Sequence[Path] = ()
+    ) -> Poses:
         """A model without points from cameras by view name; ``where`` names their origin in messages."""
         with tempfile.TemporaryDirectory() as made:
             write_cameras(Path(made), cameras)
-            return cls(load_model(Path(made), ".bin"), where, views)
+            return cls(load_model(Path(made), ".bin"), where, views, files)
 
     @property
     def points(self) -> int:

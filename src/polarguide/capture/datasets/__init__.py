@@ -7,6 +7,8 @@ from polarguide.capture.datasets.gnerp import open_gnerp
 from polarguide.capture.datasets.neisf import open_neisf
 from polarguide.capture.datasets.nersp import open_nersp
 from polarguide.capture.datasets.pandora import open_pandora
+from polarguide.capture.datasets.phygap import CAMERAS as PHYGAP_CAMERAS
+from polarguide.capture.datasets.phygap import open_phygap
 from polarguide.capture.datasets.pisr import open_pisr
 
 DATASETS = {
@@ -15,6 +17,7 @@ DATASETS = {
     "nersp": ("s0/", "s1/", "s2/"),
     "neisf": ("images_s0/", "images_s1/", "images_s2/"),
     "gnerp": ("cameras.json", "aop/", "dop/"),
+    "phygap": (PHYGAP_CAMERAS,),
 }
 """Names, and the files and folders that a folder with the layout has."""
 
@@ -40,4 +43,7 @@ def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
     """
     if name == "gnerp":
         return open_gnerp(root, transfer=transfer)
-    return {"pandora": open_pandora, "pisr": open_pisr, "nersp": open_nersp, "neisf": open_neisf}[name](root)
+    openers = {
+        "pandora": open_pandora, "pisr": open_pisr, "nersp": open_nersp, "neisf": open_neisf, "phygap": open_phygap
+    }  # fmt: skip
+    return openers[name](root)

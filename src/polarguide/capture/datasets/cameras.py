@@ -39,7 +39,7 @@ def read_projections(path: Path) -> dict[int, tuple[Matrix, Matrix, Matrix]]:
         if match is None:
             continue
         number = int(match[1])
-        scale_key = f"scale_mat_{number}"
+        scale_key = f"scale_mat_{match[1]}"
         if scale_key not in arrays:
             raise missing_entry(path, scale_key, arrays)
         world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)

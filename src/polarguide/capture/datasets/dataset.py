@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Sense
 from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.formats.pictures import decode_mask, decode_stored, read_file
+from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_file
 from polarguide.capture.formats.radiance import read_radiance
+from polarguide.capture.layout import index_files
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
@@ -55,6 +56,11 @@ class Dataset:
     mosaics: Path | None = None
     gamma: float = 1.0
     notes: tuple[str, ...] = ()
+
+
+def masks_beside(root: Path) -> dict[str, Path]:
+    """Object masks by view: the pictures in ``mask/`` or ``masks/``, whichever there is."""
+    return index_files(root / "mask", SUFFIXES) or index_files(root / "masks", SUFFIXES)
 
 
 def not_as_published(where: object, expected: str, found: str) -> PolarguideError:

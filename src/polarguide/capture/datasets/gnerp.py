@@ -26,6 +26,7 @@ from polarguide.capture.datasets.dataset import (
     StokesImage,
     cameras_of_views,
     first_picture_size,
+    masks_beside,
     not_as_published,
     numbered_views,
     require_files,
@@ -56,7 +57,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
     angles, degrees = ({view: root / part / f"{view}.npy" for view in numbers} for part in ("aop", "dop"))
     require_files(angles, "AoP")
     require_files(degrees, "DoP")
-    masks = index_files(root / "masks", SUFFIXES)
+    masks = masks_beside(root)
     cameras_file = root / "cameras.json"
     size = (
         first_picture_size({view: pictures[view] for view in numbers}, root / "images") if numbers else (1, 1)

@@ -14,7 +14,13 @@ import numpy as np
 
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.datasets.cameras import checked_pose, pinhole_camera
-from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, not_as_published, stokes_dataset
+from polarguide.capture.datasets.dataset import (
+    Dataset,
+    cameras_of_views,
+    masks_beside,
+    not_as_published,
+    stokes_dataset,
+)
 from polarguide.capture.formats.arrays import array_size, finite_numbers, read_array
 from polarguide.capture.layout import index_files
 
@@ -33,7 +39,7 @@ def open_neisf(root: Path) -> Dataset:
     files = {view: [root / part / f"{view}.exr" for part in _PARTS] for view in numbers}
     cameras_file = root / "poses_bounds.npy"
     cameras = cameras_of_views(cameras_file, numbers, _cameras(cameras_file), "row ")
-    masks = index_files(root / "masks", (".png",))
+    masks = masks_beside(root)
     note = "The sense of NeISF's angles is not stated by its release: taken as counter-clockwise (--sense cw if not)."
     return stokes_dataset(
         "neisf", _PARTS, files, lambda planes: planes, cameras_file, cameras, masks, notes=(note,)

@@ -1,7 +1,9 @@
 """NeRSP (SMVP3D, RMVP3D): Stokes vectors as NumPy files.
 
-``s0|s1|s2/%04d.npy``, twice the light; ``image/%04d.png``; ``input_azimuth_maps/%04d.png``, whose last channel is the
-object mask; ``cameras.npz``. Its azimuths are measured with y down: angles count clockwise as displayed.
+``s0|s1|s2/%04d.npy``, twice the light; ``image/%04d.png`` (also ``images/``, ``I-sum/``);
+``input_azimuth_maps/%04d.png``, whose last channel is the object mask, else ``mask/`` or ``masks/``; ``cameras.npz``
+(also ``cameras_new.npz``, ``cameras_sphere.npz``). Its azimuths are measured with y down: angles count clockwise as
+displayed.
 """
 
 from __future__ import annotations
@@ -16,13 +18,17 @@ from polarguide.capture.datasets.dataset import (
     Dataset,
     cameras_of_views,
     first_picture_size,
+    masks_beside,
     numbered_views,
+    read_mask,
     stokes_dataset,
 )
 from polarguide.capture.formats.pictures import SUFFIXES, decode_stored, read_file
 from polarguide.capture.layout import index_files
 
 _PARTS = ("s0", "s1", "s2")
+_CAMERAS = ("cameras.npz", "cameras_new.npz", "cameras_sphere.npz")
+_PICTURES = ("image", "images", "I-sum", "I_sum")
 
 
 def open_nersp(root: Path) -> Dataset:
@@ -31,16 +37,18 @@ def open_nersp(root: Path) -> Dataset:
     Raises:
         PolarguideError: one is missing, or the cameras are invalid.
     """
-    cameras_file = root / "cameras.npz"
+    cameras_file = next((root / name for name in _CAMERAS if (root / name).exists()), root / _CAMERAS[0])
     numbers = numbered_views({stem for part in _PARTS for stem in index_files(root / part, (".npy",))})
     files = {view: [root / part / f"{view}.npy" for part in _PARTS] for view in numbers}
-    pictures = index_files(root / "image", SUFFIXES)
+    folder = next((root / name for name in _PICTURES if (root / name).is_dir()), root / _PICTURES[0])
+    pictures = index_files(folder, SUFFIXES)
     maps = index_files(root / "input_azimuth_maps", (".png",))
-    size = first_picture_size(pictures, root / "image") if numbers else (1, 1)
+    size = first_picture_size(pictures, folder) if numbers else (1, 1)
     found = {i: pinhole_camera(size, *camera) for i, camera in read_projections(cameras_file).items()}
     cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
+    masks, read = (maps, _last_channel) if maps else (masks_beside(root), read_mask)
     return stokes_dataset(
-        "nersp", _PARTS, files, _halved, cameras_file, cameras, maps, read_mask=_last_channel, sense="cw"
+        "nersp", _PARTS, files, _halved, cameras_file, cameras, masks, read_mask=read, sense="cw"
     )
 
 

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.datasets.cameras import pinhole_camera, read_projections
-from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, first_picture_size, stokes_dataset
+from polarguide.capture.datasets.dataset import (
+    Dataset,
+    cameras_of_views,
+    first_picture_size,
+    masks_beside,
+    stokes_dataset,
+)
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import index_files
 
@@ -32,7 +38,7 @@ def open_pandora(root: Path) -> Dataset:
     matches = [_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
     views = sorted({match["view"] for match in matches if match is not None})
     files = {view: [folder / f"{view}_{part}.hdr" for part in _PARTS] for view in views}
-    masks = index_files(root / "mask", SUFFIXES)
+    masks = masks_beside(root)
     pictures = index_files(root / "images", SUFFIXES)
     first = 0 if any(int(view) == 0 for view in views) else 1
     size = first_picture_size(pictures, root / "images") if views else (1, 1)

@@ -17,9 +17,14 @@ from polarguide.capture.datasets.cameras import (
     missing_entry,
     read_projections,
 )
-from polarguide.capture.datasets.dataset import Dataset, cameras_of_views, not_as_published, numbered_views
+from polarguide.capture.datasets.dataset import (
+    Dataset,
+    cameras_of_views,
+    masks_beside,
+    not_as_published,
+    numbered_views,
+)
 from polarguide.capture.formats.arrays import finite_numbers, read_arrays
-from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import index_files
 
 SENSOR: Final = "IMX250MYR"
@@ -49,7 +54,7 @@ def open_pisr(root: Path) -> Dataset:
         number: distorted_camera(f"{inner_file} (dist_coeffs)", SIZE, inner, coefficients, pose)
         for number, (_, *pose) in read_projections(cameras_file).items()
     }
-    masks = index_files(root / "mask", SUFFIXES)
+    masks = masks_beside(root)
     gamma = _gamma(root)
     note = f"Stored values are the light to the power of {gamma:g} (gamma file): undone."
     return Dataset(

@@ -22,6 +22,7 @@ SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 _SUFFIX = re.compile(
     r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE
 )
+_BARE = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
 # Compression smears the edge of clipped areas over a few values.
 _JPEG_FULL = 250
 
@@ -47,7 +48,8 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
     """View -> angle -> file: from four folders named like the angles, or from four suffixes.
 
     Folders are ``0``, ``45``, ``90``, ``135``, also ``000``, ``I-00``, ``pol_45``, ...; suffixes are the same
-    after ``_``, ``-``, a point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``.
+    after ``_``, ``-``, a point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``. Files named like the angles alone
+    (``I0.png``, ``I45.png``, ...) are one view, called like the folder, where there is nothing else.
 
     Returns:
         Nothing where neither is found. Angles may be missing; ``require_four_shots`` checks.
@@ -59,13 +61,18 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
     if folders:
         return pictures_of_folders(root, folders, SHOT_SUFFIXES)
     shots: dict[str, dict[int, Path]] = {}
-    for stem, path in index_files(root, SHOT_SUFFIXES).items():
+    files = index_files(root, SHOT_SUFFIXES)
+    bare = {int(match["angle"]): path for stem, path in files.items() if (match := _BARE.fullmatch(stem))}
+    if len(bare) == len(files) == len(ANGLES):
+        return {root.resolve().name: dict(sorted(bare.items()))}
+    for stem, path in files.items():
         match = _SUFFIX.fullmatch(stem)
         if match is None:
             continue
-        of_view, angle = shots.setdefault(match["view"], {}), int(match["angle"])
+        view = match["view"]
+        of_view, angle = shots.setdefault(view, {}), int(match["angle"])
         if angle in of_view:
-            raise ambiguous(root, f"one picture of {match['view']} at {angle} degrees", of_view[angle], path)
+            raise ambiguous(root, f"one picture of {view} at {angle} degrees", of_view[angle], path)
         of_view[angle] = path
     return shots
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from polarguide.capture.formats.integrity import damaged
 from polarguide.capture.formats.pictures import read_file
 from polarguide.errors import PolarguideError
 
+_LARGEST_HEADER = 1 << 16
 _BROKEN = (ValueError, EOFError, OSError, MemoryError, SyntaxError)
 _LARGEST_ARCHIVE = 1 << 26
 """Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
@@ -68,6 +70,27 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     raise damaged(path, "a complete .npz file of numbers", found)
 
 
+def unpacked(data: bytes, names: Collection[str], largest: int) -> dict[str, NDArray[Any]]:
+    """Arrays of an ``.npz`` file by name, those that are there; the others in it are not looked at.
+
+    Args:
+        data: the whole file. names: of the arrays. largest: bytes that any of them may take.
+
+    Raises:
+        ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, NotImplementedError: it is damaged,
+            encrypted, or one of them is larger or holds no numbers.
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        found = {}
+        for entry in archive.infolist():
+            name = entry.filename.removesuffix(".npy")
+            if name in names and entry.filename.endswith(".npy"):
+                if entry.file_size > largest + _LARGEST_HEADER:
+                    raise ValueError(f"{name} of {entry.file_size} bytes")
+                found[name] = _array(archive.read(entry), "biufcSU")
+        return found
+
+
 def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
     """An array of finite numbers in one of the shapes, as float64.
 
@@ -86,8 +109,11 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
     return found
 
 
-def _array(data: bytes) -> NDArray[Any]:
-    """Decode ``.npy``; a header that promises more than there is, is refused before memory is taken for it."""
+def _array(data: bytes, kinds: str = "biuf") -> NDArray[Any]:
+    """Decode ``.npy``; a header that promises more than there is, is refused before memory is taken for it.
+
+    ``kinds`` are the types of values that may be in it, as NumPy calls them.
+    """
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -95,7 +121,7 @@ def _array(data: bytes) -> NDArray[Any]:
     size = dtype.itemsize
     for length in shape:
         size *= length
-    if dtype.hasobject or dtype.kind not in "biuf" or size > len(data) - stream.tell():
+    if dtype.hasobject or dtype.kind not in kinds or size > len(data) - stream.tell():
         raise ValueError("no complete array of numbers")
     stream.seek(0)
     return np.asarray(np.load(stream, allow_pickle=False))

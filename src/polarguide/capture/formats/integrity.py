@@ -19,6 +19,7 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _TIFF_CODES = {1: "B", 3: "H", 4: "I"}
+_BIG_TIFF = (b"II+\0", b"MM\0+")
 _TIFF_STRIPS = ((273, 279), (324, 325))
 
 
@@ -44,8 +45,8 @@ def find_damage(data: bytes) -> str | None:
         return None if _jpeg_is_complete(data) else f"a JPEG file cut short (it ends after {len(data)} bytes)"
     if data[:4] in (b"II*\0", b"MM\0*"):
         return None if _tiff_is_complete(data) else f"a TIFF file cut short (it ends after {len(data)} bytes)"
-    if data[:4] in (b"II+\0", b"MM\0+"):  # BigTIFF: left to the decoder
-        return None
+    if data[:4] in _BIG_TIFF:  # the decoder finds what is cut short
+        return None if declared_size(data) is not None else "a BigTIFF file without a size"
     return "a file that is none of these"
 
 
@@ -57,6 +58,8 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
         return _jpeg_size(data)
     if data[:4] in (b"II*\0", b"MM\0*"):
         return _tiff_size(data)
+    if data[:4] in _BIG_TIFF:
+        return _big_tiff_size(data)
     return None
 
 
@@ -113,6 +116,21 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
     for tag, kind, _, at in tiff_entries(data):
         if tag in (256, 257) and kind in (3, 4):
             (found[tag],) = struct.unpack_from(tiff_order(data) + _TIFF_CODES[kind], data, at)
+    return (found[256], found[257]) if len(found) == 2 else None
+
+
+def _big_tiff_size(data: bytes) -> tuple[int, int] | None:
+    """The same of a BigTIFF file, whose places and counts have 64 bits."""
+    order, found = tiff_order(data), {}
+    try:
+        (start,) = struct.unpack_from(order + "Q", data, 8)
+        (count,) = struct.unpack_from(order + "Q", data, start)
+        for entry in range(start + 8, start + 8 + 20 * min(count, 4096), 20):
+            tag, kind = struct.unpack_from(order + "HH", data, entry)
+            if tag in (256, 257) and kind in (3, 4, 16):
+                (found[tag],) = struct.unpack_from(order + {**_TIFF_CODES, 16: "Q"}[kind], data, entry + 12)
+    except (struct.error, OverflowError):
+        return None
     return (found[256], found[257]) if len(found) == 2 else None
 
 

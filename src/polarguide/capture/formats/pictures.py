@@ -28,8 +28,9 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 
     Args:
         path: where ``data`` came from, for messages.
-        data: the whole file: PNG, JPEG or TIFF with 8 or 16 bits a channel, gray or color. Alpha is dropped,
-            an orientation tag is not applied (poses belong to the stored pixels).
+        data: the whole file: PNG, JPEG or TIFF with 8 or 16 bits a channel, gray or color, or TIFF of floating-point
+            numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Alpha is dropped, an orientation
+            tag is not applied (poses belong to the stored pixels).
 
     Returns:
         [H, W, 3] uint8 or uint16, RGB, as stored. A gray picture becomes three equal channels.
@@ -38,6 +39,8 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
         PolarguideError: the file is damaged, cut short, or of another kind.
     """
     pixels = decode_stored(path, data)
+    if pixels.dtype.kind == "f":
+        pixels = _codes_of_floats(path, pixels)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise PolarguideError(
             path,
@@ -48,6 +51,23 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2)
     return np.ascontiguousarray(pixels[..., 2::-1])
+
+
+def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
+    """16-bit codes of intensities from 0 to 1."""
+    if not np.isfinite(pixels).all() or float(np.median(pixels)) > 1.0:
+        found = (
+            "values that are not finite"
+            if not np.isfinite(pixels).all()
+            else f"up to {float(pixels.max()):g}"
+        )
+        raise PolarguideError(
+            path,
+            expected="floating-point values from 0 to 1, where 1 is full scale",
+            found=found,
+            remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
+        )
+    return np.rint(np.clip(pixels, 0.0, 1.0) * FULL_CODE).astype(np.uint16)
 
 
 def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_]:

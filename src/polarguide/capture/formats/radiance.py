@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,29 +76,40 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _read_exr(path: Path) -> NDArray[Any]:
+def _read_exr(path: Path, wanted: tuple[str, ...] | None = None) -> NDArray[Any]:
     data = read_file(path)
     openexr = optional_import("OpenEXR", str(path), install="'polarguide[exr]'")
     found = "an empty file" if not data else "one that is damaged, cut short or something else"
     pixels = None
     if data.startswith(b"\x76\x2f\x31\x01"):
         try:
-            pixels = _exr_channels(path, openexr)
+            pixels = _exr_channels(path, openexr, wanted)
         except Exception as error:  # the binding raises whatever C++ threw
             found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
     if pixels is None:
-        raise damaged(path, "a complete OpenEXR file with channels R, G and B, or Y", found)
+        names = "R, G and B, or Y" if wanted is None else ", ".join(wanted)
+        raise damaged(path, f"a complete OpenEXR file with channels {names}", found)
     return pixels
 
 
-def _exr_channels(path: Path, package: Any) -> NDArray[Any] | None:
+def read_exr_channels(path: Path, groups: Sequence[Sequence[str]]) -> list[NDArray[np.float32]]:
+    """Named channels of an OpenEXR file, a picture [H, W, C] for each group of names.
+
+    Raises:
+        PolarguideError: the file cannot be read, is damaged or lacks a channel, or the package OpenEXR is missing.
+    """
+    return [_read_exr(path, tuple(names)) for names in groups]
+
+
+def _exr_channels(path: Path, package: Any, wanted: tuple[str, ...] | None) -> NDArray[Any] | None:
     with package.File(str(path), separate_channels=True) as file:
         window = file.header()["dataWindow"]
         width, height = (int(window[1][axis]) - int(window[0][axis]) + 1 for axis in (0, 1))
         if not 0 < width * height <= LARGEST_PIXELS:
             raise ValueError(f"{width}x{height} pixels")
         channels = file.channels()
-        names = next((n for n in (("R", "G", "B"), ("Y",)) if all(name in channels for name in n)), None)
+        choices = (("R", "G", "B"), ("Y",)) if wanted is None else (wanted,)
+        names = next((n for n in choices if all(name in channels for name in n)), None)
         if names is None:
             return None
         return np.stack([np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1)

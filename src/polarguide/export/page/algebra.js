@@ -1,6 +1,7 @@
 // Vectors are arrays of 3; matrices arrays of 9, row-major.
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const add = (a, b, factor = 1) => [a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const scaled = (a, factor) => [factor * a[0], factor * a[1], factor * a[2]];
 const unit = (a) => scaled(a, 1 / Math.hypot(a[0], a[1], a[2]));
 const apply = (m, v) => [dot(m.slice(0, 3), v), dot(m.slice(3, 6), v), dot(m.slice(6, 9), v)];

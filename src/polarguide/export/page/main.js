@@ -95,7 +95,8 @@ class Page {
     byId("view").value = String(this.scene.first);
     this.setComparing(false);
     this.choose(this.scene.layers[0]);
-    this.go(this.scene.first);
+    this.navigation.open();
+    this.redraw();
   }
 
   press(key) {

@@ -2,12 +2,24 @@
 class Navigation {
   constructor(scene) {
     this.scene = scene;
-    this.stand(scene.cameras[scene.first]);
+    this.open();
+  }
+
+  /** The first photograph's place, aimed at the subject. */
+  open() {
+    this.stand(this.scene.cameras[this.scene.first]);
+    const { center, up } = this.scene, ahead = unit(add(center, this.eye, -1));
+    const right = cross(ahead, up);
+    if (dot(ahead, this.rotation.slice(6)) < 0.5 || Math.hypot(...right) < 0.1) return;
+    this.rotation = [...unit(right), ...cross(ahead, unit(right)), ...ahead];
+    this.pivot = center;
+    this.filling = true;
   }
 
   /** Move to the pose of a photograph. */
   stand(camera) {
     this.lens = camera;
+    this.filling = false;
     this.rotation = camera.rotation;
     this.eye = scaled(apply(transposed(camera.rotation), camera.translation), -1);
     const ahead = dot(add(this.scene.center, this.eye, -1), this.rotation.slice(6));
@@ -39,9 +51,14 @@ class Navigation {
     this.pivot = add(this.pivot, shift);
   }
 
-  /** The camera for a picture size: the photograph's intrinsics, scaled so that the whole photograph is visible. */
+  /**
+   * The camera for a picture size: the photograph's intrinsics, scaled so that the whole photograph is visible. An
+   * upright picture opens on the photograph's middle instead: a phone shows the subject, not a strip of it.
+   */
   camera(width, height) {
-    const { lens, rotation } = this, factor = Math.min(width / lens.width, height / lens.height);
+    const { lens, rotation } = this, sides = [width / lens.width, height / lens.height];
+    const whole = Math.min(...sides), upright = this.filling && sides[0] < sides[1];
+    const factor = upright ? Math.min(sides[1], 1.7 * whole) : whole;
     return {
       width, height, rotation,
       translation: scaled(apply(rotation, this.eye), -1),

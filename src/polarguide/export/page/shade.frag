@@ -72,7 +72,9 @@ void main() {
   vec3 further = texelFetch(target2, at, 0).rgb;
   strength = further.x;
 #ifdef DIRECTIONAL
-  if (base.a > 0.05) specular = radiance(direction, further.x, vec4(further.yz, texelFetch(target3, at, 0).xy));
+  vec3 last = texelFetch(target3, at, 0).xyz;
+  if (base.a > 0.05)
+    specular = min(last.z / base.a, 1.0) * radiance(direction, further.x, vec4(further.yz, last.xy));
 #else
   vec3 raw = lookUp(0, resolution, 1, 0, direction).rgb;
 #ifdef FRESNEL

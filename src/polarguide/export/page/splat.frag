@@ -20,7 +20,9 @@ void main() {
   target1 = vec4(alpha * normal.xyz, alpha);
 #if defined(DIRECTIONAL)
   target2 = vec4(alpha * vec3(color.a, further.xy), alpha);
-  target3 = vec4(alpha * vec3(further.zw, 0.0), alpha);
+  // Surroundings have no features, and no surface that reflects.
+  float surface = dot(further, further) > 0.0 ? 1.0 : 0.0;
+  target3 = vec4(alpha * vec3(further.zw, surface), alpha);
 #elif defined(LOCAL)
   target2 = vec4(alpha * color.a, 0.0, 0.0, alpha);
   target3 = vec4(alpha * further.rgb, alpha);

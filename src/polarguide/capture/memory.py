@@ -1,0 +1,69 @@
+"""How much memory the pictures of a scene take, from their headers alone, before any of them is decoded."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+from polarguide.capture.formats.integrity import declared_size
+from polarguide.capture.layout import Layout
+from polarguide.capture.view import ANGLES
+from polarguide.errors import PolarguideError
+from polarguide.system import free_memory
+
+GIBIBYTE = 1 << 30
+SHARE = 0.8
+"""Of the free memory, that the pictures may take where nothing else was asked for."""
+# Bytes for each pixel of a view: codes of four angles in three channels, peak, black, invalid, saturated, mask.
+KEPT = 4 * 3 * 2 + 2 + 4
+# While one view is read: what is decoded of it, its copy in linear codes, and channels apart.
+READ = 4 * 3 * 2 * 3
+_HEADER = 1 << 20
+
+
+def check_memory(layout: Layout, names: Sequence[str], *, factor: int, at_once: int, limit: float) -> None:
+    """Refuse pictures that do not fit into memory.
+
+    Args:
+        layout: the files. names: views to be read, with all their angles.
+        factor: side of the boxes over which they are averaged. at_once: views that are read at a time.
+        limit: GiB that may be taken; 0: 80 % of what is free.
+
+    Raises:
+        PolarguideError: the least that suffices is more.
+    """
+    free = free_memory()
+    if limit <= 0 and free is None:
+        return
+    allowed = int(limit * GIBIBYTE) if limit > 0 else int(SHARE * (free or 0))
+    pixels = [_largest(layout, name) for name in names]
+    kept = sum(KEPT * count // factor**2 for count in pixels)
+    needed = kept + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
+    if needed > allowed:
+        whose = "as --memory allows" if limit > 0 else f"{SHARE:.0%} of what is free"
+        raise PolarguideError(
+            layout.root,
+            expected=f"pictures that take up to {allowed / GIBIBYTE:.1f} GiB, {whose}",
+            found=f"{len(names)} views that take {needed / GIBIBYTE:.1f} GiB",
+            remedy="Give --downscale 2 or more, fewer views, or more --memory.",
+        )
+
+
+def stated_size(path: Path) -> tuple[int, int] | None:
+    """Width and height in the header of a picture; None where there is none to be read."""
+    if not path.is_file():  # a pipe, a folder, a link to nowhere: whoever reads it says so
+        return None
+    with contextlib.suppress(OSError, struct.error), open(path, "rb") as file:
+        head = file.read(_HEADER)
+        if head[:2] in (b"II", b"MM"):  # its directory stands anywhere
+            head += file.read()
+        return declared_size(head)
+    return None
+
+
+def _largest(layout: Layout, name: str) -> int:
+    """Pixels of the largest picture of a view, as the files state; 0 where they do not."""
+    sizes = [stated_size(layout.pictures[name][angle]) for angle in ANGLES]
+    return max((size[0] * size[1] for size in sizes if size is not None), default=0)
