@@ -3,6 +3,9 @@
 #                 check the files of those that are finished, and print a SHA-256 of each
 # make test    linter, formatter, types and tests, on the package as it is installed;
 #                 its last lines say what was skipped, and how to change that
+# make fuzz N=20    the corpus of tests/robustness with N further seeds of each mutation; prints what failed, and how to repeat it
+# make soak N=300    kill commands N times at random moments, go on, and compare the files
+# make sanitize    the kernels' tests with AddressSanitizer and UndefinedBehaviorSanitizer, the thread pool with ThreadSanitizer
 # make docs    build the documentation into build/docs; a warning is an error
 # make cross-check    compile the kernels for aarch64 (needs aarch64-linux-gnu-g++ and cmake)
 # make gpu-check    build, test and measure on a machine with a GPU; in parts: call it again until it says complete
@@ -24,7 +27,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
 
-.PHONY: demo dataset test docs cross-check gpu-check gpu-pack clean
+.PHONY: demo dataset test fuzz soak sanitize docs cross-check gpu-check gpu-pack clean
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
 
@@ -41,6 +44,17 @@ test: $(VENV)/.installed-test $(SPLAT_TRANSFORM)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest $(PYTEST)
+
+N ?= 20
+
+fuzz: $(VENV)/.installed-test
+	$(BIN)/python tests/robustness/fuzz.py --seeds $(N) --first $$(date +%s)
+
+soak: $(VENV)/.installed-test
+	$(BIN)/python tests/robustness/soak.py --kills $(N)
+
+sanitize: $(VENV)/.installed-test
+	PATH=$(CURDIR)/$(BIN):$$PATH bash tests/robustness/sanitize.sh
 
 # Another program that reads what we export. Tests that need it are skipped where it cannot be installed.
 $(SPLAT_TRANSFORM):

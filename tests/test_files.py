@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, make_folder, read_file, write_text, write_whole
+from polarguide.files import atomic, atomic_folder, make_folder, read_file, write_text, write_whole
 
 
 def test_a_file_is_replaced(tmp_path: Path) -> None:
@@ -64,3 +64,44 @@ def test_pipes_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(PolarguideError, match="a pipe or device"):
         read_file(tmp_path / "pipe")
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    pid = os.fork()
+    if not pid:
+        os._exit(0)
+    os.waitpid(pid, 0)
+    dead, alive = tmp_path / f".a.txt.{pid}.tmp", tmp_path / ".a.txt.1.tmp"
+    other = tmp_path / f".b.txt.{pid}.tmp"
+    for path in (dead, alive, other):
+        path.write_text("half")
+    folder = tmp_path / f".a.txt.{pid}.tmp.d"
+    folder.mkdir()
+    write_text(tmp_path / "a.txt", "whole")
+    assert not dead.exists()
+    assert not folder.exists()
+    assert alive.exists()
+    assert other.exists()
+
+
+def test_a_folder_appears_with_whole_files(tmp_path: Path) -> None:
+    with atomic_folder(tmp_path / "out") as folder:
+        (folder / "one").write_text("1")
+        assert list((tmp_path / "out").iterdir()) == []
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["one"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def _half_a_folder(out: Path) -> None:
+    with atomic_folder(out) as folder:
+        (folder / "one").write_text("2")
+        raise OSError(errno.ENOSPC, "full")
+
+
+def test_a_folder_that_fails_changes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "one").write_text("1")
+    with pytest.raises(PolarguideError, match="full"):
+        _half_a_folder(tmp_path / "out")
+    assert (tmp_path / "out" / "one").read_text() == "1"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

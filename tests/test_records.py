@@ -104,3 +104,10 @@ def test_options_are_named_as_on_the_command_line(options: Options, message: str
     check_options(Options(folder=Path("here")))
     with pytest.raises(PolarguideError, match=message):
         check_options(options)
+
+
+@pytest.mark.parametrize("depth", [60, 900, 100_000])
+def test_what_is_nested_too_deeply_is_refused(depth: int) -> None:
+    for data in (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth):
+        with pytest.raises(PolarguideError, match="JSON"):
+            decode(data, dict[str, Any], "file.json")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -11,7 +12,14 @@ from pathlib import Path
 import pytest
 
 from polarguide import system
-from polarguide.system import StopSignals, exclusive_lock, peak_memory_mib, process_is_alive, sigterm_kept
+from polarguide.system import (
+    StopSignals,
+    exclusive_lock,
+    keep_freed_memory,
+    peak_memory_mib,
+    process_is_alive,
+    sigterm_kept,
+)
 
 
 def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
@@ -62,3 +70,48 @@ def test_a_library_that_takes_sigterm_does_not_keep_it() -> None:
     with sigterm_kept():
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+FAULTS = """
+import contextlib, resource, sys
+with contextlib.suppress(SystemExit):
+    {first}
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    bytearray(b"x") * (64 << 20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+faults()
+print(faults(), (64 << 20) // resource.getpagesize())
+"""
+"""How often the system has to bring a page to an array as large as one that was freed, and that array's pages."""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "gnu_get_libc_version"), reason="not a system with glibc")
+@pytest.mark.parametrize(
+    ("first", "kept"),
+    [
+        ("import polarguide.api", False),
+        ("from polarguide.__main__ import main; sys.argv[1:] = ['--version']; main()", True),
+        ("from polarguide.experiments.worker import main; main()", True),
+    ],
+)
+def test_freed_memory_is_kept_by_the_command_and_the_children_of_a_comparison_alone(
+    first: str, kept: bool
+) -> None:
+    code = FAULTS.format(first=first)
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=True
+    )
+    faults, pages = (int(number) for number in done.stdout.split()[-2:])
+    assert (faults < pages / 10) == kept, done.stdout
+
+
+@pytest.mark.parametrize("libc", [OSError(), TypeError(), object()], ids=["none", "Windows", "another"])
+def test_elsewhere_the_allocator_is_left_alone(libc: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(name: None) -> object:
+        if isinstance(libc, Exception):
+            raise libc
+        return libc
+
+    monkeypatch.setattr(system.ctypes, "CDLL", load)
+    keep_freed_memory()

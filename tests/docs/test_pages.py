@@ -25,6 +25,7 @@ MODULE_FILE = re.compile(r"`([a-z_]+(?:/[a-z_]+)+\.py)`")
 FOREIGN_OPTIONS = {
     *(
         "nproc-per-node",
+        "no-python",
         "no-register",
         "no-align",
         "help",

@@ -1,0 +1,156 @@
+# ruff: noqa: E501
+"""Random input for every binding of the native module: right shapes and wrong ones, huge and not finite numbers.
+
+Wrong input has to raise ``ValueError`` or ``TypeError``; the rest has to run. Under sanitizers a fault ends the program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import random
+
+import numpy as np
+
+from polarguide import _native
+
+SIZES = (0, 1, 2, 7, 16, 17, 65)
+VALUES = (0.0, -0.0, 1.0, -1.0, 1e-30, 1e30, -1e30, 3e38, np.inf, -np.inf, np.nan)
+
+
+def array(rng: random.Random, *shape: int) -> np.ndarray:
+    """Random float32 values, some of them extreme; sometimes of another shape or type."""
+    if rng.random() < 0.04:
+        shape = tuple(rng.choice(SIZES) for _ in range(rng.randint(0, 4)))
+    made = np.random.default_rng(rng.randrange(2**31)).normal(size=shape).astype(np.float32)
+    if made.size and rng.random() < 0.3:
+        for _ in range(rng.randint(1, 4)):
+            made.reshape(-1)[rng.randrange(made.size)] = rng.choice(VALUES)
+    if rng.random() < 0.02:
+        made = made.astype(np.float64)
+    return made
+
+
+def maybe(rng: random.Random, given: np.ndarray) -> np.ndarray | None:
+    return None if rng.random() < 0.3 else given
+
+
+def rasterizer(rng: random.Random) -> None:
+    n, d, height, width = rng.choice(SIZES), rng.randint(1, 12), rng.choice(SIZES), rng.choice(SIZES)
+    permutation = list(range(d))
+    rng.shuffle(permutation)
+    if rng.random() < 0.1:
+        permutation[rng.randrange(d)] = rng.choice((-1, d, 2**31 - 1, 0))
+    numbers = [
+        rng.choice((rng.gauss(0, 1), rng.choice(VALUES))) if rng.random() < 0.2 else rng.gauss(0, 1)
+        for _ in range(3)
+    ]
+    turn = np.linalg.qr(np.random.default_rng(rng.randrange(2**31)).normal(size=(3, 3)))[0]
+    made = _native.Rasterizer(
+        turn.flatten().tolist(),
+        numbers,
+        [30.0, 30.0, width / 2, height / 2],
+        width,
+        height,
+        0.01,
+        permutation,
+        rng.randint(-1, d + 1),
+    )
+    inputs = [
+        array(rng, n, 3),
+        array(rng, n, 4),
+        np.abs(array(rng, n, 3)),
+        np.abs(array(rng, n)) % 1,
+        array(rng, n, d),
+    ]
+    out, alpha, radius = array(rng, height, width, d), array(rng, height, width), array(rng, n)
+    if rng.random() < 0.9:
+        with contextlib.suppress(ValueError, TypeError):
+            made.forward(*inputs, out, alpha, radius, rng.random() < 0.5)
+    m = n if rng.random() < 0.9 else rng.choice(SIZES)
+    e = d if rng.random() < 0.9 else rng.randint(1, 12)
+    if m != n:
+        inputs = [array(rng, m, 3), array(rng, m, 4), array(rng, m, 3), array(rng, m), array(rng, m, d)]
+    gradients = [array(rng, m, 3), array(rng, m, 4), array(rng, m, 3), array(rng, m), array(rng, m, e)]
+    made.backward(
+        *inputs,
+        out,
+        array(rng, height, width, d),
+        array(rng, height, width),
+        *gradients,
+        maybe(rng, array(rng, m, 2)),
+    )
+
+
+def photometric(rng: random.Random) -> None:
+    h, w = rng.choice(SIZES), rng.choice(SIZES)
+    given = array(rng, h, w, 3), array(rng, h, w, 3), maybe(rng, array(rng, h, w))
+    _native.photometric(*given, rng.choice((0.0, 1.0, h * w)), 0.2, maybe(rng, array(rng, h, w, 3)))
+
+
+def cubemap(rng: random.Random) -> None:
+    side, channels, count = (
+        rng.choice((0, 1, 2, 8, 33)),
+        rng.choice((0, 1, 3, 16)),
+        rng.choice((*SIZES, 5000)),
+    )
+    texture, directions = array(rng, 6, side, side, channels), array(rng, count, 3)
+    _native.cubemap_forward(texture, directions, array(rng, count, channels))
+    grads = maybe(rng, array(rng, 6, side, side, channels)), maybe(rng, array(rng, count, 3))
+    _native.cubemap_backward(texture, directions, array(rng, count, channels), *grads)
+
+
+def reflect(rng: random.Random) -> None:
+    n, d, local = rng.choice((*SIZES, 5000)), rng.randint(5, 12), rng.random() < 0.5
+    features, rays, three = array(rng, n, d), array(rng, n, 3), [array(rng, n, 3) for _ in range(6)]
+    _native.reflect_directions(features, rays, three[0])
+    model = rng.random() < 0.5, local, rng.choice((1.5, 0.0, np.nan))
+    _native.reflect_layers(features, rays, three[0], *model, *three[1:5])
+    layers = [maybe(rng, values) for values in three[1:5]]
+    _native.reflect_backward_layers(features, rays, three[0], *model, *layers, three[5], array(rng, n, d))
+    _native.reflect_backward_directions(features, rays, three[0], array(rng, n, d))
+
+
+def harmonics(rng: random.Random) -> None:
+    n, degree = rng.choice((*SIZES, 3000)), rng.randint(-1, 4)
+    given = array(rng, n, 3), array(rng, 3), array(rng, n, 3), array(rng, n, 15, 3)
+    _native.harmonics_forward(degree, *given, array(rng, n, 3))
+    gradients = array(rng, n, 3), array(rng, n, 3), array(rng, n, 3), array(rng, n, 15, 3)
+    _native.harmonics_backward(degree, *given, *gradients)
+
+
+def axes(rng: random.Random) -> None:
+    n = rng.choice((*SIZES, 3000))
+    given = array(rng, n, 3), array(rng, n, 4), array(rng, n, 3), array(rng, 3), maybe(rng, array(rng, n, 3))
+    grazing = rng.choice((0.0, 0.3, np.nan))
+    _native.axes_forward(*given, grazing, array(rng, n, 3))
+    _native.axes_backward(*given, grazing, array(rng, n, 3), array(rng, n, 4))
+    _native.mirrored_forward(given[0], given[3], array(rng, n, 3), array(rng, n, 3))
+
+
+def finite(rng: random.Random) -> None:
+    _native.first_not_finite(array(rng, *(rng.choice(SIZES) for _ in range(rng.randint(0, 3)))))
+
+
+KINDS = (rasterizer, photometric, cubemap, reflect, harmonics, axes, finite)
+
+
+def main() -> None:
+    """Call everything a number of times."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    ran = refused = 0
+    for number in range(asked.rounds):
+        for kind in KINDS:
+            try:
+                kind(random.Random(f"{asked.seed} {number} {kind.__name__}"))
+                ran += 1
+            except (ValueError, TypeError):
+                refused += 1
+    print(f"bindings: {ran} calls ran, {refused} were refused")
+
+
+if __name__ == "__main__":
+    main()

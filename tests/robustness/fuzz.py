@@ -1,0 +1,70 @@
+"""``make fuzz N=``: the corpus with further seeds; prints what failed, and the seed that repeats it.
+
+python tests/robustness/fuzz.py [--seeds N] [--first SEED] [--only TEXT]
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE", POLARGUIDE_THREADS="1")
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "helpers")]
+
+from base import make_base  # noqa: E402
+from corpus import corpus  # noqa: E402
+from forked import Outcome, outcomes  # noqa: E402
+
+IMPORTED = (
+    "pycolmap",
+    "polarguide.cli.app",
+    "polarguide.api",
+    "polarguide.experiments.study",
+    "polarguide.preparation.prepare",
+)
+
+
+def run(seeds: int = 1, first: int = 0, only: str = "", at_once: int = 2) -> Iterator[Outcome]:
+    """Outcomes of the cases whose name contains a text."""
+    for name in IMPORTED:
+        importlib.import_module(name)
+    for verb in importlib.import_module("polarguide.cli.app").VERBS.values():
+        importlib.import_module(f"polarguide.cli.{verb}")
+    importlib.import_module("torch").set_num_threads(1)
+    importlib.import_module("cv2").setNumThreads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        base, work = Path(folder) / "base", Path(folder) / "work"
+        make_base(base)
+        yield from outcomes((c for c in corpus(first, seeds) if only in c.name), base, work, at_once)
+
+
+def main() -> int:
+    """Run; returns 1 where something failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--say", action="store_true", help="print every outcome")
+    asked = parser.parse_args()
+    kinds: Counter[str] = Counter()
+    longest = largest = 0.0
+    for outcome in run(asked.seeds, asked.first, asked.only):
+        kinds[outcome.kind] += 1
+        longest, largest = max(longest, outcome.seconds), max(largest, outcome.mebibytes)
+        if outcome.is_fault or asked.say:
+            figures = f"{outcome.seconds:.1f} s {outcome.mebibytes:.0f} MiB"
+            print(f"--- {outcome.kind}: {outcome.case.name} (seed {outcome.case.seed}) {figures}")
+            print(outcome.said.strip()[-700:])
+    faults = sum(count for kind, count in kinds.items() if kind not in ("error", "warning", "accepted"))
+    print(f"{sum(kinds.values())} cases: {dict(kinds)}; at most {longest:.1f} s and {largest:.0f} MiB")
+    return int(faults > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
