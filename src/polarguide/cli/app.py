@@ -31,6 +31,7 @@ VERBS = {
     "ablate": "ablate",
     "synth": "synth",
     "bench": "bench",
+    "tables": "tables",
 }
 """The module of each verb, whose function has the module's name. None of them imports torch before it is called."""
 DESCRIPTION = (

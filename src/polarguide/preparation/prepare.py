@@ -155,9 +155,9 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
             if known is not None and poses is not None:
                 warp = poses.warp(view, msgspec.convert(known["geometry"], Geometry)).record()
             if not folder.has(view, warp):
-                fault, found = _write_view(folder, pictures, view, poses)
-                faults += fault
-                notes += found
+                found_faults, found_notes = _write_view(folder, pictures, view, poses)
+                faults += found_faults
+                notes += found_notes
             advance(count)
     for fault in faults[:_NOTES]:
         reporter.warn(fault)
