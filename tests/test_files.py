@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, atomic_folder, make_folder, read_file, write_text, write_whole
+from polarguide.files import atomic, atomic_folder, make_folder, read_file, write_text, write_whole, writing
 
 
 def test_a_file_is_replaced(tmp_path: Path) -> None:
@@ -105,3 +106,20 @@ def test_a_folder_that_fails_changes_nothing(tmp_path: Path) -> None:
         _half_a_folder(tmp_path / "out")
     assert (tmp_path / "out" / "one").read_text() == "1"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_that_cannot_be_copied_is_one_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``shutil.copytree`` goes on after a file that does not fit, and raises one error with a list of all."""
+    (tmp_path / "old" / "below").mkdir(parents=True)
+    for name in ("a", "b", "below/c"):
+        (tmp_path / "old" / name).write_text("x")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copystat", full)
+    with pytest.raises(PolarguideError) as caught, writing(tmp_path / "new"):
+        shutil.copytree(tmp_path / "old", tmp_path / "new")
+    assert caught.value.found == "[Errno 28] No space left on device"

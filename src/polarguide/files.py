@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
+import re
 import shutil
 import stat
 from collections.abc import Iterator
@@ -90,6 +91,11 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
+def holds_files(folder: Path) -> bool:
+    """Whether there is anything in a folder but what a process that was killed left half-written."""
+    return any(re.fullmatch(r"\..+\.\d+\.tmp", path.name) is None for path in folder.iterdir())
+
+
 def _is_alive(process: int) -> bool:
     """Whether there may be such a process; elsewhere than on POSIX, asking would end it."""
     if os.name != "posix":
@@ -146,9 +152,16 @@ def writing(path: Path) -> Iterator[None]:
         raise PolarguideError(
             path,
             expected="to write this file",
-            found=error.strerror or str(error),
+            found=_reason(error),
             remedy="Make room or give rights, and repeat the command: it goes on where it stopped.",
         ) from error
+
+
+def _reason(error: OSError) -> str:
+    """What happened, in words; of a copied folder, what happened to its first file."""
+    if isinstance(error, shutil.Error) and isinstance(error.args[0], list):
+        return str(error.args[0][0][-1])
+    return error.strerror or str(error)
 
 
 def require_folder(path: Path, *, expected: str, remedy: str) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from tiny_capture import NAMES, TinyCapture, write_tiny_capture
 
-from polarguide.capture import load_scene
+from polarguide.capture import load_scene, view_reader
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.memory import KEPT, READ, stated_size
 from polarguide.errors import PolarguideError
@@ -70,6 +71,35 @@ def test_24_huge_pictures_of_their_camera_are_refused_by_their_memory(capture: T
         path.write_bytes(png_of(12_000, 12_000))
     with pytest.raises(PolarguideError, match=r"found 9 views that take .* GiB"):
         load_scene(capture.root, memory=8)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("polar/v003_090.png", r"v003_090\.png: expected 12x10 with 16 bits like .*, found 12000x12000"),
+        ("masks/v002.png", r"v002\.png: expected the size of the pictures, 12x10, found 12000x12000"),
+        ("invalid/v002.png", r"v002\.png: expected the size of the pictures, 12x10, found 12000x12000"),
+    ],
+)
+def test_one_huge_file_of_a_view_is_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, message: str
+) -> None:
+    capture = write_tiny_capture(tmp_path / "tiny")
+    path = capture.root / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(png_of(12_000, 12_000))
+
+    def sized(decode: Any) -> Any:
+        def checked(of: Path, data: bytes, **given: Any) -> Any:
+            assert of != path, "it was decoded"
+            return decode(of, data, **given)
+
+        return checked
+
+    for function in ("decode_picture", "decode_mask"):
+        monkeypatch.setattr(view_reader, function, sized(getattr(view_reader, function)))
+    with pytest.raises(PolarguideError, match=message):
+        load_scene(capture.root, memory=1000)
 
 
 @pytest.mark.parametrize(("order", "mark"), [("<", b"II"), (">", b"MM")])

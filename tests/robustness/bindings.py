@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import random
+from collections import Counter
 
 import numpy as np
 
@@ -66,7 +67,7 @@ def rasterizer(rng: random.Random) -> None:
     out, alpha, radius = array(rng, height, width, d), array(rng, height, width), array(rng, n)
     if rng.random() < 0.9:
         with contextlib.suppress(ValueError, TypeError):
-            made.forward(*inputs, out, alpha, radius, rng.random() < 0.5)
+            made.forward(*inputs, out, alpha, radius, rng.random() < 0.5, rng.random() < 0.8)
     m = n if rng.random() < 0.9 else rng.choice(SIZES)
     e = d if rng.random() < 0.9 else rng.randint(1, 12)
     if m != n:
@@ -132,7 +133,53 @@ def finite(rng: random.Random) -> None:
     _native.first_not_finite(array(rng, *(rng.choice(SIZES) for _ in range(rng.randint(0, 3)))))
 
 
-KINDS = (rasterizer, photometric, cubemap, reflect, harmonics, axes, finite)
+def gbuffer(rng: random.Random) -> None:
+    n, d = rng.choice((*SIZES, 5000)), rng.randint(5, 12)
+    _native.gbuffer_split(array(rng, n, d), array(rng, n), array(rng, n, 3), maybe(rng, array(rng, n)))
+    given = [maybe(rng, array(rng, *shape)) for shape in ((n,), (n, d), (n, 3), (n,), (n,))]
+    _native.gbuffer_join(array(rng, n), *given[:4], array(rng, n, d), given[4])
+
+
+def polarization(rng: random.Random) -> None:
+    n, k = rng.choice((*SIZES, 5000)), rng.choice((0, 1, 2, 3, 4, 9))
+    normal, rays, specular, diffuse = (array(rng, n, 3) for _ in range(4))
+    measured, analyzers, weight = array(rng, k, n, 3), array(rng, k, 3), maybe(rng, array(rng, n))
+    numbers = rng.choice((0.1, 0.0, np.nan, 3e38)), rng.choice((1.5, 1.5, 1.0, -1.0, 1e30, np.inf, np.nan))
+    gradients = (array(rng, n, 3) for _ in range(3))
+    _native.polarization(
+        normal, rays, array(rng, 3, 3), specular, diffuse, measured, analyzers, weight, *numbers, *gradients
+    )
+
+
+def direction(rng: random.Random) -> None:
+    n = rng.choice((*SIZES, 5000))
+    given = array(rng, n, 3), array(rng, n, 3), maybe(rng, array(rng, n))
+    _native.direction(*given, rng.choice((0.1, 0.0, np.nan)), rng.random() < 0.5, array(rng, n, 3))
+
+
+def consistency(rng: random.Random) -> None:
+    h, w = rng.choice((2, 3, 5, 16, 17, 70)), rng.choice((2, 3, 5, 16, 17, 70))
+    n = h * w if rng.random() < 0.95 else rng.choice(SIZES)
+    normal, rays, turn = array(rng, n, 3), array(rng, n, 3), array(rng, 3, 3)
+    given = array(rng, h, w), array(rng, h, w), maybe(rng, array(rng, n))
+    _native.consistency(
+        normal, rays, turn, *given, rng.choice((0.1, np.nan)), array(rng, n, 3), array(rng, h, w)
+    )
+
+
+KINDS = (
+    rasterizer, photometric, cubemap, reflect, harmonics, axes, finite, gbuffer, polarization, direction, consistency,
+)  # fmt: skip
+
+
+def instruction_sets() -> list[str]:
+    """Those that this processor has."""
+    found = []
+    for name in ("baseline", "avx2", "avx512"):
+        with contextlib.suppress(ValueError):
+            _native.select_simd(name)
+            found.append(name)
+    return found
 
 
 def main() -> None:
@@ -141,15 +188,21 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    ran = refused = 0
+    ran: Counter[str] = Counter()
+    refused: Counter[str] = Counter()
+    sets = instruction_sets()
     for number in range(asked.rounds):
+        _native.select_simd(sets[number % len(sets)])
+        _native.set_thread_count((1, 2, 3)[number // len(sets) % 3])
         for kind in KINDS:
             try:
                 kind(random.Random(f"{asked.seed} {number} {kind.__name__}"))
-                ran += 1
+                ran[kind.__name__] += 1
             except (ValueError, TypeError):
-                refused += 1
-    print(f"bindings: {ran} calls ran, {refused} were refused")
+                refused[kind.__name__] += 1
+    idle = [kind.__name__ for kind in KINDS if not ran[kind.__name__]]
+    assert not idle, f"never ran: {idle}"
+    print(f"bindings: {ran.total()} calls ran, {refused.total()} were refused, with {', '.join(sets)}")
 
 
 if __name__ == "__main__":

@@ -6,38 +6,22 @@ python tests/robustness/fuzz.py [--seeds N] [--first SEED] [--only TEXT]
 from __future__ import annotations
 
 import argparse
-import importlib
-import os
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE", POLARGUIDE_THREADS="1")
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "helpers")]
+from warm import warm_up  # it puts the helpers on the path
 
-from base import make_base  # noqa: E402
-from corpus import corpus  # noqa: E402
-from forked import Outcome, outcomes  # noqa: E402
-
-IMPORTED = (
-    "pycolmap",
-    "polarguide.cli.app",
-    "polarguide.api",
-    "polarguide.experiments.study",
-    "polarguide.preparation.prepare",
-)
+from base import make_base  # isort: skip
+from corpus import corpus  # isort: skip
+from forked import Outcome, outcomes  # isort: skip
 
 
 def run(seeds: int = 1, first: int = 0, only: str = "", at_once: int = 2) -> Iterator[Outcome]:
     """Outcomes of the cases whose name contains a text."""
-    for name in IMPORTED:
-        importlib.import_module(name)
-    for verb in importlib.import_module("polarguide.cli.app").VERBS.values():
-        importlib.import_module(f"polarguide.cli.{verb}")
-    importlib.import_module("torch").set_num_threads(1)
-    importlib.import_module("cv2").setNumThreads(1)
+    warm_up()
     with tempfile.TemporaryDirectory() as folder:
         base, work = Path(folder) / "base", Path(folder) / "work"
         make_base(base)

@@ -12,8 +12,8 @@ g++ -std=c++17 -O1 -g -fsanitize=thread -Inative tests/robustness/thread_pool.cp
 
 echo "Kernels: AddressSanitizer and UndefinedBehaviorSanitizer"
 flags="-fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g -O1"
-cmake -S . -B "$build/cmake" -DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_CXX_FLAGS="$flags" -DPython_EXECUTABLE="$(command -v python)" >/dev/null
-cmake --build "$build/cmake" -j "$(nproc)" >/dev/null
+cmake -S . -B "$build/cmake" -DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_CXX_FLAGS="$flags" -DPOLARGUIDE_OPTIMIZE=-O1 -DPython_EXECUTABLE="$(command -v python)" >/dev/null
+cmake --build "$build/cmake" -j "${JOBS:-$(nproc)}" >/dev/null
 rm -rf "$build/src"
 cp -r src "$build/src"
 rm -f "$build"/src/polarguide/_native*.so

@@ -25,11 +25,9 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE", POLARGUIDE_THREADS="1")
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "helpers")]
+from warm import warm_up  # it puts the helpers on the path
 
-from base import MOSAICS, make_base  # noqa: E402
-from fuzz import IMPORTED  # noqa: E402
+from base import MOSAICS, make_base  # isort: skip
 
 RECIPES = ("polarguide-stokes", "polarguide", "polarguide-paper", "3dgs", "3dgs-dr", "ref-gs")
 STEPS = "12"
@@ -162,9 +160,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    for name in IMPORTED:
-        importlib.import_module(name)
-    importlib.import_module("torch").set_num_threads(1)
+    warm_up()
     with tempfile.TemporaryDirectory() as folder:
         make_base(Path(folder) / "base")
         os.chdir(Path(folder) / "base")

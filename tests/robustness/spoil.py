@@ -136,7 +136,8 @@ def picture(path: Path, rng: random.Random, how: str) -> None:
         path.unlink()
         return
     elif how == "huge":
-        pixels = np.zeros((12000, 12000), np.uint8)
+        assert cv2.imwrite(str(path), np.zeros((12000, 12000), np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        return
     elif how == "animated":
         path.write_bytes(b"GIF89a" + rng.randbytes(60))
         return
@@ -171,7 +172,7 @@ def archive(path: Path, rng: random.Random, how: str) -> None:
         value = np.array([{"a": 1}], dtype=object)
     elif how == "bomb":
         with (
-            zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file,
+            zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file,
             file.open("normal.npy", "w", force_zip64=True) as member,
         ):
             np.lib.format.write_array_header_1_0(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from polarguide.camera import Camera
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
+from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes, read_file
 from polarguide.capture.ground_truth import read_ground_truth
 from polarguide.capture.layout import Layout
@@ -126,7 +127,10 @@ def _read_angles(files: Files, paths: dict[int, Path]) -> list[NDArray[Any]]:
     pictures: list[NDArray[Any]] = []
     for angle in ANGLES:
         path = paths[angle]
-        picture = decode_picture(path, files.read(path))
+        data = files.read(path)
+        if pictures:
+            _require_stated_alike(path, data, paths[0], pictures[0])
+        picture = decode_picture(path, data)
         if pictures:
             require_alike(path, picture, paths[0], pictures[0])
         pictures.append(picture)
@@ -148,16 +152,38 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
         )
 
 
-def _read_mask(files: Files, path: Path, size: tuple[int, int], *, any_value: bool) -> NDArray[np.bool_]:
-    mask = decode_mask(path, files.read(path), any_value=any_value)
-    if mask.shape != size:
+def _require_stated_alike(path: Path, data: bytes, first_path: Path, first: NDArray[Any]) -> None:
+    """As ``require_alike``, of a larger picture, by its header: it is not decoded to say so."""
+    stated = _larger(data, first.shape)
+    if stated:
         raise PolarguideError(
             path,
-            expected=f"the size of the pictures, {size[1]}x{size[0]}",
-            found=f"{mask.shape[1]}x{mask.shape[0]}",
-            remedy="Make the mask for these pictures.",
+            expected=f"{_kind(first)} like {'/'.join(first_path.parts[-2:])}",
+            found=stated,
+            remedy="Export the four pictures of a view alike.",
         )
-    return mask
+
+
+def _larger(data: bytes, shape: tuple[int, ...]) -> str:
+    """The size of a picture in words if its header states more pixels than an array has, else nothing."""
+    width, height = declared_size(data) or (0, 0)
+    return f"{width}x{height}" if width * height > shape[0] * shape[1] else ""
+
+
+def _read_mask(files: Files, path: Path, size: tuple[int, int], *, any_value: bool) -> NDArray[np.bool_]:
+    data = files.read(path)
+    found = _larger(data, size)
+    if not found:
+        mask = decode_mask(path, data, any_value=any_value)
+        if mask.shape == size:
+            return mask
+        found = f"{mask.shape[1]}x{mask.shape[0]}"
+    raise PolarguideError(
+        path,
+        expected=f"the size of the pictures, {size[1]}x{size[0]}",
+        found=found,
+        remedy="Make the mask for these pictures.",
+    )
 
 
 def _kind(picture: NDArray[Any]) -> str:

@@ -19,7 +19,7 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import ANGLES
 from polarguide.capture.write import intensity_codes, picture_name, write_view
 from polarguide.errors import PolarguideError
-from polarguide.files import check_out, make_folder, write_whole
+from polarguide.files import check_out, holds_files, make_folder, write_whole
 from polarguide.records import decode, read_record, shortened, to_json
 
 JOURNAL = "prepare.json"
@@ -87,7 +87,7 @@ class SceneFolder:
             self._go_on(path)
             self.begun = True
             self.finished = path == whole and not self._follows_none
-        elif root.exists() and any(root.iterdir()):
+        elif root.exists() and holds_files(root):
             raise PolarguideError(
                 root,
                 expected="a new or empty folder, or an unfinished preparation",
@@ -137,9 +137,10 @@ class SceneFolder:
                     found="a link to another place",
                     remedy="Remove the link, or give another --out; nothing was written.",
                 )
+        make_folder(self.root)
+        self.save()  # first: without it nobody could go on with the folder
         make_folder(self.root / "polar")
         make_folder(self.root / "invalid")
-        self.save()
         (self.root / SCENE).unlink(missing_ok=True)
 
     def save(self) -> None:

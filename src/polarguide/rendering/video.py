@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,14 +45,29 @@ def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: f
                 count += 1
             if writer is not None:
                 writer.close()
+                _require_whole(encoder, named, count)
             named.replace(temporary)
         except (OSError, RuntimeError) as error:
             raise PolarguideError(
                 path,
                 expected="that the video can be encoded",
                 found=str(error).strip().splitlines()[-1][:200] if str(error).strip() else "a failure",
-                remedy="Choose another place or fewer layers.",
+                remedy="Make room, choose another place or fewer layers.",
             ) from None
         finally:
             named.unlink(missing_ok=True)
     return count
+
+
+def _require_whole(encoder: Any, path: Path, count: int) -> None:
+    """Count the pictures of a video: the encoder is another program, whose end on a full disk nobody reports.
+
+    Raises:
+        OSError: there are fewer than were written.
+    """
+    try:
+        found, _ = encoder.count_frames_and_secs(path)
+    except RuntimeError:  # it cannot be read at all
+        found = 0
+    if found != count:
+        raise OSError(f"a file of {found} of {count} pictures, as on a full disk")

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from polarguide.errors import PolarguideError
+from polarguide.files import make_folder, write_whole
 from polarguide.synth.environment import make_environment
 from polarguide.synth.mesh import Array, Mesh, rotation, write_ply
 from polarguide.synth.mitsuba_dicts import area_light_dict, bsdf_dict, environment_dict, shown_dict
@@ -43,12 +44,13 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
     """
     import mitsuba as mi
 
-    (folder / "mesh").mkdir(parents=True, exist_ok=True)
+    make_folder(folder / "mesh")
     meshes = [_mesh(thing, spec) for thing in spec.things]
     for thing, mesh in zip(spec.things, meshes, strict=True):
         write_ply(folder / "mesh" / f"{thing.name}.ply", mesh)
     panorama = make_environment(spec.environment, spec.name, spec.folder)
-    cv2.imwrite(str(folder / "environment.hdr"), panorama[..., ::-1].astype(np.float32))
+    _, encoded = cv2.imencode(".hdr", panorama[..., ::-1].astype(np.float32))
+    write_whole(folder / "environment.hdr", encoded.tobytes())
     pictures = [_texture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
     scenes: list[Any] = []
     first: list[Any] = []

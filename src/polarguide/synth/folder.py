@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from polarguide.capture.write import picture_name
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, write_whole
+from polarguide.files import holds_files, make_folder, write_whole
 from polarguide.polarizer import ANGLES, malus
 from polarguide.records import read_record, shortened
 from polarguide.synth.mesh import Array
@@ -54,7 +54,7 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
     """
     path = out / REQUEST
     remedy = "Give another --out, or remove the folder."
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+    if not out.exists() or (out.is_dir() and not holds_files(out)):
         return "new"
     if not path.is_file():
         raise PolarguideError(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.files import write_whole
 from polarguide.vectors import unit_array
 
 Array = NDArray[np.float64]
@@ -81,7 +82,11 @@ def rotation(degrees: tuple[float, float, float]) -> Array:
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
-    """Write a binary PLY with normals, where there are any, and texture coordinates ``u``, ``v``."""
+    """Write a binary PLY with normals, where there are any, and texture coordinates ``u``, ``v``.
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
     names = ["x", "y", "z"] + (["nx", "ny", "nz"] if mesh.normals is not None else []) + ["u", "v"]
     parts = [mesh.points] + ([mesh.normals] if mesh.normals is not None else []) + [mesh.uv]
     rows = np.concatenate(parts, axis=1).astype("<f4")
@@ -90,4 +95,4 @@ def write_ply(path: Path, mesh: Mesh) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property float {name}" for name in names]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + rows.tobytes() + faces.tobytes())
+    write_whole(path, "\n".join(header).encode() + rows.tobytes() + faces.tobytes())

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera, quaternion
+from polarguide.files import make_folder, write_text
 from polarguide.synth.build import BuiltScene
 from polarguide.synth.geometry import intersect
 from polarguide.synth.mesh import Array
@@ -155,11 +156,15 @@ def _project(camera: Camera, places: Array) -> Array:
 
 
 def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], sparse: SparsePoints) -> None:
-    """Write a COLMAP model as text files."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write a COLMAP model as text files.
+
+    Raises:
+        PolarguideError: a file cannot be written.
+    """
+    make_folder(folder)
     first = cameras[0]
     inner = " ".join(f"{float(v)!r}" for v in (first.fx, first.fy, first.cx, first.cy))
-    (folder / "cameras.txt").write_text(f"# one camera\n1 PINHOLE {first.width} {first.height} {inner}\n")
+    write_text(folder / "cameras.txt", f"# one camera\n1 PINHOLE {first.width} {first.height} {inner}\n")
     seen: list[list[str]] = [[] for _ in names]
     rows = []
     for number, (place, color, track) in enumerate(
@@ -175,10 +180,10 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
         xyz = " ".join(f"{v:.6f}" for v in place)
         rgb = " ".join(str(int(c)) for c in color)
         rows.append(f"{number} {xyz} {rgb} {np.mean(errors):.4f} {' '.join(parts)}")
-    (folder / "points3D.txt").write_text("# points\n" + "\n".join(rows) + "\n")
+    write_text(folder / "points3D.txt", "# points\n" + "\n".join(rows) + "\n")
     lines = []
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
         numbers = (*quaternion(camera.rotation), *camera.translation.tolist())
         pose = " ".join(f"{v:.15g}" for v in numbers)
         lines += [f"{number + 1} {pose} 1 {name}.png", " ".join(seen[number])]
-    (folder / "images.txt").write_text("# two lines an image\n" + "\n".join(lines) + "\n")
+    write_text(folder / "images.txt", "# two lines an image\n" + "\n".join(lines) + "\n")
