@@ -50,13 +50,17 @@ def made_sensor(
             return rng.uniform(-1, 1, size)
         y, x = np.mgrid[: size[0], : size[1]] / max(size)
         places = tiled(rng.uniform(-0.75, 0.75, pattern.angles.shape), size)
-        return np.asarray(places + 0.25 * np.sin(3 * x + rng.uniform(0, 6)) * np.cos(2 * y + rng.uniform(0, 6)))
+        return np.asarray(
+            places + 0.25 * np.sin(3 * x + rng.uniform(0, 6)) * np.cos(2 * y + rng.uniform(0, 6))
+        )
 
     ratio = np.exp(np.log(20) + (errors() + 1) / 2 * np.log(15))
     angle = nominal + np.radians(2.0) * errors()
     gain = 1 + 0.03 * errors()
     strength = (ratio - 1) / (ratio + 1)
     vectors = np.stack([np.ones(size), strength * np.cos(2 * angle), strength * np.sin(2 * angle)], axis=-1)
+    if pattern.colors is not None:  # what passes the color filters of a white light
+        gain = gain * tiled(np.array([0.6, 1.0, 0.75])[pattern.colors], size)
     return MadeSensor(name, vectors * gain[..., None] / 2, nominal)
 
 
@@ -67,14 +71,19 @@ def polarizer_light(degrees: float, level: float = 1.0, extinction: float = np.i
     return level * np.array([1.0, strength * np.cos(turn), strength * np.sin(turn)])
 
 
-def fall_off(size: tuple[int, int], least: float = 0.6) -> np.ndarray:
+def fall_off(size: tuple[int, int], least: float = 0.95) -> np.ndarray:
     """What a lens does to a uniform light, [H, W]: 1 in the middle, ``least`` in the corners."""
     y, x = (np.linspace(-1, 1, length) for length in size)
     return 1 - (1 - least) * (y[:, None] ** 2 + x**2) / 2
 
 
 def write_codes(
-    path: Path, values: np.ndarray, *, black: float = 0.0, electrons: float = 0.0, rng: np.random.Generator | None = None
+    path: Path,
+    values: np.ndarray,
+    *,
+    black: float = 0.0,
+    electrons: float = 0.0,
+    rng: np.random.Generator | None = None,
 ) -> None:
     """A 12-bit mosaic; ``electrons`` at full scale for shot noise, 0 for none."""
     if electrons:

@@ -22,7 +22,7 @@ from polarguide.visualization.figures import write_png
 MOST_DEFECTS = 0.05
 """Share of pixels without a plausible polarizer from which on the fault is not the sensor's."""
 DOUBTFUL = 0.005
-"""Misfit from which on, and DoLP of a flat field above which, a warning is due: it is an error of about as much DoLP."""
+"""Misfit, and DoLP of a flat field, above which a warning is due: DoLP will be wrong by about as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,9 @@ def _diattenuation(settings: CalibrateSettings) -> float:
     return 1.0 if ratio is None else (ratio - 1.0) / (ratio + 1.0)
 
 
-def _solved(files: Shots, measured: Measured, settings: CalibrateSettings, known: list[float] | None) -> ShotFit:
+def _solved(
+    files: Shots, measured: Measured, settings: CalibrateSettings, known: list[float] | None
+) -> ShotFit:
     return solve_shots(
         measured.means,
         np.radians(files.pattern.angles.ravel().astype(np.float64)),
@@ -132,16 +134,19 @@ def _solved(files: Shots, measured: Measured, settings: CalibrateSettings, known
 def _say_shots(fit: ShotFit, settings: CalibrateSettings, measured: Measured, reporter: Reporter) -> None:
     """What was found about the shots, and what nothing in them tells."""
     angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(fit.angles))
-    reporter.say(f"{len(fit.angles)} shots, polarizer at {angles} degrees; misfit {fit.misfit:.2%} of their mean.")
+    reporter.say(
+        f"{len(fit.angles)} shots, polarizer at {angles} degrees; misfit {fit.misfit:.2%} of their mean."
+    )
     if settings.angles is not None:
         drift = f"{fit.levels.max() / fit.levels.min() - 1:.1%}"
         reporter.say(f"The light behind the polarizer varied by {drift}; corrected.")
         if settings.reference == "mean":
-            reporter.say(f"The zero of the angles given lay {np.degrees(-fit.zero):+.2f} degrees off the sensor's mean.")
+            zero = np.degrees(-fit.zero)
+            reporter.say(f"The zero of the angles given lay {zero:+.2f} degrees off the sensor's mean.")
     else:
         reporter.say(
-            "Angles were estimated. The shots do not tell their zero: the positions' mean deviation from their names is "
-            "taken as zero."
+            "Angles were estimated. The shots do not tell their zero: the positions' mean deviation from their names "
+            "is taken as zero."
         )
         if measured.flat is None:
             reporter.say(
@@ -166,11 +171,15 @@ def _say_choice(
 ) -> None:
     own = choice.block == files.pattern.period
     reporter.say(
-        f"Pixels of a block differ by {choice.scatter:.2%}, the noise of a single pixel's vector is {choice.noise:.2%}: "
+        f"Pixels of a block differ by {choice.scatter:.2%}, the noise of one pixel's vector is {choice.noise:.2%}: "
         f"{'each pixel has its own' if own else f'blocks of {choice.block} pixels share vectors'}"
         f"{'' if settings.block is None else ' (as asked)'}."
     )
     if own and choice.noise > choice.scatter:
-        reporter.warn("Noise exceeds what single pixels really differ by: take more shots, or leave --block out.")
+        reporter.warn(
+            "Noise exceeds what single pixels really differ by: take more shots, or leave --block out."
+        )
     if defects:
-        reporter.say(f"{defects} pixels have no plausible polarizer, and got the vector of their neighborhood.")
+        reporter.say(
+            f"{defects} pixels have no plausible polarizer, and got the vector of their neighborhood."
+        )

@@ -30,7 +30,7 @@ class PixelFit:
 
     Attributes:
         vectors: [H, W, 3]; around each pixel, the mean of the first components of its color is 1/2.
-        noise: variance of a vector (the sum over its three components) by the deviations of its shots, mean over pixels.
+        noise: variance of a vector by the deviations of its shots: sum over components, mean over pixels.
         defects: pixels without a plausible polarizer, [H, W].
     """
 
@@ -101,10 +101,23 @@ def plausible(vectors: Any, nominal: Any) -> NDArray[np.bool_]:
     )
 
 
-def choose_block(pixels: PixelFit, offset: tuple[int, int], pattern: Pattern, asked: int | None) -> BlockChoice:
+def choose_block(
+    pixels: PixelFit, offset: tuple[int, int], pattern: Pattern, asked: int | None
+) -> BlockChoice:
     """Choose what shares a vector: single pixels where their noise is less than what their mean over a block hides."""
-    means = block_means(pixels, offset, BLOCK, pattern)
-    deviation = pixels.vectors - _at_pixels(means, offset, BLOCK, pattern, pixels.vectors.shape)
+    around = _at_pixels(
+        block_means(pixels, offset, BLOCK, pattern), offset, BLOCK, pattern, pixels.vectors.shape
+    )
+    deviation = (pixels.vectors - around).astype(np.float64)
+    deviation[pixels.defects] = 0.0
+    # What is common to the pixels of a cell changes its brightness, not its polarization.
+    left, top = pattern.cell_corner()
+    height, width = (
+        (length - cut) // 2 for length, cut in zip(pixels.defects.shape, (top, left), strict=True)
+    )
+    inside = (slice(top, top + 2 * height), slice(left, left + 2 * width))
+    common = (2 * deviation[inside][..., 0]).reshape(height, 2, width, 2).mean(axis=(1, 3))
+    deviation[inside] -= np.repeat(np.repeat(common, 2, axis=0), 2, axis=1)[..., None] * around[inside]
     sound = ~pixels.defects
     spread = float((deviation[sound] ** 2).sum(axis=1).mean()) if sound.any() else 0.0
     scatter = max(0.0, spread - pixels.noise)
@@ -128,13 +141,17 @@ def shared(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: Patte
     """
     if block > pattern.period:
         return block_means(pixels, offset, block, pattern)
-    around = _at_pixels(block_means(pixels, offset, BLOCK, pattern), offset, BLOCK, pattern, pixels.vectors.shape)
+    around = _at_pixels(
+        block_means(pixels, offset, BLOCK, pattern), offset, BLOCK, pattern, pixels.vectors.shape
+    )
     vectors = np.where(pixels.defects[..., None], around, pixels.vectors)
-    return block_means(replace(pixels, vectors=vectors, defects=np.zeros_like(pixels.defects)), offset, block, pattern)
+    return block_means(
+        replace(pixels, vectors=vectors, defects=np.zeros_like(pixels.defects)), offset, block, pattern
+    )
 
 
 def block_means(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
-    """Mean vectors of blocks by place in the pattern of the sensor; the mean over the sensor where no pixel is sound."""
+    """Mean vectors of blocks by place in the pattern; the mean over the sensor where no pixel is sound."""
     height, width, _ = pixels.vectors.shape
     period = pattern.period
     rows, columns = grid_shape(offset, (width, height), block)
@@ -171,20 +188,59 @@ def _nominal(pattern: Pattern, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np.float64]:
-    """Mean over the neighborhood of a pixel, of its cell's color, [H, W]: what the light and the lens do to it.
+    """What the light and the lens do to each pixel, [H, W]: a smooth surface through the brightness of its color.
 
-    It is the same for the pixels of a cell, so that a light that is not quite uniform does not look like polarization.
+    It is smooth, and a plane over a cell, so that a light that is not quite uniform does not look like polarization.
+
+    Args:
+        throughput: [H, W]. pattern: of the region.
     """
     left, top = pattern.cell_corner()
     height, width = ((length - cut) // 2 for length, cut in zip(throughput.shape, (top, left), strict=True))
     inner = throughput[top : top + 2 * height, left : left + 2 * width]
     cells = inner.reshape(height, 2, width, 2).mean(axis=(1, 3))
-    step = 1 if pattern.colors is None else 2
-    for row, column in np.ndindex(step, step):
-        plane = np.ascontiguousarray(cells[row::step, column::step])
-        side = NEIGHBORHOOD if step == 1 else NEIGHBORHOOD // 2
-        cells[row::step, column::step] = cv2.blur(plane, (side, side), borderType=cv2.BORDER_REFLECT)
-    pixels = np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
-    # Pixels outside of whole cells, at odd edges, take what their neighbors have.
-    after = [length - cut - 2 * count for length, cut, count in zip(throughput.shape, (top, left), (height, width), strict=True)]
-    return np.pad(pixels, ((top, after[0]), (left, after[1])), mode="edge")
+    out = np.empty_like(throughput)
+    if pattern.colors is None:
+        return _at_places(_smooth(cells, NEIGHBORHOOD), (left, top), 2, out)
+    for row, column in np.ndindex(2, 2):
+        plane = _smooth(cells[row::2, column::2], NEIGHBORHOOD // 2)
+        surface = _at_places(plane, (left + 2 * column, top + 2 * row), 4, np.empty_like(out))
+        # Pixels beyond the first and last whole cell belong to a cell of this color, too: places repeat every 4.
+        rows = [y for y in range(out.shape[0]) if (y - top) // 2 % 2 == row]
+        columns = [x for x in range(out.shape[1]) if (x - left) // 2 % 2 == column]
+        out[np.ix_(rows, columns)] = surface[np.ix_(rows, columns)]
+    return out
+
+
+def _at_places(
+    cells: NDArray[np.float64], corner: tuple[int, int], step: int, out: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """A surface of cells, 2x2 pixels that lie ``step`` apart from a corner on, interpolated at all pixels."""
+    x = ((np.arange(out.shape[1]) - corner[0] - 0.5) / step).astype(np.float32)
+    y = ((np.arange(out.shape[0]) - corner[1] - 0.5) / step).astype(np.float32)
+    across, down = np.meshgrid(x, y)
+    out[:] = cv2.remap(cells, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return out
+
+
+def _smooth(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    """The plane of least squares through the square around each value, at its middle; smaller squares at the edges."""
+    y, x = np.mgrid[: values.shape[0], : values.shape[1]].astype(np.float64)
+
+    def box(plane: NDArray[np.float64]) -> NDArray[np.float64]:
+        plane = np.ascontiguousarray(plane)
+        return np.asarray(
+            cv2.boxFilter(plane, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        )
+
+    count = box(np.ones_like(values))
+    right, below = box(x) / count - x, box(y) / count - y
+    mean = box(values) / count
+    # Squares are products of intervals: x and y are not correlated in them.
+    spread_x, spread_y = (
+        box(x * x) / count - (box(x) / count) ** 2,
+        box(y * y) / count - (box(y) / count) ** 2,
+    )
+    slope_x = (box(values * x) / count - mean * (box(x) / count)) / np.maximum(spread_x, 1e-9)
+    slope_y = (box(values * y) / count - mean * (box(y) / count)) / np.maximum(spread_y, 1e-9)
+    return np.asarray(mean - slope_x * right - slope_y * below)

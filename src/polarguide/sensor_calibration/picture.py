@@ -38,7 +38,8 @@ def calibration_picture(
     curves = _curves(calibration, said, fit, means, pattern)
     width = max(maps.shape[1], curves.shape[1])
     padded = [
-        np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255) for part in (curves, maps)
+        np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
+        for part in (curves, maps)
     ]
     return np.concatenate(padded)
 
@@ -65,7 +66,12 @@ def _maps(said: Sequence[Position]) -> Picture:
                 rows[index].append(scalar_to_rgb(torch.from_numpy(shown.copy()), low, high, colormap))
     most = 420 if len(colors) == 1 else 256
     return contact_sheet(
-        rows, [f"{angle} deg" for angle in ANGLES], labels, footer=footer, minimum_width=256, maximum_width=most
+        rows,
+        [f"{angle} deg" for angle in ANGLES],
+        labels,
+        footer=footer,
+        minimum_width=256,
+        maximum_width=most,
     )
 
 
@@ -106,9 +112,16 @@ def _curves(
         value = share * top_value
         cv2.line(drawn, at(0, value), at(180, value), _GRID, 1)
         _text(drawn, f"{value:.2f}", 24, at(0, value)[1] + 4)
-    _text(drawn, "angle of the polarizer, degrees; dots are shots, curves the fit", _LEFT + 40, _HEIGHT - 10)
+    _text(
+        drawn,
+        "angle of the polarizer in degrees; share of full scale; dots are shots, curves the fit",
+        _LEFT + 40,
+        _HEIGHT - 10,
+    )
     for angle in ANGLES:
-        points = np.array([at(float(np.degrees(t)), float(v)) for t, v in zip(turns, curves[angle], strict=True)])
+        points = np.array(
+            [at(float(np.degrees(t)), float(v)) for t, v in zip(turns, curves[angle], strict=True)]
+        )
         cv2.polylines(drawn, [points.astype(np.int32)], False, _CURVES[angle], 1, cv2.LINE_AA)
         for turn, value in zip(fit.angles, seen[angle], strict=True):
             cv2.circle(drawn, at(float(np.degrees(turn)), float(value)), 4, _CURVES[angle], -1, cv2.LINE_AA)
@@ -123,20 +136,19 @@ def _curves(
 
 
 def _legend(drawn: Picture, said: Sequence[Position], x: int) -> None:
-    """Medians by angle; of a color sensor, over its colors."""
-    _text(drawn, "through-   extinction   angle error", x + 74, _TOP - 8)
-    _text(drawn, "put        ratio        in degrees", x + 74, _TOP + 10)
-    for line, angle in enumerate(ANGLES):
-        own = [position for position in said if position.angle == angle]
+    """Medians of the positions."""
+    columns = (80, 160, 236)
+    for text, place in zip(("throughput", "extinction", "angle error"), columns, strict=True):
+        _text(drawn, text, x + place - 4, 50, 0.4)
+    for line, position in enumerate(said):
         throughput, extinction, error = (
-            float(np.median([spread(values)[0] for values in parts]))
-            for parts in ([p.throughput for p in own], [p.extinction for p in own], [p.angle_error for p in own])
+            spread(values)[0] for values in (position.throughput, position.extinction, position.angle_error)
         )
-        y = _TOP + 40 + 26 * line
-        cv2.circle(drawn, (x + 6, y - 4), 5, _CURVES[angle], -1, cv2.LINE_AA)
-        _text(drawn, f"{angle} deg", x + 18, y)
+        y = _TOP + line * (26 if len(said) == len(ANGLES) else 20)
+        cv2.circle(drawn, (x + 6, y - 4), 5, _CURVES[position.angle], -1, cv2.LINE_AA)
+        _text(drawn, f"{position.name} deg", x + 18, y)
         ratio = f">{COUNTLESS:.0f}" if extinction > 0.999 * COUNTLESS else f"{extinction:.0f}"
-        for text, place in ((f"{throughput:.3f}", 78), (ratio, 150), (f"{error:+.2f}", 236)):
+        for text, place in zip((f"{throughput:.3f}", ratio, f"{error:+.2f}"), columns, strict=True):
             _text(drawn, text, x + place, y)
 
 

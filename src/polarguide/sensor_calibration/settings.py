@@ -13,7 +13,6 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Sense
 from polarguide.capture.sensor.pattern import sensor_pattern
-from polarguide.capture.sensor.raw_file import RawFormat
 from polarguide.errors import PolarguideError
 from polarguide.records import check_options
 
@@ -96,11 +95,6 @@ class CalibrateSettings:
     def offset(self) -> tuple[int, int]:
         """Column and row at which the region starts."""
         return self.offset_x, self.offset_y
-
-    @property
-    def raw(self) -> RawFormat:
-        """Size and packing of packed files."""
-        return RawFormat(self.width, self.height, self.packing)
 
     def known_angles(self, files: Sequence[Path]) -> list[float] | None:
         """The angle of the polarizer in each file in radians, counter-clockwise as displayed; None if not given.

@@ -16,7 +16,7 @@ from polarguide.capture.sensor.color_filters import SIDE, color_filters
 from polarguide.capture.sensor.packing import PACKINGS
 from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
 from polarguide.capture.sensor.radiometry import Levels, estimate_levels
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, read_mosaic
+from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
 from polarguide.preparation.mosaic_samples import sample_blocks
@@ -134,7 +134,9 @@ class Shots:
         shots = len(self.files)
         return Measured(levels, means[:shots], means[shots:].mean(axis=0) if self._flat else None)
 
-    def linear(self, levels: Levels, reporter: Reporter) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
+    def linear(
+        self, levels: Levels, reporter: Reporter
+    ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
         """Each shot once more: linear intensities [H, W], full scale 1, and whether a sample is saturated."""
         with reporter.track("fitting pixels", len(self.files)) as advance:
             for number, path in enumerate(self.files, 1):
@@ -144,7 +146,8 @@ class Shots:
                 advance(number)
 
     def _read(self, path: Path) -> NDArray[Any]:
-        values = read_mosaic(path, self._settings.raw)
+        asked = self._settings
+        values = read_mosaic(path, RawFormat(asked.width, asked.height, asked.packing))
         if self._first is None:
             if min(values.shape) < _SMALLEST:
                 raise PolarguideError(
@@ -248,15 +251,12 @@ class Shots:
         if low < UNEVEN * high or texture > TEXTURED:
             found = f"{low / high:.0%} of the brightest part in the dimmest, {texture:.0%} of texture"
             raise PolarguideError(
-                self._settings_folder(),
-                expected=f"a uniform light: its dimmest part above {UNEVEN:.0%}, and less than {TEXTURED:.0%} of texture",
+                self.files[0].parent,
+                expected=f"a uniform light: its dimmest part above {UNEVEN:.0%}, texture below {TEXTURED:.0%}",
                 found=found,
-                remedy="Fill the field with a diffuser or an integrating sphere, out of focus, with the polarizer before "
-                "all of it.",
+                remedy="Fill the field with a diffuser or an integrating sphere, out of focus, and all of it with the "
+                "polarizer.",
             )
-
-    def _settings_folder(self) -> Path:
-        return self.files[0].parent
 
 
 def _files(option: str, path: Path | None) -> list[Path]:

@@ -1,8 +1,8 @@
 """Angles and levels of the shots, from the means of all positions of the pattern.
 
-The means form a matrix ``M = X A^T``: X [T, 3] are the Stokes vectors of the shots, ``L (1, e cos 2t, e sin 2t)``, and A
-[K, 3] the analyzer vectors of the positions. Both are estimated at once, by least squares in which A, whose best values
-for given X are linear, is eliminated (variable projection: Golub and Pereyra 1973).
+The means form a matrix ``M = X A^T``: X [T, 3] are the Stokes vectors of the shots, ``L (1, e cos 2t, e sin 2t)``,
+and A [K, 3] the analyzer vectors of the positions. Both are estimated at once, by least squares in which A, linear for
+given X, is eliminated (variable projection, Golub and Pereyra 1973: the minimum of alternating least squares).
 
 What M does not tell: the scale of A against L; where angles are unknown, their common zero and the sense in which they
 count (the pattern's names say it); e, the polarizer's own diattenuation, which scales S1 and S2; and where angles *and*
@@ -98,7 +98,7 @@ def solve_shots(
                 path,
                 expected=f"light through a polarizer, of a DoLP above {POLARIZED:.0%}",
                 found=f"{dolp:.0%}",
-                remedy="Take it through the polarizer; give a picture without it as --flat. Check --sensor and offsets.",
+                remedy="Take it through the polarizer, and the --flat without it. Check --sensor and offsets.",
             )
     if flat is not None:
         s0, s1, s2 = _seen(flat[None], nominal)[0]
@@ -119,14 +119,21 @@ def solve_shots(
     vectors = np.linalg.lstsq(light, means, rcond=None)[0].T
     misfit = float(np.sqrt(np.mean((means - light @ vectors.T) ** 2)) / means.mean())
     if misfit > MISFIT:
-        why = "the angles given" if known is not None else "one steady, unpolarized light behind a turned polarizer"
+        why = (
+            "the angles given"
+            if known is not None
+            else "one steady, unpolarized light behind a turned polarizer"
+        )
         remedy = (
             "Check their order and zero; shots must be linear (no gamma, no automatic exposure within the list)."
             if known is not None
             else "Give --flat (a picture without the polarizer) or --angles; keep lamp and exposure as they are."
         )
         raise PolarguideError(
-            folder, expected=f"shots that agree with {why} within {MISFIT:.0%}", found=f"{misfit:.1%}", remedy=remedy
+            folder,
+            expected=f"shots that agree with {why} within {MISFIT:.0%}",
+            found=f"{misfit:.1%}",
+            remedy=remedy,
         )
     zero = _mean_deviation(vectors, nominal)
     if to_mean:
@@ -158,7 +165,12 @@ def _seen(means: Array, nominal: Array) -> Array:
 
 
 def _refined(
-    means: Array, seen: Array, brightness: Array, known: Sequence[float] | None, flat: Array | None, diattenuation: float
+    means: Array,
+    seen: Array,
+    brightness: Array,
+    known: Sequence[float] | None,
+    flat: Array | None,
+    diattenuation: float,
 ) -> tuple[Array, Array]:
     """Angles and levels that fit best; the first angle, or all that are known, and the first level are held."""
     count = len(means)

@@ -131,10 +131,16 @@ class AnalyzerCalibration:
                 where,
                 expected=f"a calibration of {_region(offset, size)}, or more",
                 found=f"one of {_region(self.offset, self.size)}",
-                remedy="Calibrate with the region of these files, or give --offset-x and --offset-y as the camera was set.",
+                remedy="Calibrate with the region of these files; --offset-x and --offset-y say where it starts.",
             )
 
-    def apply(self, values: Array, *, offset: tuple[int, int] | None = None, scale: int | None = None) -> Array:
+    def record(self) -> dict[str, str]:
+        """What ``scene.json`` says of it."""
+        return {"sensor": self.sensor, "lens": self.lens, "sha256": self.sha256}
+
+    def apply(
+        self, values: Array, *, offset: tuple[int, int] | None = None, scale: int | None = None
+    ) -> Array:
         """Intensities that ideal polarizers would have measured.
 
         Of the four samples I of a cell with the analyzer vectors A [4, 3], ``pinv(A) I`` is the Stokes vector, and the
@@ -209,7 +215,9 @@ class AnalyzerCalibration:
             for step in (1, 2, 4)
         }
         sizes[1] = (2 * sizes[1][0], 2 * sizes[1][1])
-        found = [step for step, size in sizes.items() if size == (width, height)] if scale is None else [scale]
+        found = (
+            [step for step, size in sizes.items() if size == (width, height)] if scale is None else [scale]
+        )
         if not found:
             raise PolarguideError(
                 "calibration",
@@ -225,7 +233,9 @@ class AnalyzerCalibration:
             field_ = field_[..., None]
         elif values.ndim == 3 and field_.ndim == 5:
             field_ = field_.mean(axis=-1)
-        return np.stack([sum(field_[k, j] * values[j] for j in range(4)) for k in range(4)]).astype(np.float32)
+        return np.stack([sum(field_[k, j] * values[j] for j in range(4)) for k in range(4)]).astype(
+            np.float32
+        )
 
     def correction_of_angles(self, offset: tuple[int, int], size: tuple[int, int], scale: int) -> Array:
         """The matrix of each pixel of four intensities at 0, 45, 90 and 135 degrees.
@@ -250,7 +260,9 @@ class AnalyzerCalibration:
             planes = []
             for color in range(3):
                 own = [c for c in corners if int(pattern.colors[2 * c[0], 2 * c[1]]) == color]
-                mean = np.mean([cells[..., row::2, column::2] for row, column in own], axis=0, dtype=np.float32)
+                mean = np.mean(
+                    [cells[..., row::2, column::2] for row, column in own], axis=0, dtype=np.float32
+                )
                 planes.append(_repeated(mean, 4 // scale))
         stacked = np.stack(planes, axis=-1)[:, :, :height, :width]
         return stacked[..., 0] if pattern.colors is None else stacked
@@ -425,7 +437,9 @@ def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
     period = found.pattern.period
     shape = (*grid_shape(found.offset, found.size, found.block), period, period, 3)
     if found.block % period or found.vectors.shape != shape or found.vectors.dtype != np.float32:
-        raise _damaged(path, f"vectors {list(found.vectors.shape)} of {found.vectors.dtype} instead of {list(shape)}")
+        raise _damaged(
+            path, f"vectors {list(found.vectors.shape)} of {found.vectors.dtype} instead of {list(shape)}"
+        )
     gain = found.vectors[..., 0]
     if not (np.isfinite(found.vectors).all() and (gain > 0).all()):
         raise _damaged(path, "vectors that are not finite, or have no throughput")
@@ -435,7 +449,10 @@ def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
 
 def _damaged(path: Path, found: str) -> PolarguideError:
     return PolarguideError(
-        path, expected=f"a file that polarguide calibrate wrote (version {VERSION})", found=found, remedy=_REMEDY
+        path,
+        expected=f"a file that polarguide calibrate wrote (version {VERSION})",
+        found=found,
+        remedy=_REMEDY,
     )
 
 
