@@ -237,16 +237,15 @@ class Shots:
             cells += plane / plane.mean(dtype=np.float64) / step**2
         side = _CELLS * 2 // step
         rows, columns = cells.shape[0] // side, cells.shape[1] // side
-        blocks = cells[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
-        blocks = blocks.reshape(rows * columns, -1)
+        grid = cells[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
+        blocks = grid.reshape(rows * columns, side * side)
         means = blocks.mean(axis=1)
         low, high = np.percentile(means, [1, 99])
         # A gradient is no texture: what a plane through a block explains is left out.
         slope = (np.arange(side) + 0.5) / side - 0.5
-        slopes = [np.tile(slope, side), np.repeat(slope, side)]
         rest = blocks / means[:, None] - 1
-        for plane in slopes:
-            rest = rest - np.outer(rest @ plane / (plane @ plane), plane)
+        for tilt in (np.tile(slope, side), np.repeat(slope, side)):
+            rest = rest - np.outer(rest @ tilt / (tilt @ tilt), tilt)
         texture = float(np.sqrt(np.mean(rest**2)))
         if low < UNEVEN * high or texture > TEXTURED:
             found = f"{low / high:.0%} of the brightest part in the dimmest, {texture:.0%} of texture"

@@ -116,7 +116,7 @@ def solve_shots(
     angles, levels = _refined(means, seen, start[:, 0], known, flat, diattenuation)
     levels = levels / levels.mean()
     light = _stokes(angles, levels, diattenuation)
-    vectors = np.linalg.lstsq(light, means, rcond=None)[0].T
+    vectors = np.asarray(np.linalg.lstsq(light, means, rcond=None)[0].T, np.float64)
     misfit = float(np.sqrt(np.mean((means - light @ vectors.T) ** 2)) / means.mean())
     if misfit > MISFIT:
         why = (

@@ -206,36 +206,49 @@ class AnalyzerCalibration:
         return out
 
     def _four(self, values: Array, offset: tuple[int, int], scale: int | None) -> Array:
-        pattern = self.pattern.shifted(*offset)
-        left, top = pattern.cell_corner()
-        end = (self.offset[0] + self.size[0], self.offset[1] + self.size[1])
-        height, width = values.shape[1:3]
-        sizes = {
-            step: ((end[0] - offset[0] - left) // max(2, step), (end[1] - offset[1] - top) // max(2, step))
-            for step in (1, 2, 4)
-        }
-        sizes[1] = (2 * sizes[1][0], 2 * sizes[1][1])
-        found = (
-            [step for step, size in sizes.items() if size == (width, height)] if scale is None else [scale]
-        )
-        if not found:
+        matrices = self.of_pictures(values.shape[1:3], offset=offset, scale=scale)
+        if values.ndim == 4 and matrices.ndim == 4:
+            matrices = matrices[..., None]
+        elif values.ndim == 3 and matrices.ndim == 5:
+            matrices = matrices.mean(axis=-1)
+        out = np.empty_like(values)
+        product = np.empty_like(values[0])
+        for k in range(4):
+            np.multiply(matrices[k, 0], values[0], out=out[k])
+            for j in range(1, 4):
+                out[k] += np.multiply(matrices[k, j], values[j], out=product)
+        return out
+
+    def of_pictures(
+        self, shape: tuple[int, ...], *, offset: tuple[int, int] | None = None, scale: int | None = None
+    ) -> Array:
+        """The matrix of each pixel of pictures that were developed from mosaics; arguments as in ``apply``.
+
+        Args:
+            shape: height and width of the pictures.
+
+        Returns:
+            What ``correction_of_angles`` gives.
+
+        Raises:
+            PolarguideError: the calibration is of another size.
+        """
+        offset = self.offset if offset is None else offset
+        left, top = self.pattern.shifted(*offset).cell_corner()
+        start = (offset[0] + left, offset[1] + top)
+        columns, rows = ((self.offset[axis] + self.size[axis] - start[axis]) // 2 * 2 for axis in (0, 1))
+        height, width = shape
+        fitting = [step for step in (1, 2, 4) if (rows // step, columns // step) == (height, width)]
+        if scale is None and not fitting:
             raise PolarguideError(
                 "calibration",
-                expected=f"one of {width}x{height} pixels, twice or four times as many each way",
+                expected=f"one of a sensor that gives pictures of {width}x{height} pixels",
                 found=f"one of {_region(self.offset, self.size)}",
                 remedy="Give the calibration of this camera, made with the region of these pictures.",
             )
-        step = found[0]
-        start, size = (offset[0] + left, offset[1] + top), (width * step, height * step)
-        self.require_region(start, size, "calibration")
-        field_ = self.correction_of_angles(start, size, step)
-        if values.ndim == 4 and field_.ndim == 4:
-            field_ = field_[..., None]
-        elif values.ndim == 3 and field_.ndim == 5:
-            field_ = field_.mean(axis=-1)
-        return np.stack([sum(field_[k, j] * values[j] for j in range(4)) for k in range(4)]).astype(
-            np.float32
-        )
+        step = fitting[0] if scale is None else scale
+        self.require_region(start, (width * step, height * step), "calibration")
+        return self.correction_of_angles(start, (width * step, height * step), step)
 
     def correction_of_angles(self, offset: tuple[int, int], size: tuple[int, int], scale: int) -> Array:
         """The matrix of each pixel of four intensities at 0, 45, 90 and 135 degrees.
@@ -260,9 +273,7 @@ class AnalyzerCalibration:
             planes = []
             for color in range(3):
                 own = [c for c in corners if int(pattern.colors[2 * c[0], 2 * c[1]]) == color]
-                mean = np.mean(
-                    [cells[..., row::2, column::2] for row, column in own], axis=0, dtype=np.float32
-                )
+                mean = np.stack([cells[..., row::2, column::2] for row, column in own]).mean(axis=0)
                 planes.append(_repeated(mean, 4 // scale))
         stacked = np.stack(planes, axis=-1)[:, :, :height, :width]
         return stacked[..., 0] if pattern.colors is None else stacked
