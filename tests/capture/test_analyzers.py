@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_sensor import MadeSensor, made_sensor
+from made_sensor import COLORS, MadeSensor, made_sensor, true_calibration
 
 from polarguide.capture.sensor.analyzers import (
     AnalyzerCalibration,
@@ -25,38 +25,12 @@ SENSORS = ("IMX250MZR", "IMX250MYR")
 LIGHT = np.array([0.8, 0.05, -0.06])
 
 
-def true_calibration(sensor: MadeSensor, offset: tuple[int, int] = (0, 0)) -> AnalyzerCalibration:
-    """The calibration that holds the sensor's own vectors, one a pixel."""
-    pattern = sensor_pattern(sensor.name)
-    period = pattern.period
-    height, width, _ = sensor.vectors.shape
-    color = np.ones((height, width))
-    if pattern.colors is not None:
-        color = tiled(np.array([0.6, 1.0, 0.75])[pattern.shifted(*offset).colors], (height, width))
-    rows, columns = (
-        (length + start - 1) // period - start // period + 1
-        for length, start in ((height, offset[1]), (width, offset[0]))
-    )
-    vectors = np.full((rows, columns, period, period, 3), [0.5, 0.5, 0.0], np.float32)
-    for y in range(height):
-        for x in range(width):
-            v, u = y + offset[1], x + offset[0]
-            place = (
-                v // period - offset[1] // period,
-                u // period - offset[0] // period,
-                v % period,
-                u % period,
-            )
-            vectors[place] = sensor.vectors[y, x] / color[y, x]
-    return AnalyzerCalibration(sensor.name, "", offset, (width, height), period, vectors, "mean")
-
-
 def ideal_mosaic(sensor: MadeSensor, stokes: np.ndarray) -> np.ndarray:
     """What ideal polarizers behind the same color filters see."""
     s0, s1, s2 = np.moveaxis(np.broadcast_to(stokes, sensor.vectors.shape), -1, 0)
     seen = (s0 + s1 * np.cos(2 * sensor.nominal) + s2 * np.sin(2 * sensor.nominal)) / 2
     colors = sensor_pattern(sensor.name).colors
-    return seen if colors is None else seen * tiled(np.array([0.6, 1.0, 0.75])[colors], seen.shape)
+    return seen if colors is None else seen * tiled(COLORS[colors], seen.shape)
 
 
 def four(mosaic: np.ndarray, sensor: MadeSensor) -> np.ndarray:

@@ -8,9 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 
 FULL = 4095
+COLORS = np.array([0.6, 1.0, 0.75])
+"""What passes the color filters of a white light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +62,35 @@ def made_sensor(
     gain = 1 + 0.03 * errors()
     strength = (ratio - 1) / (ratio + 1)
     vectors = np.stack([np.ones(size), strength * np.cos(2 * angle), strength * np.sin(2 * angle)], axis=-1)
-    if pattern.colors is not None:  # what passes the color filters of a white light
-        gain = gain * tiled(np.array([0.6, 1.0, 0.75])[pattern.colors], size)
+    if pattern.colors is not None:
+        gain = gain * tiled(COLORS[pattern.colors], size)
     return MadeSensor(name, vectors * gain[..., None] / 2, nominal)
+
+
+def true_calibration(sensor: MadeSensor, offset: tuple[int, int] = (0, 0)) -> AnalyzerCalibration:
+    """The calibration that holds the sensor's own vectors, one a pixel."""
+    pattern = sensor_pattern(sensor.name)
+    period = pattern.period
+    height, width, _ = sensor.vectors.shape
+    color = np.ones((height, width))
+    if pattern.colors is not None:
+        color = tiled(COLORS[pattern.shifted(*offset).colors], (height, width))
+    rows, columns = (
+        (length + start - 1) // period - start // period + 1
+        for length, start in ((height, offset[1]), (width, offset[0]))
+    )
+    vectors = np.full((rows, columns, period, period, 3), [0.5, 0.5, 0.0], np.float32)
+    for y in range(height):
+        for x in range(width):
+            v, u = y + offset[1], x + offset[0]
+            place = (
+                v // period - offset[1] // period,
+                u // period - offset[0] // period,
+                v % period,
+                u % period,
+            )
+            vectors[place] = sensor.vectors[y, x] / color[y, x]
+    return AnalyzerCalibration(sensor.name, "", offset, (width, height), period, vectors, "mean")
 
 
 def polarizer_light(degrees: float, level: float = 1.0, extinction: float = np.inf) -> np.ndarray:
