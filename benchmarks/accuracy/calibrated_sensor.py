@@ -1,7 +1,7 @@
 """Errors of DoLP and AoLP before and after ``calibrate``, on a simulated sensor with made errors.
 
 Extinction ratios of 20 to 300, angles up to 2 degrees off, gains of +-3 %: by place in the pattern (smooth over the
-sensor) or of every pixel by itself. The shots have the noise of 10,000 electrons at full scale; the light that is measured
+sensor) or of every pixel by itself. The shots have the noise of 10,000 electrons at full scale; the light measured
 afterwards has none, so that what is left is the error of the calibration. One row a way of calibrating.
 
     python benchmarks/accuracy/calibrated_sensor.py [--dolp 0.1] [--seeds 3]
@@ -34,7 +34,6 @@ WAYS = {
     "12 unknown angles, steady light": {},
     "12 known angles, lamp polarized by 15 %": {"angles": "names", "levels": LAMP},
     "12 unknown angles, flat, such a lamp": {"flat": True, "levels": LAMP},
-    "12 unknown angles, alone, such a lamp": {"levels": LAMP},
     "5 known angles": {"angles": "names", "degrees": [10.0, 40.0, 75.0, 115.0, 150.0]},
     "every pixel differs; 12 known angles x 8": {"angles": "names", "frames": 8, "single": True},
 }
@@ -52,7 +51,9 @@ def errors(sensor: MadeSensor, calibration: AnalyzerCalibration | None, dolp: fl
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--dolp", type=float, default=0.1)
     parser.add_argument("--seeds", type=int, default=3)
     options = parser.parse_args()
@@ -73,7 +74,9 @@ def main() -> None:
                         flat=folder / "flat.png" if how.get("flat") else None,
                     )  # fmt: skip
                     done = calibrate_sensor(folder / "shots", folder / "c.safetensors", settings)
-                rows.append([*errors(sensor, None, options.dolp), *errors(sensor, done.calibration, options.dolp)])
+                rows.append(
+                    [*errors(sensor, None, options.dolp), *errors(sensor, done.calibration, options.dolp)]
+                )
             dolp, aolp, dolp_after, aolp_after = np.mean(rows, axis=0)
             print(
                 f"{way:42} {name:10} {dolp:.4f}, {dolp_after:.4f} {dolp / dolp_after:21.1f}   "
@@ -89,8 +92,12 @@ def speed() -> None:
     for block in (32, 2):
         rows, columns = -(-2048 // block), -(-2448 // block)
         turn = np.radians([[90, 45], [135, 0]]) + rng.normal(0, 0.01, (rows, columns, 2, 2))
-        vectors = np.stack([np.ones_like(turn), 0.95 * np.cos(2 * turn), 0.95 * np.sin(2 * turn)], axis=-1) / 2
-        found = AnalyzerCalibration("IMX250MZR", "", (0, 0), (2448, 2048), block, vectors.astype(np.float32), "mean")
+        vectors = (
+            np.stack([np.ones_like(turn), 0.95 * np.cos(2 * turn), 0.95 * np.sin(2 * turn)], axis=-1) / 2
+        )
+        found = AnalyzerCalibration(
+            "IMX250MZR", "", (0, 0), (2448, 2048), block, vectors.astype(np.float32), "mean"
+        )
         mosaic = rng.uniform(0, 1, (2048, 2448)).astype(np.float32)
         seconds = []
         for _ in range(2):
@@ -98,7 +105,9 @@ def speed() -> None:
             found.apply(mosaic)
             seconds.append(time.process_time() - begin)
         kind = "vectors of single pixels" if block == 2 else "blocks of 32 pixels"
-        print(f"2448x2048, {kind}: {seconds[0]:.2f} s of CPU for the first mosaic, {seconds[1]:.2f} s for the next")
+        print(
+            f"2448x2048, {kind}: {seconds[0]:.2f} s of CPU for the first mosaic, {seconds[1]:.2f} s for the next"
+        )
 
 
 if __name__ == "__main__":

@@ -94,6 +94,7 @@ def test_four_intensities_at_every_size_get_the_same_correction() -> None:
     np.testing.assert_allclose(
         calibration.apply(three), np.repeat(expected[..., None], 3, axis=-1), atol=2e-6
     )
+    np.testing.assert_allclose(calibration.apply(seen[..., None]), expected[..., None], atol=2e-6)
     doubled = np.repeat(np.repeat(seen, 2, axis=1), 2, axis=2)
     np.testing.assert_allclose(calibration.apply(doubled)[:, ::2, ::2], expected, atol=2e-6)
     quarter = calibration.apply(seen.reshape(4, 6, 2, 8, 2).mean(axis=(2, 4)))

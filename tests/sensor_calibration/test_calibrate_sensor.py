@@ -302,7 +302,12 @@ def polarized_flat(folder: Path) -> dict[str, Any]:
 
 
 def polarized_lamp(folder: Path) -> dict[str, Any]:
-    write_at(folder, DEGREES, level=0.5, levels=list(1 + 0.4 * np.cos(4 * np.radians(DEGREES))))
+    write_at(folder, DEGREES, level=0.55, levels=DRIFT)
+    return {}
+
+
+def flickering_lamp(folder: Path) -> dict[str, Any]:
+    write_at(folder, DEGREES, level=0.55, levels=[1.0, 1.06] * 6)
     return {}
 
 
@@ -348,7 +353,8 @@ REFUSED = {
     other_sense: ("--angles", "give the other --sense"),
     other_zero: ("--angles", "a zero that lies"),
     polarized_flat: ("--flat", "expected unpolarized light"),
-    polarized_lamp: ("shots", "one steady, unpolarized light"),
+    polarized_lamp: ("shots", "the lamp is polarized, or it or the exposure changed"),
+    flickering_lamp: ("shots", "one steady, unpolarized light behind a turned polarizer within 2%"),
     count_of_angles: ("--angles", "an angle for each of the 12 shots, found 5 angles"),
     nameless: ("shot_last", "a name that ends in the angle"),
     color_of_gray: ("--sensor", "the Bayer pattern of color filters"),

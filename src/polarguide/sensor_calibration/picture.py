@@ -137,7 +137,7 @@ def _curves(
 
 def _legend(drawn: Picture, said: Sequence[Position], x: int) -> None:
     """Medians of the positions."""
-    columns = (80, 160, 236)
+    columns = (90, 168, 242)
     for text, place in zip(("throughput", "extinction", "angle error"), columns, strict=True):
         _text(drawn, text, x + place - 4, 50, 0.4)
     for line, position in enumerate(said):

@@ -35,6 +35,8 @@ POLARIZED = 0.5
 """Least DoLP of a shot through a polarizer."""
 FLAT_POLARIZED = 0.1
 """DoLP from which a flat field is certainly polarized: no gains of a sensor look like this."""
+UNSTEADY = 0.15
+"""Change of the brightness over the shots that errors of a sensor (3 % of gain, extinction ratios of 20) may cause."""
 LARGEST_ZERO = np.radians(10.0)
 ALIKE = 0.9
 """Agreement of two lists of angles, 1 where they differ by a constant."""
@@ -110,6 +112,8 @@ def solve_shots(
                 remedy="Take it without the polarizer, of a light behind a thick diffuser; no screen, no reflection.",
             )
     seen = np.arctan2(start[:, 2], start[:, 1]) / 2
+    if known is None and flat is None:
+        _require_steady(start[:, 0], folder)
     if known is not None:
         _require_match(np.asarray(known), seen, folder, to_mean)
     _require_different(seen if known is None else np.asarray(known), folder, known is not None)
@@ -143,6 +147,18 @@ def solve_shots(
         s0, s1, s2 = np.linalg.lstsq(vectors, flat, rcond=None)[0]
         flat_dolp = float(np.hypot(s1, s2) / s0)
     return ShotFit(np.mod(angles, np.pi), levels, vectors, misfit, zero, flat_dolp)
+
+
+def _require_steady(brightness: Array, folder: Path) -> None:
+    """Refuse light that changes from shot to shot where nothing else tells it from the sensor's own polarization."""
+    change = float(brightness.max() / brightness.min()) - 1
+    if change > UNSTEADY:
+        raise PolarguideError(
+            folder,
+            expected=f"one steady, unpolarized light, whose shots differ by at most {UNSTEADY:.0%} in brightness",
+            found=f"{change:.0%}: the lamp is polarized, or it or the exposure changed",
+            remedy="Give --angles, or --flat (a picture without the polarizer), which measure the light of each shot.",
+        )
 
 
 def _stokes(angles: Array, levels: Array, diattenuation: float) -> Array:

@@ -31,6 +31,8 @@ SUFFIX = ".safetensors"
 LEAST_DIATTENUATION = 0.3
 """Of a pixel's polarizer; below it, its angle and the correction mean nothing. (Extinction ratio 1.9.)"""
 _ENTRY, _TENSOR = "polarguide", "vectors"
+_AT_ONCE = 16
+"""Rows of cells whose matrices are made at once: their parts then stay in the processor's cache."""
 _REMEDY = "Calibrate again (polarguide calibrate), or copy the file again."
 
 Array = NDArray[np.float32]
@@ -149,8 +151,8 @@ class AnalyzerCalibration:
         noise can still be told from it. Samples have to be linear and without black level; they may be scaled.
 
         Args:
-            values: a mosaic [H, W]; or four intensities at 0, 45, 90 and 135 degrees, [4, h, w] or [4, h, w, 3], as
-                developed from one at its size, half or a quarter of it.
+            values: a mosaic [H, W]; or four intensities at 0, 45, 90 and 135 degrees, [4, h, w] or [4, h, w, C] with
+                1 or 3 channels, as developed from one at its size, half or a quarter of it.
             offset: column and row of the sensor at which the mosaic starts; that of the calibration if None.
             scale: pixels of the sensor that became one of four intensities, each way (1, 2 or 4); if None, as the
                 size says.
@@ -166,8 +168,8 @@ class AnalyzerCalibration:
         start = self.offset if offset is None else offset
         if values.ndim == 2:
             return self._mosaic(values, start)
-        if values.ndim not in (3, 4) or values.shape[0] != 4 or (values.ndim == 4 and values.shape[3] != 3):
-            raise ValueError(f"expected [H, W], [4, H, W] or [4, H, W, 3], found {list(values.shape)}")
+        if values.ndim not in (3, 4) or values.shape[0] != 4 or values.shape[3:] not in ((), (1,), (3,)):
+            raise ValueError(f"expected [H, W], [4, H, W] or [4, H, W, C], found {list(values.shape)}")
         return self._four(values, start, scale)
 
     def correction(self, offset: tuple[int, int], size: tuple[int, int]) -> Array:
@@ -209,8 +211,8 @@ class AnalyzerCalibration:
         matrices = self.of_pictures(values.shape[1:3], offset=offset, scale=scale)
         if values.ndim == 4 and matrices.ndim == 4:
             matrices = matrices[..., None]
-        elif values.ndim == 3 and matrices.ndim == 5:
-            matrices = matrices.mean(axis=-1)
+        elif values.shape[3:] != (3,) and matrices.ndim == 5:
+            matrices = matrices.mean(axis=-1, keepdims=values.ndim == 4)
         out = np.empty_like(values)
         product = np.empty_like(values[0])
         for k in range(4):
@@ -287,12 +289,16 @@ class AnalyzerCalibration:
         if found is None:
             rows, columns = (self._places(axis, offset[1 - axis], size[1 - axis]) for axis in (0, 1))
             (y, which_row), (x, which_column) = rows, columns
-            analyzers = [
-                self.vectors[y[2 * r][:, None], x[2 * c], y[2 * r + 1][:, None], x[2 * c + 1]]
-                for r, c in np.ndindex(2, 2)
-            ]
             nominal = self.pattern.shifted(*offset).angles[:2, :2].ravel()
-            found = correction_matrices(analyzers, nominal), which_row, which_column
+            matrices = np.empty((4, 4, y.shape[1], x.shape[1]), np.float32)
+            for first in range(0, y.shape[1], _AT_ONCE):
+                part = y[:, first : first + _AT_ONCE, None]
+                analyzers = [
+                    self.vectors[part[2 * r], x[2 * c], part[2 * r + 1], x[2 * c + 1]]
+                    for r, c in np.ndindex(2, 2)
+                ]
+                matrices[:, :, first : first + _AT_ONCE] = correction_matrices(analyzers, nominal)
+            found = matrices, which_row, which_column
             self._matrices.clear()
             self._matrices[key] = found
         return found
