@@ -33,6 +33,7 @@ ROOMS = (
     "raster",
     "shading",
     "visualization",
+    "sensor_calibration",
     "training",
     "recipes",
     "runs",

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polarguide import optics
-    from polarguide.api import Run, demo_scene, inspect, open_run, prepare, priors, train
+    from polarguide.api import Run, calibrate, demo_scene, inspect, open_run, prepare, priors, train
     from polarguide.capture import Scene, load_scene
+    from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
     from polarguide.errors import PolarguideError, PolarguideWarning
     from polarguide.experiments.ablate import ablate
     from polarguide.experiments.compare import compare
@@ -21,14 +22,16 @@ if TYPE_CHECKING:
     from polarguide.options import SceneOptions, SessionOptions
     from polarguide.preparation.settings import PrepareSettings
     from polarguide.progress import Reporter
+    from polarguide.sensor_calibration.settings import CalibrateSettings
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
 
     __version__: str
 
 _NAMES = {
-    "api": ("Run", "demo_scene", "inspect", "open_run", "prepare", "priors", "train"),
+    "api": ("Run", "calibrate", "demo_scene", "inspect", "open_run", "prepare", "priors", "train"),
     "capture": ("Scene", "load_scene"),
+    "capture.sensor.analyzers": ("AnalyzerCalibration", "read_analyzers"),
     "errors": ("PolarguideError", "PolarguideWarning"),
     "experiments.ablate": ("ablate",),
     "experiments.compare": ("compare",),
@@ -37,6 +40,7 @@ _NAMES = {
     "options": ("SceneOptions", "SessionOptions"),
     "preparation.settings": ("PrepareSettings",),
     "progress": ("Reporter",),
+    "sensor_calibration.settings": ("CalibrateSettings",),
     "training.recipe": ("Recipe",),
     "training.settings": ("TrainSettings",),
 }
@@ -44,6 +48,8 @@ _NAMES = {
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
+    "AnalyzerCalibration",
+    "CalibrateSettings",
     "CompareOptions",
     "InspectSettings",
     "PolarguideError",
@@ -58,6 +64,7 @@ __all__ = [
     "TrainSettings",
     "__version__",
     "ablate",
+    "calibrate",
     "compare",
     "demo_scene",
     "inspect",
@@ -66,6 +73,7 @@ __all__ = [
     "optics",
     "prepare",
     "priors",
+    "read_analyzers",
     "train",
 ]
 

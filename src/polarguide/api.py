@@ -28,6 +28,7 @@ from polarguide.rendering import film, pictures, relight
 from polarguide.rendering.priors import write_priors
 from polarguide.runs import train as training
 from polarguide.runs.opened import OpenedRun
+from polarguide.sensor_calibration.calibrate import calibrate_sensor
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.viewer import watch
@@ -63,6 +64,7 @@ class Run(OpenedRun):
 
 
 open_run = Run.open
+calibrate = calibrate_sensor
 prepare = prepare_scene
 priors = write_priors
 

@@ -18,6 +18,7 @@ from polarguide.errors import PolarguideError
 
 VERBS = {
     "demo": "demo",
+    "calibrate": "calibrate",
     "prepare": "prepare",
     "inspect": "inspect",
     "train": "train",
@@ -111,6 +112,7 @@ def _near(word: str) -> str:
         "web": "share",
         "new": "demo",
         "check": "inspect",
+        "calibration": "calibrate",
     }
     near = difflib.get_close_matches(word.lower(), VERBS, 1, 0.6)
     verb = others.get(word.lower()) or (near[0] if near else "")

@@ -10,6 +10,7 @@ import tyro
 
 from polarguide.cli.console import console, use_threads
 from polarguide.cli.progress import ConsoleReporter
+from polarguide.errors import PolarguideError
 from polarguide.inspection.settings import InspectSettings
 from polarguide.options import ComputeOptions
 
@@ -35,6 +36,13 @@ def inspect(
         out: Folder to write; without it SCENE-inspection beside the scene.
         fix: New folder for a corrected copy of the scene, if order, sense or zero are wrong and decided.
     """
+    if fix is not None and settings.calibration is not None:
+        raise PolarguideError(
+            "--fix",
+            expected="no --calibration beside it: the copy would be without it",
+            found="both",
+            remedy="Prepare the mosaics anew with --calibration, and fix that scene.",
+        )
     use_threads(compute.threads)
     reporter = ConsoleReporter()
     inspection = importlib.import_module("polarguide.inspection.inspect")

@@ -34,9 +34,8 @@ def prepare(
     """
     use_threads(compute.threads)
     preparation = importlib.import_module("polarguide.preparation.prepare")
-    done = preparation.prepare_scene(
-        source, out, replace(settings, calibration=angles.read()), ConsoleReporter()
-    )
+    asked = replace(settings, calibration=angles.read(), analyzers=angles.analyzers())
+    done = preparation.prepare_scene(source, out, asked, ConsoleReporter())
     without = f", {len(done.left_out)} left out" if done.left_out else ""
     console.print(f"scene: {done.folder} ({len(done.views)} views{without})", markup=False)
     if done.posed:

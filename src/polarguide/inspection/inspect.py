@@ -10,6 +10,7 @@ from pathlib import Path
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out
+from polarguide.inspection.analyzers import analyzer_check, corrected
 from polarguide.inspection.angle_checks import (
     AngleFindings,
     combine_evidence,
@@ -92,6 +93,8 @@ def inspect_scene(
     """
     check_options(settings)
     capture = read_capture(path, downscale=settings.downscale, transfer=settings.transfer, reporter=reporter)
+    if settings.calibration is not None:
+        capture = corrected(capture, settings.calibration)
     index = settings.refractive_index or capture.refractive_index or 1.5
     measurements: list[ViewMeasurements] = []
     with reporter.track("measuring", len(capture.views)) as advance:
@@ -100,6 +103,8 @@ def inspect_scene(
             advance(len(measurements))
     pairing = find_pairing(capture)
     checks = picture_checks(capture, measurements, pairing)
+    calibrated = analyzer_check(capture, settings.calibration)
+    checks += [] if calibrated is None else [calibrated]
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), coverage_check(capture)]
     angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)

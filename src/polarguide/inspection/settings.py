@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -24,6 +25,7 @@ class InspectSettings:
         refractive_index: Of the surfaces; without it as scene.json says, else 1.5.
         downscale: Average the pictures over boxes of this many pixels first; 0 until they are at most 640 pixels wide.
         transfer: How the files encode radiance.
+        calibration: File of polarguide calibrate: inspect the scene as that of its sensor corrects it.
     """
 
     normals: Normals = "auto"
@@ -31,3 +33,4 @@ class InspectSettings:
     refractive_index: Annotated[float, Meta(gt=1, lt=4)] | None = None
     downscale: Annotated[int, Meta(ge=0)] = 0
     transfer: Transfer = "linear"
+    calibration: Path | None = None

@@ -111,6 +111,7 @@ class SceneFolder:
         before, now = json.loads(json.dumps(state["request"])), json.loads(json.dumps(self.request))
         if before["settings"].get("white_balance") == "grey":  # its name in earlier journals
             before["settings"]["white_balance"] = "gray"
+        before["settings"].setdefault("analyzers", None)  # earlier journals do not know it
         self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
         if self._follows_none:
             for record in (before, now):

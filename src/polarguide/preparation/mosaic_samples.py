@@ -23,7 +23,11 @@ def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
 
 
 def block_intensities(
-    samples: list[NDArray[Any]], levels: Levels, floor: NDArray[np.float32] | None, pattern: Pattern
+    samples: list[NDArray[Any]],
+    levels: Levels,
+    floor: NDArray[np.float32] | None,
+    pattern: Pattern,
+    matrices: NDArray[np.float32] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Intensities at the centers of blocks: by angle [4, N], by color [3, N], and whether each is usable [N].
 
@@ -35,11 +39,18 @@ def block_intensities(
         levels: of the capture.
         floor: ``sample_blocks`` of the dark frame, or None.
         pattern: of the mosaics.
+        matrices: [4, 4, ...]: ``sample_blocks`` of the corrections of cells, in blocks of one period, or None.
     """
     values = np.concatenate(samples)
     dark = None if floor is None else np.tile(floor, (len(samples), 1, 1))
     linear = levels.linear(values, dark).astype(np.float64)
     period = pattern.period
+    if matrices is not None:
+        cells = linear.reshape(len(samples), -1, period, 2, period, 2)
+        planes = [cells[..., row, :, column].copy() for row, column in np.ndindex(2, 2)]
+        for index, (row, column) in enumerate(np.ndindex(2, 2)):
+            done = sum(matrices[index, other] * plane for other, plane in enumerate(planes))
+            cells[..., row, :, column] = done
     rising = (np.arange(period) + 0.5) / period
     tent = np.concatenate([rising, rising[::-1]])
     weighted = linear * tent[:, None] * tent

@@ -14,6 +14,7 @@ from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_g
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.layout import index_files
+from polarguide.capture.sensor.analyzers import read_analyzers, spread_to_cells
 from polarguide.capture.sensor.color_filters import SIDE, color_filters
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.packing import PACKINGS
@@ -27,6 +28,8 @@ from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
+CALIBRATED_IMBALANCE = 0.01
+"""Of the pair sums of a calibrated sensor; more is a sign of another camera's calibration."""
 _SMALLEST = 16
 
 
@@ -65,10 +68,14 @@ class MosaicSource(Source):
         self._files = {view: files[view] for view in sorted(names)}
         self.views = list(self._files)
         self.paths = list(self._files.values() if dataset is None else dataset.paths)
-        self.paths += [] if self._dark_path is None else [self._dark_path]
+        self.paths += [path for path in (self._dark_path, settings.analyzers) if path is not None]
+        self._analyzers = None if settings.analyzers is None else read_analyzers(settings.analyzers)
+        if self._analyzers is not None:
+            self._analyzers.require_sensor(settings.sensor, settings.analyzers)
         pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
         self._crop = pattern.cell_corner()
         self._pattern = pattern.shifted(*self._crop)
+        self._corner = (settings.offset_x + self._crop[0], settings.offset_y + self._crop[1])
         self._white = white_gains(settings.white_balance)
         if self._pattern.colors is None and settings.white_balance != "none":
             raise PolarguideError(
@@ -88,6 +95,9 @@ class MosaicSource(Source):
             values = read_mosaic(path, self._raw)
             shape = shape or (values.shape, values.dtype)
             self._require_alike(path, values, shape)
+            if self._analyzers is not None and count == 1:
+                offset = (self._settings.offset_x, self._settings.offset_y)
+                self._analyzers.require_region(offset, values.shape[::-1], self._settings.analyzers)
             container = self._container(path, values)
             largest, used = max(largest, int(values.max())), used | int(np.bitwise_or.reduce(values, None))
             samples.append(sample_blocks(self._cut(values), 2 * self._pattern.period))
@@ -104,7 +114,15 @@ class MosaicSource(Source):
             self._require_kind(np.concatenate(blocks), levels)
         dark = self._dark(shape[0])
         floor = None if dark is None else sample_blocks(dark, 2 * self._pattern.period)
-        angles, colors, usable = block_intensities(samples, levels, floor, self._pattern)
+        width, height = ((shape[0][axis] - self._crop[1 - axis]) // 2 * 2 for axis in (1, 0))
+        matrices, brighter = None, 1.0
+        if self._analyzers is not None:
+            cells = self._analyzers.correction(self._corner, (width, height))
+            matrices = np.stack(
+                [[sample_blocks(cell, self._pattern.period) for cell in row] for row in cells]
+            )
+            brighter = self._analyzers.peak(self._corner, (width, height))
+        angles, colors, usable = block_intensities(samples, levels, floor, self._pattern, matrices)
         ratio = pair_ratio(angles, usable)
         gains, notes = self._gains(ratio)
         notes += [] if self._dataset is None else self._dataset.notes
@@ -113,13 +131,14 @@ class MosaicSource(Source):
                 f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale."
             )
         white = self._white or gray_world(colors[:, usable])
-        peak = max(white) / min(gains) * asked.calibration.peak
+        peak = max(white) / min(gains) * asked.calibration.peak * brighter
         return {
             "levels": asdict(levels),
             "pattern": self._pattern.rows(),
             "crop": list(self._crop),
             "pair_ratio": ratio,
             "gains": list(gains),
+            "analyzers": None if self._analyzers is None else self._analyzers.record(),
             "white_balance": list(white),
             "scale": 1.0 / max(1.0, peak),
             "notes": notes,
@@ -133,10 +152,13 @@ class MosaicSource(Source):
         values = self._cut(stored)
         levels = Levels(**measured["levels"])
         saturated, black = unusable_samples(values, levels, dark)
-        linear = levels.linear(values, dark) * self._sample_gains(values.shape, measured)
+        bad, linear = saturated | black, levels.linear(values, dark)
+        if self._analyzers is not None:
+            linear, bad = self._analyzers.apply(linear, offset=self._corner), spread_to_cells(bad)
+        linear = linear * self._sample_gains(values.shape, measured)
         asked = self._settings
         picture = demosaic(
-            linear, saturated | black, self._pattern,
+            linear, bad, self._pattern,
             mode=asked.demosaic, interpolation=asked.interpolation, registered=asked.register,
         )  # fmt: skip
         intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), asked.calibration)
@@ -213,6 +235,13 @@ class MosaicSource(Source):
     def _gains(self, ratio: float | None) -> tuple[tuple[float, float, float, float], list[str]]:
         """Gains of the angles, and notes about them."""
         asked = self._settings
+        if self._analyzers is not None:
+            if ratio is None:
+                return UNIT_GAINS, []
+            notes = [f"With the calibration, I0 + I90 is {ratio - 1:+.2%} off I45 + I135."]
+            if abs(ratio - 1) > CALIBRATED_IMBALANCE:
+                notes.append("That is more than a calibration of this camera leaves: is it one of another?")
+            return UNIT_GAINS, notes
         if asked.calibration.gains is not None:
             return asked.calibration.gains, []
         if asked.gains == "none":

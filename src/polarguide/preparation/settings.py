@@ -14,6 +14,7 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
+from polarguide.capture.sensor.analyzers import is_analyzer_file
 from polarguide.errors import PolarguideError
 from polarguide.records import check_options, option_name
 
@@ -22,7 +23,7 @@ ORIGINS = ("auto", "dataset", "sfm", "none")
 """What poses can be instead of a path."""
 _MOSAIC_ONLY = (
     "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
-    "saturation", "white_balance", "demosaic", "interpolation", "register",
+    "saturation", "white_balance", "demosaic", "interpolation", "register", "analyzers",
 )  # fmt: skip
 _OPTIONS = {
     "mosaic": _MOSAIC_ONLY,
@@ -60,6 +61,7 @@ class PrepareSettings:
         gains: auto corrects what the light tells of the gains of the angles; none leaves them. Gains of a calibration
             go first.
         calibration: gains, order, sense and zero of the angles.
+        analyzers: calibration of the sensor that polarguide calibrate wrote; takes the place of gains.
         poses: sfm, dataset, none, or the path of a COLMAP model, transforms.json (nerfstudio), cameras.xml (Metashape)
             or cameras.npz (IDR); auto takes those of a dataset, else sfm.
         matching: Pairs that SfM compares: all, or neighbors in the order of their names.
@@ -89,6 +91,7 @@ class PrepareSettings:
     align: bool = True
     gains: Literal["auto", "none"] = "auto"
     calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
+    analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
     poses: str = "auto"
     matching: Literal["exhaustive", "sequential"] = "exhaustive"
     sfm_pictures: Literal["photograph", "minimum"] = "photograph"
@@ -106,6 +109,13 @@ class PrepareSettings:
         check_options(self)
         checked(self.calibration, "calibration")
         white_gains(self.white_balance)
+        if self.analyzers is not None and self.calibration.gains is not None:
+            raise PolarguideError(
+                "calibration (gains)",
+                expected="none beside the analyzers of polarguide calibrate, which hold the gains of every pixel",
+                found=str(self.calibration.gains),
+                remedy="Leave one of them out.",
+            )
         if self.intrinsics is not None:
             known_intrinsics(self.intrinsics)
         elif self.refine_intrinsics:
@@ -119,6 +129,7 @@ class PrepareSettings:
             self,
             white_balance="gray" if self.white_balance == "grey" else self.white_balance,
             dark_frame=_absolute(self.dark_frame),
+            analyzers=_absolute(self.analyzers),
             poses=self.poses if self.poses in ORIGINS else os.path.realpath(self.poses),
             masks=_absolute(self.masks),
         )
@@ -134,7 +145,8 @@ class CalibrationOptions:
     """A calibration as the command line states it.
 
     Attributes:
-        calibration: JSON file with gains, order, sense and zero; the three options below go first.
+        calibration: File of polarguide calibrate (.safetensors), or JSON file with gains, order, sense and zero; the
+            three options below go first.
         order: Angle of the pictures called 0, 45, 90 and 135, such as 90,45,0,135.
         sense: How the angles count as the picture is displayed; without it ccw, or as the dataset says.
         zero: Where their zero lies, in degrees counter-clockwise from the image's horizontal.
@@ -151,12 +163,21 @@ class CalibrationOptions:
         Raises:
             PolarguideError: the file or the order is wrong.
         """
-        found = Calibration() if self.calibration is None else read_calibration(self.calibration)
+        if self.calibration is None or self.analyzers() is not None:
+            found = Calibration()
+        else:
+            found = read_calibration(self.calibration)
         if self.order is not None:
             found = replace(found, order=_four_angles(self.order))
         if self.sense is not None:
             found = replace(found, sense=self.sense)
         return found if self.zero is None else replace(found, zero=self.zero)
+
+    def analyzers(self) -> Path | None:
+        """The file, if it is one of polarguide calibrate, which ``PrepareSettings.analyzers`` takes; else None."""
+        return (
+            self.calibration if self.calibration is not None and is_analyzer_file(self.calibration) else None
+        )
 
 
 def check_format(settings: PrepareSettings, kind: str) -> None:

@@ -1,0 +1,504 @@
+"""Analyzer vectors of a polarization sensor: their file, and the correction of what the sensor measures with them.
+
+A pixel behind a polarizer measures ``I = a . (S0, S1, S2)`` of the linear Stokes vector; ``a`` is its analyzer vector,
+``(1, cos 2p, sin 2p) / 2`` for an ideal polarizer at the angle p. ``polarguide calibrate`` estimates the vectors;
+``read_analyzers`` reads them, and ``AnalyzerCalibration.apply`` gives the intensities that ideal polarizers would have
+measured (the superpixel calibration of Powell and Gruev, Optics Express 21(18), 2013).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
+from polarguide.errors import PolarguideError
+from polarguide.files import require_file, write_whole
+from polarguide.polarizer import ANGLES
+from polarguide.records import decode
+
+FORMAT, VERSION = "polarguide-analyzers", 1
+SUFFIX = ".safetensors"
+LEAST_DIATTENUATION = 0.3
+"""Of a pixel's polarizer; below it, its angle and the correction mean nothing. (Extinction ratio 1.9.)"""
+_ENTRY, _TENSOR = "polarguide", "vectors"
+_AT_ONCE = 16
+"""Rows of cells whose matrices are made at once: their parts then stay in the processor's cache."""
+_REMEDY = "Calibrate again (polarguide calibrate), or copy the file again."
+
+Array = NDArray[np.float32]
+Reference = Literal["angles", "mean"]
+_Positive = Annotated[int, msgspec.Meta(ge=1, le=1 << 20)]
+_NotNegative = Annotated[int, msgspec.Meta(ge=0, le=1 << 20)]
+
+
+class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
+    """The one entry of metadata of the file."""
+
+    format: str
+    version: int
+    sensor: str
+    lens: str
+    width: _Positive
+    height: _Positive
+    offset_x: _NotNegative
+    offset_y: _NotNegative
+    block: _Positive
+    reference: Reference
+    polarizer_extinction: float | None
+    units: str
+    sha256: str
+
+
+UNITS = "intensity per Stokes component, (S0, S1, S2); an ideal polarizer has (1, cos 2p, sin 2p) / 2"
+
+
+@dataclass(frozen=True, eq=False)
+class AnalyzerCalibration:
+    """Analyzer vectors over a sensor, or a region of it.
+
+    Attributes:
+        sensor: its name, a key of ``SENSORS``.
+        lens: what the user calls the lens; "" where nothing was said.
+        offset: column and row of the sensor at which the region starts. size: width and height of the region.
+        block: side in pixels of the blocks that share vectors; the pattern's period where each pixel has its own.
+        vectors: [rows, columns, P, P, 3] float32 for a pattern of the period P: the vector of a pixel in column x and
+            row y of the sensor is ``vectors[y // block - offset_y // block, x // block - offset_x // block, y % P,
+            x % P]``. Their scale: the mean of the first components around a pixel, of its color, is 1/2.
+        reference: where the zero of the angles comes from: "angles" of the polarizer as given, or "mean": the mean
+            deviation of the positions from their nominal angles is zero.
+        polarizer_extinction: of the polarizer before the light, as given; None where it was taken as ideal.
+        sha256: checksum of all of these.
+    """
+
+    sensor: str
+    lens: str
+    offset: tuple[int, int]
+    size: tuple[int, int]
+    block: int
+    vectors: Array
+    reference: Reference
+    polarizer_extinction: float | None = None
+    sha256: str = ""
+    _matrices: dict[Any, tuple[Array, NDArray[np.intp], NDArray[np.intp]]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    @property
+    def pattern(self) -> Pattern:
+        """The pattern of the whole sensor."""
+        return sensor_pattern(self.sensor)
+
+    def require_sensor(self, sensor: str | None, where: object) -> None:
+        """Refuse a calibration of another sensor.
+
+        Args:
+            sensor: the sensor of what is to be corrected; None where nobody knows. where: for messages.
+
+        Raises:
+            PolarguideError: it is another one.
+        """
+        if sensor is not None and sensor != self.sensor:
+            raise PolarguideError(
+                where,
+                expected=f"a calibration of the sensor {sensor}",
+                found=f"one of {self.sensor}",
+                remedy="Give the calibration of this camera, or the --sensor that it was made with.",
+            )
+
+    def require_region(self, offset: tuple[int, int], size: tuple[int, int], where: object) -> None:
+        """Refuse a region that the calibration does not hold.
+
+        Args:
+            offset, size: of the region, in columns and rows of the sensor. where: for messages.
+
+        Raises:
+            PolarguideError: it is not inside.
+        """
+        inside = all(
+            mine <= start and start + length <= mine + whole
+            for mine, whole, start, length in zip(self.offset, self.size, offset, size, strict=True)
+        )
+        if not inside:
+            raise PolarguideError(
+                where,
+                expected=f"a calibration of {_region(offset, size)}, or more",
+                found=f"one of {_region(self.offset, self.size)}",
+                remedy="Calibrate with the region of these files; --offset-x and --offset-y say where it starts.",
+            )
+
+    def record(self) -> dict[str, str]:
+        """What ``scene.json`` says of it."""
+        return {"sensor": self.sensor, "lens": self.lens, "sha256": self.sha256}
+
+    def apply(
+        self, values: Array, *, offset: tuple[int, int] | None = None, scale: int | None = None
+    ) -> Array:
+        """Intensities that ideal polarizers would have measured.
+
+        Of the four samples I of a cell with the analyzer vectors A [4, 3], ``pinv(A) I`` is the Stokes vector, and the
+        result are its intensities behind ideal polarizers. The one part of I that no Stokes vector explains (for an
+        ideal sensor, I0 - I45 + I90 - I135) is kept, so that the samples of an ideal sensor do not change and the
+        noise can still be told from it. Samples have to be linear and without black level; they may be scaled.
+
+        Args:
+            values: a mosaic [H, W]; or four intensities at 0, 45, 90 and 135 degrees, [4, h, w] or [4, h, w, C] with
+                1 or 3 channels, as developed from one at its size, half or a quarter of it.
+            offset: column and row of the sensor at which the mosaic starts; that of the calibration if None.
+            scale: pixels of the sensor that became one of four intensities, each way (1, 2 or 4); if None, as the
+                size says.
+
+        Returns:
+            float32 in the shape of ``values``. Rows and columns that fill no cell are as they were.
+
+        Raises:
+            PolarguideError: the calibration is of another size.
+            ValueError: another shape.
+        """
+        values = np.asarray(values, np.float32)
+        start = self.offset if offset is None else offset
+        if values.ndim == 2:
+            return self._mosaic(values, start)
+        if values.ndim not in (3, 4) or values.shape[0] != 4 or values.shape[3:] not in ((), (1,), (3,)):
+            raise ValueError(f"expected [H, W], [4, H, W] or [4, H, W, C], found {list(values.shape)}")
+        return self._four(values, start, scale)
+
+    def correction(self, offset: tuple[int, int], size: tuple[int, int]) -> Array:
+        """The matrix of each cell of a region.
+
+        Args:
+            offset: column and row of the sensor, at the start of a cell. size: width and height in pixels, even.
+
+        Returns:
+            [4, 4, height / 2, width / 2]: the matrix from the samples of a cell, by rows, to the corrected ones.
+        """
+        matrices, rows, columns = self._coarse(offset, size)
+        return np.ascontiguousarray(matrices[:, :, rows[:, None], columns])
+
+    def peak(self, offset: tuple[int, int], size: tuple[int, int]) -> float:
+        """The largest intensity that comes out where no sample of a region exceeds 1."""
+        matrices, _, _ = self._coarse(offset, size)
+        return float(np.maximum(matrices, 0).sum(axis=1).max())
+
+    def _mosaic(self, mosaic: Array, offset: tuple[int, int]) -> Array:
+        height, width = mosaic.shape
+        self.require_region(offset, (width, height), "calibration")
+        left, top = self.pattern.shifted(*offset).cell_corner()
+        height, width = (height - top) // 2 * 2, (width - left) // 2 * 2
+        matrices, rows, columns = self._coarse((offset[0] + left, offset[1] + top), (width, height))
+        inside = (slice(top, top + height), slice(left, left + width))
+        cells = mosaic[inside]
+        samples = [np.ascontiguousarray(cells[row::2, column::2]) for row, column in np.ndindex(2, 2)]
+        out = mosaic.copy()
+        part, product = np.empty_like(samples[0]), np.empty_like(samples[0])
+        for index, (row, column) in enumerate(np.ndindex(2, 2)):
+            part[:] = 0
+            for other, sample in enumerate(samples):
+                part += np.multiply(_expanded(matrices[index, other], rows, columns), sample, out=product)
+            out[inside][row::2, column::2] = part
+        return out
+
+    def _four(self, values: Array, offset: tuple[int, int], scale: int | None) -> Array:
+        matrices = self.of_pictures(values.shape[1:3], offset=offset, scale=scale)
+        if values.ndim == 4 and matrices.ndim == 4:
+            matrices = matrices[..., None]
+        elif values.shape[3:] != (3,) and matrices.ndim == 5:
+            matrices = matrices.mean(axis=-1, keepdims=values.ndim == 4)
+        out = np.empty_like(values)
+        product = np.empty_like(values[0])
+        for k in range(4):
+            np.multiply(matrices[k, 0], values[0], out=out[k])
+            for j in range(1, 4):
+                out[k] += np.multiply(matrices[k, j], values[j], out=product)
+        return out
+
+    def of_pictures(
+        self, shape: tuple[int, ...], *, offset: tuple[int, int] | None = None, scale: int | None = None
+    ) -> Array:
+        """The matrix of each pixel of pictures that were developed from mosaics; arguments as in ``apply``.
+
+        Args:
+            shape: height and width of the pictures.
+
+        Returns:
+            What ``correction_of_angles`` gives.
+
+        Raises:
+            PolarguideError: the calibration is of another size.
+        """
+        offset = self.offset if offset is None else offset
+        left, top = self.pattern.shifted(*offset).cell_corner()
+        start = (offset[0] + left, offset[1] + top)
+        columns, rows = ((self.offset[axis] + self.size[axis] - start[axis]) // 2 * 2 for axis in (0, 1))
+        height, width = shape
+        fitting = [step for step in (1, 2, 4) if (rows // step, columns // step) == (height, width)]
+        if scale is None and not fitting:
+            raise PolarguideError(
+                "calibration",
+                expected=f"one of a sensor that gives pictures of {width}x{height} pixels",
+                found=f"one of {_region(self.offset, self.size)}",
+                remedy="Give the calibration of this camera, made with the region of these pictures.",
+            )
+        step = fitting[0] if scale is None else scale
+        self.require_region(start, (width * step, height * step), "calibration")
+        return self.correction_of_angles(start, (width * step, height * step), step)
+
+    def correction_of_angles(self, offset: tuple[int, int], size: tuple[int, int], scale: int) -> Array:
+        """The matrix of each pixel of four intensities at 0, 45, 90 and 135 degrees.
+
+        Args:
+            offset: column and row of the sensor, at the start of a cell. size: width and height in pixels of the
+                sensor. scale: of these, each way, that are one pixel of the intensities: 1, 2 or 4.
+
+        Returns:
+            [4, 4, h, w], or [4, 4, h, w, 3] for a color sensor, whose colors have analyzers of their own.
+        """
+        pattern = self.pattern.shifted(*offset)
+        height, width = size[1] // scale, size[0] // scale
+        cells = self.correction(offset, (-(-size[0] // 4) * 4, -(-size[1] // 4) * 4))
+        places = [int(angle) for angle in pattern.angles[:2, :2].ravel()]
+        order = [places.index(angle) for angle in ANGLES]
+        cells = cells[order][:, order]
+        if pattern.colors is None:
+            planes = [_resized(cells, scale)]
+        else:
+            corners = [(row, column) for row, column in np.ndindex(2, 2)]
+            planes = []
+            for color in range(3):
+                own = [c for c in corners if int(pattern.colors[2 * c[0], 2 * c[1]]) == color]
+                mean = np.stack([cells[..., row::2, column::2] for row, column in own]).mean(axis=0)
+                planes.append(_repeated(mean, 4 // scale))
+        stacked = np.stack(planes, axis=-1)[:, :, :height, :width]
+        return stacked[..., 0] if pattern.colors is None else stacked
+
+    def _coarse(
+        self, offset: tuple[int, int], size: tuple[int, int]
+    ) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+        """Matrices [4, 4, R, C] of the different cells, and which of these each row and column of cells has."""
+        key = (offset, size)
+        found = self._matrices.get(key)
+        if found is None:
+            rows, columns = (self._places(axis, offset[1 - axis], size[1 - axis]) for axis in (0, 1))
+            (y, which_row), (x, which_column) = rows, columns
+            nominal = self.pattern.shifted(*offset).angles[:2, :2].ravel()
+            matrices = np.empty((4, 4, y.shape[1], x.shape[1]), np.float32)
+            for first in range(0, y.shape[1], _AT_ONCE):
+                part = y[:, first : first + _AT_ONCE, None]
+                analyzers = [
+                    self.vectors[part[2 * r], x[2 * c], part[2 * r + 1], x[2 * c + 1]]
+                    for r, c in np.ndindex(2, 2)
+                ]
+                matrices[:, :, first : first + _AT_ONCE] = correction_matrices(analyzers, nominal)
+            found = matrices, which_row, which_column
+            self._matrices.clear()
+            self._matrices[key] = found
+        return found
+
+    def _places(self, axis: int, start: int, length: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The different rows (axis 0) or columns (1) of cells, and which of them each one is.
+
+        Returns:
+            [4, R]: block and place in the pattern of a cell's first row, and of its second; and [length / 2].
+        """
+        period, last = self.pattern.period, self.vectors.shape[axis] - 1
+        first = start + 2 * np.arange(length // 2)
+        described = []
+        for place in (first, first + 1):
+            # A cell beyond the edge, which completes a superpixel, takes the vectors of the last block.
+            block = place // self.block - self.offset[1 - axis] // self.block
+            described += [np.minimum(block, last), place % period]
+        unique, inverse = np.unique(np.stack(described), axis=1, return_inverse=True)
+        return unique, inverse.reshape(-1)
+
+
+def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
+    """Matrices from measured samples of a cell to those of ideal polarizers.
+
+    ``C = W pinv(A) + n m^T``: A [4, 3] are the analyzer vectors, W those of ideal polarizers, n and m the unit vectors
+    perpendicular to the columns of W and A. C A = W, and C is the identity where A is W.
+
+    Args:
+        analyzers: four of [..., 3], the vectors of the samples of a cell. nominal: their nominal angles in degrees.
+
+    Returns:
+        [4, 4, ...] float32.
+    """
+    u, v, w = ([a[..., component].astype(np.float32) for a in analyzers] for component in range(3))
+
+    def dot(x: list[Any], y: list[Any]) -> Any:
+        return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
+
+    uu, uv, uw, vv, vw, ww = dot(u, u), dot(u, v), dot(u, w), dot(v, v), dot(v, w), dot(w, w)
+    # The inverse of A^T A by its adjugate: millions of 3x3 matrices, for which LAPACK's calls would take seconds.
+    a00, a01, a02 = vv * ww - vw * vw, uw * vw - uv * ww, uv * vw - uw * vv
+    a11, a12, a22 = uu * ww - uw * uw, uv * uw - uu * vw, uu * vv - uv * uv
+    scale = 1 / (uu * a00 + uv * a01 + uw * a02)
+    inverse = [
+        [(r[0] * u[j] + r[1] * v[j] + r[2] * w[j]) * scale for j in range(4)]
+        for r in ((a00, a01, a02), (a01, a11, a12), (a02, a12, a22))
+    ]
+    left = []
+    for j in range(4):
+        i, k, m = (other for other in range(4) if other != j)
+        minor = u[i] * (v[k] * w[m] - v[m] * w[k]) - v[i] * (u[k] * w[m] - u[m] * w[k])
+        minor = minor + w[i] * (u[k] * v[m] - u[m] * v[k])
+        left.append(minor if j % 2 == 0 else -minor)
+    rest = [0.5 if int(angle) % 90 == 0 else -0.5 for angle in nominal]
+    along = dot(rest, left)
+    length = np.copysign(np.sqrt(dot(left, left)), along)
+    left = [part / length for part in left]
+    cosine = [{0: 1.0, 90: -1.0}.get(int(angle), 0.0) for angle in nominal]
+    sine = [{45: 1.0, 135: -1.0}.get(int(angle), 0.0) for angle in nominal]
+    rows = []
+    for k in range(4):
+        turned = inverse[1] if cosine[k] else inverse[2]
+        sign = cosine[k] + sine[k]
+        rows.append([(inverse[0][j] + sign * turned[j]) / 2 + rest[k] * left[j] for j in range(4)])
+    return np.asarray(rows, np.float32)
+
+
+def spread_to_cells(bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Unusable samples [H, W] of a mosaic that starts with a cell, spread to all of their cells: these were mixed."""
+    height, width = bad.shape
+    cells = bad.reshape(height // 2, 2, width // 2, 2).any(axis=(1, 3))
+    return np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
+
+
+def is_analyzer_file(path: Path) -> bool:
+    """Whether a file looks like one of analyzers rather than like JSON; False where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(64)
+    except OSError:
+        return False
+    return path.suffix.lower() == SUFFIX or start[8:9] == b"{"
+
+
+def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
+    """Write the file of a calibration, which is the same bytes for the same content; returns the checksum.
+
+    Raises:
+        PolarguideError: it cannot be written.
+    """
+    vectors = np.ascontiguousarray(calibration.vectors, np.float32)
+    metadata = _Metadata(
+        FORMAT, VERSION, calibration.sensor, calibration.lens, *calibration.size, *calibration.offset,
+        calibration.block, calibration.reference, calibration.polarizer_extinction, UNITS, "",
+    )  # fmt: skip
+    metadata.sha256 = _checksum(metadata, vectors)
+    # One entry: safetensors writes several in any order.
+    text = json.dumps(msgspec.to_builtins(metadata), ensure_ascii=False)
+    write_whole(path, save({_TENSOR: vectors}, metadata={_ENTRY: text}))
+    return metadata.sha256
+
+
+def read_analyzers(path: Path) -> AnalyzerCalibration:
+    """Read the file that ``polarguide calibrate`` wrote.
+
+    Raises:
+        PolarguideError: it cannot be read, is cut short, damaged, or of another kind or version.
+    """
+    require_file(path, expected="a calibration of polarguide calibrate", remedy=_REMEDY)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            entries, names = file.metadata() or {}, list(file.keys())
+            vectors = file.get_tensor(_TENSOR) if names == [_TENSOR] else None
+    except (SafetensorError, ValueError, OSError, RuntimeError, TypeError) as error:
+        raise _damaged(path, f"damaged or foreign data ({str(error)[:200]})") from None
+    if _ENTRY not in entries or vectors is None:
+        raise _damaged(path, "another safetensors file")
+    metadata = decode(entries[_ENTRY].encode(), _Metadata, path, remedy=_REMEDY)
+    if metadata.format != FORMAT or metadata.version != VERSION:
+        raise _damaged(path, f"{metadata.format}, version {metadata.version}")
+    if _checksum(metadata, vectors) != metadata.sha256:
+        raise PolarguideError(
+            path,
+            expected=f"content with the checksum {metadata.sha256[:16]}...",
+            found="other content: the file is damaged, or was changed",
+            remedy=_REMEDY,
+        )
+    found = AnalyzerCalibration(
+        metadata.sensor, metadata.lens, (metadata.offset_x, metadata.offset_y), (metadata.width, metadata.height),
+        metadata.block, vectors, metadata.reference, metadata.polarizer_extinction, metadata.sha256,
+    )  # fmt: skip
+    _require_sound(path, found)
+    return found
+
+
+def grid_shape(offset: tuple[int, int], size: tuple[int, int], block: int) -> tuple[int, int]:
+    """Rows and columns of blocks that a region touches; blocks count from the corner of the sensor."""
+    rows, columns = (
+        (start + length - 1) // block - start // block + 1
+        for start, length in zip(offset[::-1], size[::-1], strict=True)
+    )
+    return rows, columns
+
+
+def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
+    """Refuse content that fits its checksum and still makes no sense.
+
+    Raises:
+        PolarguideError: an unknown sensor, vectors of another shape, or that no polarizer has.
+    """
+    if found.sensor not in SENSORS:
+        raise _damaged(path, f"one of the sensor {found.sensor!r}, which is unknown")
+    period = found.pattern.period
+    shape = (*grid_shape(found.offset, found.size, found.block), period, period, 3)
+    if found.block % period or found.vectors.shape != shape or found.vectors.dtype != np.float32:
+        raise _damaged(
+            path, f"vectors {list(found.vectors.shape)} of {found.vectors.dtype} instead of {list(shape)}"
+        )
+    gain = found.vectors[..., 0]
+    if not (np.isfinite(found.vectors).all() and (gain > 0).all()):
+        raise _damaged(path, "vectors that are not finite, or have no throughput")
+    if (np.hypot(found.vectors[..., 1], found.vectors[..., 2]) < LEAST_DIATTENUATION * gain).any():
+        raise _damaged(path, "vectors of pixels that hardly polarize")
+
+
+def _damaged(path: Path, found: str) -> PolarguideError:
+    return PolarguideError(
+        path,
+        expected=f"a file that polarguide calibrate wrote (version {VERSION})",
+        found=found,
+        remedy=_REMEDY,
+    )
+
+
+def _checksum(metadata: _Metadata, vectors: NDArray[Any]) -> str:
+    said = {key: value for key, value in msgspec.to_builtins(metadata).items() if key != "sha256"}
+    digest = hashlib.sha256(json.dumps(said, ensure_ascii=False, sort_keys=True).encode())
+    digest.update(f"{vectors.dtype.str} {vectors.shape}".encode())
+    digest.update(np.ascontiguousarray(vectors).tobytes())
+    return digest.hexdigest()
+
+
+def _region(offset: tuple[int, int], size: tuple[int, int]) -> str:
+    place = f" from column {offset[0]}, row {offset[1]} on" if any(offset) else ""
+    return f"{size[0]}x{size[1]} pixels{place}"
+
+
+def _expanded(plane: Array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
+    """The plane [R, C] at every cell; itself where each cell has a matrix of its own."""
+    if plane.shape == (len(rows), len(columns)):
+        return plane
+    return np.asarray(plane[:, columns][rows])
+
+
+def _resized(cells: Array, scale: int) -> Array:
+    """Matrices of cells [4, 4, h, w] at the pixels of intensities."""
+    if scale == 4:
+        return np.mean([cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)], axis=0, dtype=np.float32)
+    return _repeated(cells, 2 // scale)
+
+
+def _repeated(planes: Array, times: int) -> Array:
+    return np.repeat(np.repeat(planes, times, axis=-2), times, axis=-1) if times > 1 else planes

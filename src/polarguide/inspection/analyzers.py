@@ -1,0 +1,199 @@
+"""Inspect a scene as a calibration of its sensor would make it, without preparing it anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pycolmap
+import torch
+from numpy.typing import NDArray
+
+from polarguide.capture import checks
+from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
+from polarguide.capture.colmap.undistort import Geometry, undistortion
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
+from polarguide.capture.view import FULL_CODE
+from polarguide.errors import PolarguideError
+from polarguide.files import read_file
+from polarguide.inspection.capture import Capture, InspectedView
+from polarguide.inspection.verdict import Check
+from polarguide.records import decode
+
+_REMEDY = "Prepare the mosaics with it: polarguide prepare RAW --out SCENE --calibration FILE."
+
+
+class _Analyzers(msgspec.Struct):
+    sensor: str
+    lens: str = ""
+    sha256: str = ""
+
+
+class _Warp(msgspec.Struct):
+    model: str
+    parameters: list[float]
+
+
+class _View(msgspec.Struct):
+    geometry: Geometry
+    warp: _Warp | None = None
+
+
+class _Settings(msgspec.Struct):
+    offset_x: int = 0
+    offset_y: int = 0
+
+
+class _Request(msgspec.Struct):
+    settings: _Settings = msgspec.field(default_factory=_Settings)
+
+
+class _Prepared(msgspec.Struct):
+    request: _Request = msgspec.field(default_factory=_Request)
+    views: dict[str, _View] = {}
+
+
+class _Scene(msgspec.Struct):
+    """What is read of ``scene.json``."""
+
+    sensor: str | None = None
+    gains: tuple[float, float, float, float] | None = None
+    analyzers: _Analyzers | None = None
+    prepare: _Prepared | None = None
+
+
+def corrected(capture: Capture, path: Path) -> Capture:
+    """The capture as the calibration of its sensor corrects it.
+
+    The matrices follow what ``prepare`` did: its region, the gains that it divided by, the order of the angles, the
+    removal of the distortion. Where pictures were averaged, so are the matrices.
+
+    Args:
+        capture: of a scene of one sensor's mosaics, or of four pictures a view at its size, half or a quarter of it.
+        path: a file of ``polarguide calibrate``.
+
+    Raises:
+        PolarguideError: the file cannot be used, is of another sensor or size, or has been applied already.
+    """
+    calibration = read_analyzers(path)
+    about = _about(capture)
+    if about.analyzers is not None:
+        raise PolarguideError(
+            capture.root,
+            expected="a scene that was prepared without --calibration",
+            found=f"one with that of {about.analyzers.sensor} (checksum {about.analyzers.sha256[:16]}...)",
+            remedy="Leave --calibration out.",
+        )
+    if about.prepare is not None and about.sensor is None:
+        raise PolarguideError(
+            capture.root,
+            expected="a scene of the mosaics of a sensor",
+            found="one of shots through a filter, or of a dataset",
+            remedy="Leave --calibration out.",
+        )
+    calibration.require_sensor(about.sensor, path)
+    applied = capture.applied
+    if (applied is None and about.prepare is not None) or (applied is not None and not applied.permutes):
+        raise PolarguideError(
+            capture.root,
+            expected="angles in steps of 45 degrees from those of the sensor",
+            found="a scene whose zero was turned",
+            remedy=_REMEDY,
+        )
+    known: dict[Any, NDArray[np.float32]] = {}
+    views = []
+    for view in capture.views:
+        said = None if about.prepare is None else about.prepare.views.get(view.name)
+        key = None if said is None else msgspec.json.encode(said)
+        if key not in known:
+            matrices = _matrices(calibration, about, said, capture.size)
+            known[key] = _averaged(_as_named(matrices, applied, about.gains), capture.factor)
+        views.append(_corrected_view(view, known[key]))
+    return replace(capture, views=tuple(views))
+
+
+def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
+    """What is known of the sensor's analyzers; None where nothing was calibrated."""
+    key, title = "analyzers", "Analyzers of the sensor"
+    if path is not None:
+        found = read_analyzers(path)
+        text = f"Corrected for this inspection with the calibration of {found.sensor}"
+        remedy = "The scene itself is as it was: prepare its mosaics with --calibration."
+        record = found.record()
+    else:
+        said = _about(capture).analyzers
+        if said is None:
+            return None
+        text, remedy, record = (
+            f"Prepared with the calibration of {said.sensor}",
+            "",
+            msgspec.to_builtins(said),
+        )
+    lens = f" and {record['lens']}" if record["lens"] else ""
+    return Check(key, title, "ok", f"{text}{lens} ({record['sha256'][:16]}).", remedy, figures=record)
+
+
+def _about(capture: Capture) -> _Scene:
+    path = capture.root / "scene.json"
+    if not path.exists():
+        return _Scene()
+    return decode(read_file(path), _Scene, path, remedy="Prepare the scene again.")
+
+
+def _matrices(
+    calibration: AnalyzerCalibration, about: _Scene, said: _View | None, size: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Matrices [4, 4, h, w] or [4, 4, h, w, 3] at the pixels of a view's pictures."""
+    if said is None or about.prepare is None:
+        return calibration.of_pictures(size[::-1])
+    settings, geometry = about.prepare.request.settings, said.geometry
+    matrices = calibration.of_pictures(
+        geometry.size[::-1], offset=(settings.offset_x, settings.offset_y), scale=geometry.step
+    )
+    if said.warp is None:
+        return matrices
+    width, height = geometry.size
+    camera = pycolmap.Camera(model=said.warp.model, width=width, height=height, params=said.warp.parameters)
+    planes = matrices.reshape(16, *matrices.shape[2:])
+    moved, _ = undistortion(camera).apply(planes, np.zeros((height, width), bool))
+    return moved.reshape(4, 4, *moved.shape[1:])
+
+
+def _as_named(
+    matrices: NDArray[np.float32], applied: Calibration | None, gains: tuple[float, ...] | None
+) -> NDArray[np.float32]:
+    """Matrices for pictures that were divided by gains, and then named by their true angles."""
+    scaled = matrices * np.asarray(gains or UNIT_GAINS, np.float32).reshape(1, 4, *[1] * (matrices.ndim - 2))
+    if applied is None:
+        return scaled
+    source = [int(row.argmax()) for row in oriented(np.eye(4, dtype=np.float32), applied)]
+    return scaled[source][:, source]
+
+
+def _averaged(matrices: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Means over boxes of ``factor`` x ``factor`` pixels."""
+    if factor == 1:
+        return matrices
+    height, width = matrices.shape[2] // factor, matrices.shape[3] // factor
+    cut = matrices[:, :, : height * factor, : width * factor]
+    boxes = cut.reshape(4, 4, height, factor, width, factor, *matrices.shape[4:])
+    return np.asarray(boxes.mean(axis=(3, 5), dtype=np.float32))
+
+
+def _corrected_view(view: InspectedView, matrices: NDArray[np.float32]) -> InspectedView:
+    codes = view.codes.numpy().astype(np.float32)
+    weights = matrices if matrices.ndim == 5 else matrices[..., None]
+    done = np.stack([sum(weights[k, j] * codes[j] for j in range(4)) for k in range(4)])
+    over = (done > FULL_CODE).any(axis=(0, 3))
+    saturated = view.saturated | torch.from_numpy(over)
+    corrected_codes = np.rint(np.clip(done, 0, FULL_CODE)).astype(np.uint16)
+    usable = ~(view.invalid | saturated).numpy()
+    return replace(
+        view,
+        codes=torch.from_numpy(corrected_codes),
+        saturated=saturated,
+        measures=checks.measure(corrected_codes, usable),
+    )

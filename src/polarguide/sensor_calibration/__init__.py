@@ -1,0 +1,1 @@
+"""Calibrate a polarization sensor: analyzer vectors from shots of a polarizer before a uniform light."""
