@@ -21,7 +21,7 @@ from polarguide.files import atomic
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
-from polarguide.scene_frame import SceneFrame, scene_frame
+from polarguide.scene_frame import SceneFrame
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
 from polarguide.shading.model import RadianceCubemap, ShadingModel
 
@@ -51,7 +51,7 @@ def relight(
         raise PolarguideError(what, expected="degrees", found=str(degrees), remedy="Give a number.")
     cubemap = needs_radiance(run.model.shading, what=what)
     light = run.model.light
-    around = scene_frame(list(run.cameras.values()))
+    around = run.frame
     if panorama is not None:
         texels = texels_of(read_panorama(Path(panorama)), cubemap, around, RELIT_RESOLUTION)
         light[cubemap.name] = texels.to(light[cubemap.name].device)

@@ -16,11 +16,13 @@ from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
+from polarguide.presentation import Presentation, read_presentation
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend, choose_backend
 from polarguide.raster.in_front import alpha_in_front
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
+from polarguide.scene_frame import SceneFrame
 from polarguide.shading.gbuffer import render, splats
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
@@ -198,6 +200,26 @@ class OpenedRun:
         if found.digest != configuration.scene_digest:
             _warn(f"{found.root} has changed since {self.folder} was trained on it.")
         return found
+
+    @property
+    def scene_folder(self) -> Path:
+        """Where the scene is, or was when it was trained on."""
+        found = self._scene_source
+        return found.root if isinstance(found, Scene) else Path(found or self.configuration.scene)
+
+    @property
+    def presentation(self) -> Presentation:
+        """How the run is presented: its own ``presentation.json`` over that of its scene, as they are now.
+
+        Raises:
+            PolarguideError: a file is not such a record.
+        """
+        return read_presentation(self.folder).over(read_presentation(self.scene_folder))
+
+    @property
+    def frame(self) -> SceneFrame:
+        """The frame of the scene's cameras, with the up axis of its presentation; reads the scene."""
+        return self.presentation.frame(list(self.cameras.values()))
 
     @property
     def cameras(self) -> dict[str, Camera]:
