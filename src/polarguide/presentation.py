@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,11 +21,10 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.files import write_whole
 from polarguide.records import read_record, to_json
-from polarguide.scene_frame import SceneFrame, scene_frame
+from polarguide.scene_frame import SceneFrame
 
 PRESENTATION_FILE = "presentation.json"
 REMEDY = "Correct it with polarguide present, or remove the file."
@@ -68,14 +67,14 @@ class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
         return around if self.up is None else _upright(around, self.up)
 
     def corners(self, around: SceneFrame) -> Tensor:
-        """Its eight corners in the world, [8, 3] float64, the last axis fastest."""
+        """Its eight corners in the world, [8, 3] float64, the last axis fastest, from the cameras' own frame."""
         frame = self._frame(around)
         sides = torch.tensor([self.low, self.high], dtype=torch.float64)
         local = torch.cartesian_prod(*sides.T) * frame.distance
         return frame.center + local @ frame.panorama_axes().T
 
     def inside(self, means: Tensor, around: SceneFrame) -> Tensor:
-        """Which means [N, 3] lie in it, [N] bool."""
+        """Which means [N, 3] lie in it, [N] bool; ``around`` is the cameras' own frame."""
         frame = self._frame(around)
         axes, center = (t.to(means) for t in (frame.panorama_axes(), frame.center))
         local = (means - center) @ axes / frame.distance
@@ -129,9 +128,8 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         """This, with another's fields where this one has none."""
         return Presentation(**{**_given(other), **_given(self)})
 
-    def frame(self, cameras: Sequence[Camera]) -> SceneFrame:
-        """The frame of a scene's cameras, at least one, with the up axis that was chosen, if one was."""
-        around = scene_frame(cameras)
+    def upright(self, around: SceneFrame) -> SceneFrame:
+        """A frame of cameras with the up axis that was chosen, if one was."""
         return around if self.up_axis is None else _upright(around, self.up_axis)
 
     def to_record(self) -> dict[str, Any]:
@@ -151,9 +149,7 @@ def _upright(around: SceneFrame, up: Vector) -> SceneFrame:
 
 
 def _check_direction(name: str, vector: Vector | None) -> None:
-    if vector is not None and not (
-        all(map(math.isfinite, vector)) and 1e-9 < math.hypot(*vector) < 1e9
-    ):
+    if vector is not None and not (all(map(math.isfinite, vector)) and 1e-9 < math.hypot(*vector) < 1e9):
         raise PolarguideError(
             name, expected="a direction, three numbers not all 0", found=str(list(vector)), remedy=REMEDY
         )
@@ -166,9 +162,7 @@ def read_presentation(folder: Path) -> Presentation:
         PolarguideError: the file is not such a record.
     """
     path = folder / PRESENTATION_FILE
-    return (
-        read_record(path, Presentation, remedy=REMEDY) if os.path.lexists(path) else Presentation()
-    )
+    return read_record(path, Presentation, remedy=REMEDY) if os.path.lexists(path) else Presentation()
 
 
 def write_presentation(folder: Path, presentation: Presentation) -> Path:

@@ -54,10 +54,10 @@ class SceneFrame:
 def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
     """The frame of some cameras, at least one.
 
-    The center is the point nearest to all optical axes (least squares). Up is the direction to which the pictures' rows
-    are most nearly perpendicular (least squares), as people hold cameras level while they look down; where the rows do
-    not tell, it is the mean of the pictures' upward directions. Parallel axes, as of a camera shifted along a line, meet nowhere: then the center lies ahead of the
-    cameras' mean by as much as they spread.
+    The center is the point nearest to all optical axes (least squares). Parallel axes, as of a camera shifted along a
+    line, meet nowhere: then it lies ahead of the cameras' mean by as much as they spread. Up is the direction to which
+    the pictures' rows are most nearly perpendicular (least squares), as people hold cameras level while they look down;
+    where the rows do not tell, it is the mean of the pictures' upward directions.
     """
     centers = torch.stack([camera.center for camera in cameras])
     forward = torch.stack([camera.rotation[2] for camera in cameras])

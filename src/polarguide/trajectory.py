@@ -58,9 +58,7 @@ def orbit(
     return path
 
 
-def spiral(
-    cameras: Sequence[Camera], frames: int, *, around: SceneFrame | None = None
-) -> list[Camera]:
+def spiral(cameras: Sequence[Camera], frames: int, *, around: SceneFrame | None = None) -> list[Camera]:
     """An orbit that goes up and down by a quarter of the distance, twice."""
     return orbit(cameras, frames, swing=0.25, around=around)
 

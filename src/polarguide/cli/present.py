@@ -29,19 +29,19 @@ def present(
     provenance: str = "",
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
-    """Set how a scene or a run is shown and exported: white, up, scale, crop box, credit. Data and scores do not change.
+    """Set how a scene or a run is shown and exported: white, up, scale, crop box, credit. Data and scores stay.
 
-    What is set stands in presentation.json in the folder. A scene's holds for all its runs; a run's goes before it. What
-    is not given stays as it is, "none" removes it, and without an option it is printed. `polarguide view RUN` lets you
-    pick the same with the mouse. A VIEW,X,Y is a pixel of a photograph, counted from its top left corner.
+    What is set stands in presentation.json in the folder. A scene's holds for all its runs; a run's goes before it.
+    What is not given stays as it is, "none" removes it, and without an option it is printed. `polarguide view RUN` lets
+    you pick the same with the mouse. A VIEW,X,Y is a pixel of a photograph, counted from its top left corner.
 
     Args:
         folder: Folder of a scene or a run.
         white_balance: gray (the photographs' mean becomes gray), gains such as 1.9,1,1.6, or VIEW,X,Y where something
             white or gray is.
-        up_axis: An axis such as z or --up-axis=-y, three numbers, or VIEW,X,Y where a level surface is. Without it, up is
-            as the cameras say.
-        points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on the surface, or VIEW for a camera's place.
+        up_axis: An axis such as z or --up-axis=-y, three numbers, or VIEW,X,Y where a level surface is. Without it, up
+            is as the cameras say.
+        points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on a surface, or VIEW for a camera's place.
         distance: Of the two points, such as 85mm.
         meters_per_unit: How long a unit of the scene is, in place of points and distance.
         crop: Box as --crop=left,right,down,up,front,back in percent of the cameras' distance.

@@ -68,8 +68,8 @@ def write_pictures(
         views: ``test``, ``train``, ``all``, or names separated by commas.
         layers: names of layers, all of the run's by default; one that the recipe has not is left out, and named to
             the reporter.
-        format: png as a display shows layers, white balance included; exr and npy hold their linear numbers, in the units that ``layers.json``
-            beside them states. The contact sheet is PNG.
+        format: png as a display shows layers, with the white balance of the run's presentation; exr and npy hold their
+            linear numbers, in the units that ``layers.json`` beside them states. The contact sheet is PNG.
 
     Returns:
         The path of the contact sheet.

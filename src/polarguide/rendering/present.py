@@ -60,8 +60,8 @@ def present(
         folder: of a scene, whose runs then have it from there, or of a run.
         white_balance: ``none``, ``gray`` (the mean of the photographs becomes gray), gains of R, G and B such as
             ``1.9,1,1.6``, or VIEW,X,Y: a place in a photograph that should be white or gray.
-        up_axis: ``none`` (as the cameras say), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a place whose
-            surface is level; up is its normal there.
+        up_axis: ``none`` (as the cameras say), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a place
+            whose surface is level; up is its normal there.
         points: two PLACEs whose distance is known. distance: it, such as ``85mm``.
         meters_per_unit: how long one unit of the scene is, or ``none``.
         crop: ``none``, or left,right,down,up,front,back in percent of the cameras' distance, as the viewer counts.
@@ -88,7 +88,9 @@ def present(
         up = changes["up_axis"] if "up_axis" in changes else place.shown(own).up_axis
         changes["crop"] = _crop(crop, up)
     texts = {"title": title, "author": author, "license": license, "provenance": provenance}
-    changes |= {name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None}
+    changes |= {
+        name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
+    }
     place.refuse_inherited(name for name, value in changes.items() if value in (None, ""))
     record = {**own.to_record(), **changes}
     made = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")

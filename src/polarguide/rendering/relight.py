@@ -8,6 +8,7 @@ radiance on the scale of the photographs (S0 / 2).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -118,14 +119,14 @@ def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
     return found.reshape(6, resolution, resolution, -1)
 
 
-def write_exr(path: Path, picture: Tensor) -> None:
-    """Write linear radiance [H, W, 3] as 32-bit floats.
+def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -> None:
+    """Write linear radiance [H, W, 3] as 32-bit floats, with standard attributes of the format, such as ``owner``.
 
     Raises:
         PolarguideError: OpenEXR is not installed.
     """
     exr = optional_import("OpenEXR", "an EXR file")
-    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage, **attributes}
     pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32))
     with atomic(path) as temporary, exr.File(header, {"RGB": pixels}) as file:
         try:

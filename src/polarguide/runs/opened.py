@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.capture import Scene, load_scene
+from polarguide.capture import Scene, load_scene, read_model
+from polarguide.capture.layout import find_layout
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
 from polarguide.presentation import Presentation, read_presentation
@@ -22,7 +23,7 @@ from polarguide.raster import Backend, choose_backend
 from polarguide.raster.in_front import alpha_in_front
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
-from polarguide.scene_frame import SceneFrame
+from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.gbuffer import render, splats
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
@@ -216,10 +217,22 @@ class OpenedRun:
         """
         return read_presentation(self.folder).over(read_presentation(self.scene_folder))
 
+    @cached_property
+    def camera_frame(self) -> SceneFrame:
+        """The frame of the scene's cameras, with up as they say; reads their poses, not their pictures.
+
+        Raises:
+            PolarguideError: the scene is not there any more, or has no such poses.
+        """
+        if "scene" in self.__dict__ or isinstance(self._scene_source, Scene):
+            return scene_frame(list(self.cameras.values()))
+        model = read_model(self.scene_folder)
+        return scene_frame([model.camera(name) for name in find_layout(self.scene_folder).names])
+
     @property
     def frame(self) -> SceneFrame:
-        """The frame of the scene's cameras, with the up axis of its presentation; reads the scene."""
-        return self.presentation.frame(list(self.cameras.values()))
+        """``camera_frame``, with the up axis of the presentation where one was chosen."""
+        return self.presentation.upright(self.camera_frame)
 
     @property
     def cameras(self) -> dict[str, Camera]:

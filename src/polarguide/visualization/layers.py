@@ -13,7 +13,6 @@ from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
 from polarguide.visualization.sheet import Picture
 
-
 RADIANCE = frozenset(("final", "base", "reflection", "specular", "diffuse"))
 """Layers that are linear radiance."""
 
