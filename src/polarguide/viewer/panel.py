@@ -58,7 +58,7 @@ class Panel:
         # The box as it was saved, until a slider is moved; it is told more exactly than sliders can.
         self._saved_crop = options.presentation.crop
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self._status = gui.add_markdown("")
+        self._status, self._lines, self._note = gui.add_markdown(""), tuple[str, ...](), ""
         self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
         layers = [name for name in LAYERS if name in options.layers]
         self.layer = gui.add_dropdown(
@@ -112,9 +112,15 @@ class Panel:
         ]
         return {control._impl.uuid: accepts for control, accepts in controls} | self.presenting.accepts
 
+    def show_note(self, note: str) -> None:
+        """Show another note below the status, of which the same holds."""
+        self._note = note
+        self.show_status(*self._lines)
+
     def show_status(self, *lines: str) -> None:
         """Show status lines; they must not contain names from files."""
-        text = "  \n".join(lines)
+        self._lines = lines
+        text = "  \n".join((*lines, f"**{self._note}**") if self._note else lines)
         if self._status.content != text:
             self._status.content = text
 

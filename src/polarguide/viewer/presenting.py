@@ -22,8 +22,10 @@ LINE_COLOR = (255, 80, 40)
 ASKS = {
     "white": "Click on something white or gray",
     "level": "Click on a level surface",
-    "measure": "Click on one end",
+    "length": "Click on one end of a known length",
 }
+PICKS = tuple(ASKS)
+AS_SHOWN, OF_CAMERAS = UPS = ("as shown", "of cameras")
 
 
 class PresentingControls:
@@ -45,25 +47,23 @@ class PresentingControls:
                 initial_value=AS_PHOTOGRAPHED if presentation.white_balance is None else PICKED,
                 hint="For display; the data stay as they are",
             )
-            self.pick_white = gui.add_button("Pick white", hint="Then click on something white or gray")
-            self.pick_level = gui.add_button("Pick a level surface", hint="Its normal becomes up")
-            self.up_shown = gui.add_button("Up as shown", hint="The picture's upward direction becomes up")
-            self.up_cameras = gui.add_button("Up of the cameras")
-            self.measure = gui.add_button("Measure", hint="Then click on two points")
-            self.measured = gui.add_text("Distance", "", disabled=True)
+            hint = (
+                "Something white or gray; a level surface, whose normal becomes up; or the ends of a length"
+            )
+            self.pick = gui.add_button_group("Pick", PICKS, hint=hint)
+            self.up = gui.add_button_group("Up", UPS, hint="As this picture has it, or as the cameras say")
+            self.measured = gui.add_text("Length", "", disabled=True)
             self.length = gui.add_number("Known, mm", 100.0, min=KNOWN_LENGTH[0], max=KNOWN_LENGTH[1])
-            self.set_scale = gui.add_button("Set scale", hint="The measured distance is as long as known")
-            label = "Save to the run" if saves else "Download presentation.json"
+            self.set_scale = gui.add_button("Set scale", hint="The picked length is as long as known")
             hint = "White, up, scale and crop, for pages, exports and renderings"
-            self.save = gui.add_button(label, hint=hint)
-            self.note = gui.add_text("", "", disabled=True)
-        pushed = (
-            self.pick_white, self.pick_level, self.up_shown, self.up_cameras, self.measure, self.set_scale, self.save
-        )  # fmt: skip
+            self.save = gui.add_button("Save to the run" if saves else "Download them", hint=hint)
         controls: list[tuple[Any, Accepts]] = [
             (self.white, choice(WHITES)),
+            (self.pick, choice(PICKS)),
+            (self.up, choice(UPS)),
             (self.length, number(*KNOWN_LENGTH)),
-            *((control, push) for control in pushed),
+            (self.set_scale, push),
+            (self.save, push),
         ]
         self.accepts = {control._impl.uuid: accepts for control, accepts in controls}
 
@@ -74,13 +74,15 @@ class Presenting:
     Callbacks only record; the rendering thread calls ``take_click`` and ``found``.
 
     Attributes:
-        chosen: white, up, scale and credit. crop: of the panel, is not among them.
+        chosen: white, up, scale and credit. The crop box is the panel's.
+        note: what the visitor should do or know next, without any name from files.
 
     Args:
         client: viser's handle. controls: of its panel. presentation: as it was saved.
         gray_world: gives the gains of the photographs' mean. save: writes what was chosen, and says what it did.
         distance: of the cameras.
-        changed: called after every change that affects the picture, and when a click waits.
+        changed: called after every change that affects the picture, and when a click waits. said: when there is
+            another note.
         caught: makes callbacks whose faults cost only this browser.
     """
 
@@ -94,11 +96,12 @@ class Presenting:
         save: Callable[[], str],
         distance: float,
         changed: Callable[[], None],
+        said: Callable[[], None],
         caught: Callable[[Callable[[], None]], Callable[[Any], None]],
     ) -> None:
         self._client, self._controls, self._gray_world = client, controls, gray_world
         self._changed, self._caught, self._distance = changed, caught, distance
-        self.chosen = presentation
+        self.chosen, self.note, self._said = presentation, "", said
         self._picked_white = presentation.white_balance
         self._picking = ""
         self._listener: Callable[[Any], None] | None = None
@@ -106,11 +109,8 @@ class Presenting:
         self._ends: list[Tensor] = []
         self._line: Any = None
         controls.white.on_update(caught(self._white_chosen))
-        controls.pick_white.on_click(caught(lambda: self._ask("white")))
-        controls.pick_level.on_click(caught(lambda: self._ask("level")))
-        controls.up_shown.on_click(caught(self._up_as_shown))
-        controls.up_cameras.on_click(caught(lambda: self._set_up(None)))
-        controls.measure.on_click(caught(lambda: self._ask("measure")))
+        controls.pick.on_click(caught(lambda: self._ask(controls.pick.value)))
+        controls.up.on_click(caught(self._up_chosen))
         controls.set_scale.on_click(caught(self._set_scale))
         controls.save.on_click(caught(lambda: self._say(save())))
 
@@ -143,10 +143,11 @@ class Presenting:
             self._end_found(place.point)
 
     def _say(self, text: str) -> None:
-        self._controls.note.value = text
+        self.note = text
+        self._said()
 
     def _ask(self, what: str) -> None:
-        if what == "measure":
+        if what == "length":
             self._ends = []
             self._draw_line()
         self._listen(what)
@@ -196,7 +197,10 @@ class Presenting:
         self._controls.white.value = PICKED
         self._say("White: gains " + ", ".join(f"{gain:.3g}" for gain in self._picked_white))
 
-    def _up_as_shown(self) -> None:
+    def _up_chosen(self) -> None:
+        if self._controls.up.value == OF_CAMERAS:
+            self._set_up(None)
+            return
         w, x, y, z = (float(value) for value in self._client.camera.wxyz)
         up = -Rotation.from_quat([x, y, z, w]).as_matrix()[:, 1]
         self._set_up((float(up[0]), float(up[1]), float(up[2])))
@@ -219,7 +223,7 @@ class Presenting:
             return
         self._listen("")
         self._show_length()
-        self._say("")
+        self._say(f"Length: {self._controls.measured.value}")
 
     def _show_length(self) -> None:
         if len(self._ends) == 2:
@@ -244,7 +248,7 @@ class Presenting:
     def _set_scale(self) -> None:
         apart = float((self._ends[0] - self._ends[1]).norm()) if len(self._ends) == 2 else 0.0
         if apart <= 0:
-            self._say("Measure a known distance first")
+            self._say("Pick a length first")
             return
         self._choose(meters_per_unit=1e-3 * float(self._controls.length.value) / apart)
         self._show_length()

@@ -81,6 +81,7 @@ class Session:
             save=self._save_presentation,
             distance=scene_frame.distance,
             changed=self._changed,
+            said=lambda: self.panel.show_note(self._presenting.note),
             caught=self._caught,
         )
         self._frusta = Frusta(
