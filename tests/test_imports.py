@@ -24,6 +24,7 @@ ROOMS = (
     "vectors",
     "camera",
     "scene_frame",
+    "presentation",
     "trajectory",
     "_native",
     "optics",

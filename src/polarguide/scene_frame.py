@@ -14,6 +14,8 @@ from polarguide.vectors import unit
 
 # Optical axes that are nearly parallel do not say where they meet: the cameras' own distance from each other does then.
 _LEAST_SPREAD = 1e-4
+# The pictures' rows say what is level if they fan out by so much (variance of unit vectors) and roll by less than so.
+_LEAST_FAN, _MOST_ROLL = 0.03, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +54,10 @@ class SceneFrame:
 def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
     """The frame of some cameras, at least one.
 
-    The center is the point nearest to all optical axes (least squares), up the mean of the pictures' upward
-    directions. Parallel axes, as of a camera shifted along a line, meet nowhere: then the center lies ahead of the
-    cameras' mean by as much as they spread.
+    The center is the point nearest to all optical axes (least squares). Parallel axes, as of a camera shifted along a
+    line, meet nowhere: then it lies ahead of the cameras' mean by as much as they spread. Up is the direction to which
+    the pictures' rows are most nearly perpendicular (least squares), as people hold cameras level while they look down;
+    where the rows do not tell, it is the mean of the pictures' upward directions.
     """
     centers = torch.stack([camera.center for camera in cameras])
     forward = torch.stack([camera.rotation[2] for camera in cameras])
@@ -67,8 +70,21 @@ def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
     else:
         spread = float((centers - middle).norm(dim=1).max())
         center = middle + ahead * max(spread, 1.0)
-    up = -torch.stack([camera.rotation[1] for camera in cameras]).mean(dim=0)
-    if float(up.norm()) < 0.05:  # cameras all around, or rolled: no common up
-        up = -cameras[0].rotation[1]
     distance = float((centers - center).norm(dim=1).median())
-    return SceneFrame(center, up / up.norm(), max(distance, 1e-6))
+    return SceneFrame(center, _common_up(cameras), max(distance, 1e-6))
+
+
+def _common_up(cameras: Sequence[Camera]) -> Tensor:
+    """Unit [3] float64; see ``scene_frame``."""
+    mean = -torch.stack([camera.rotation[1] for camera in cameras]).mean(dim=0)
+    if float(mean.norm()) < 0.05:  # cameras all around, or rolled: no common up
+        mean = -cameras[0].rotation[1]
+    mean = mean / mean.norm()
+    rows = torch.stack([camera.rotation[0] for camera in cameras])
+    values, axes = torch.linalg.eigh(rows.T @ rows / len(rows))
+    axis = axes[:, 0]
+    # The rows have to spread over a plane, with little out of it, and the cameras to be upright rather than on end.
+    told = float(values[1]) > _LEAST_FAN and float(values[0]) < _MOST_ROLL * float(values[1])
+    if not told or abs(float(axis @ mean)) < 0.5:
+        return mean
+    return axis if float(axis @ mean) > 0 else -axis

@@ -32,14 +32,17 @@ REMEDY = "Give orbit, spiral, interpolate, or a JSON file with cameras as docs/h
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
 
 
-def orbit(cameras: Sequence[Camera], frames: int, *, swing: float = 0.0) -> list[Camera]:
+def orbit(
+    cameras: Sequence[Camera], frames: int, *, swing: float = 0.0, around: SceneFrame | None = None
+) -> list[Camera]:
     """Once around the scene at the cameras' median height and distance, beginning at the first camera's side.
 
     Args:
         cameras: of the scene, at least one; the first one's lens is used.
         frames: pictures, the last a step before the first. swing: up and down by this share of the distance, twice.
+        around: the scene's frame; that of the cameras if None.
     """
-    around = scene_frame(cameras)
+    around = around or scene_frame(cameras)
     ahead, side = _level_axes(around, cameras[0].center)
     offsets = torch.stack([camera.center for camera in cameras]) - around.center
     height = float((offsets @ around.up).median())
@@ -55,9 +58,9 @@ def orbit(cameras: Sequence[Camera], frames: int, *, swing: float = 0.0) -> list
     return path
 
 
-def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+def spiral(cameras: Sequence[Camera], frames: int, *, around: SceneFrame | None = None) -> list[Camera]:
     """An orbit that goes up and down by a quarter of the distance, twice."""
-    return orbit(cameras, frames, swing=0.25)
+    return orbit(cameras, frames, swing=0.25, around=around)
 
 
 def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:

@@ -22,9 +22,10 @@ from polarguide.evaluation.scores import score_view
 from polarguide.evaluation.target import ViewTarget
 from polarguide.inspection.short_run import short_run, surface_of
 from polarguide.options import ComputeOptions
+from polarguide.presentation import Crop
 from polarguide.scene_frame import scene_frame
 from polarguide.viewer import shown_run
-from polarguide.viewer.appearance import Appearance, Crop, Painter
+from polarguide.viewer.appearance import Appearance, Painter
 
 
 @pytest.fixture

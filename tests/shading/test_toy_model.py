@@ -20,6 +20,7 @@ from polarguide.evaluation.target import ViewTarget
 from polarguide.export.points import surface_points
 from polarguide.export.share import BAKED, share_page
 from polarguide.gaussians.ply import read_ply
+from polarguide.presentation import Crop
 from polarguide.raster import choose_backend
 from polarguide.recipes import ablations_of, recipe_named
 from polarguide.rendering.relight import needs_radiance
@@ -33,7 +34,7 @@ from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer, TrainSettings
 from polarguide.viewer import shown_training
-from polarguide.viewer.appearance import Appearance, Crop, Painter
+from polarguide.viewer.appearance import Appearance, Painter
 
 SETTINGS = TrainSettings(steps=150, seed=2, refractive_index=1.4)
 STOP = 70  # after rounds of the density control, and before others

@@ -10,8 +10,9 @@ import torch
 from random_runs import KINDS, ring
 from viewer_scenes import frame_of_scene, photograph, shown
 
+from polarguide.presentation import Crop
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.appearance import MEASURED, Appearance, Crop, Painter
+from polarguide.viewer.appearance import MEASURED, Appearance, Painter
 from polarguide.viewer.viewport import letterbox
 from polarguide.visualization import figures
 

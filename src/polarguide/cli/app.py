@@ -25,6 +25,7 @@ VERBS = {
     "eval": "evaluate",
     "render": "render",
     "view": "view",
+    "present": "present",
     "share": "share",
     "export": "export",
     "priors": "priors",

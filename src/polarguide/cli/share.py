@@ -28,5 +28,4 @@ def share(
     """
     trained, _ = opened(run, machine)
     path = trained.share(out, title=title, caption=caption)
-    size = f"{path.stat().st_size / 1e6:.1f} MB, {len(trained.model):,} Gaussians"
-    console.print(f"page: {path} ({size})", markup=False)
+    console.print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)

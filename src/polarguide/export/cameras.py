@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,20 @@ _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 
 def write_colmap(
-    folder: Path, cameras: Mapping[str, Camera], points: Tensor, colors: Tensor, suffix: str = ".png"
+    folder: Path,
+    cameras: Mapping[str, Camera],
+    points: Tensor,
+    colors: Tensor,
+    suffix: str = ".png",
+    *,
+    comments: Sequence[str] = (),
 ) -> None:
     """Write a COLMAP model as text: one camera and one image a view, and points without tracks.
 
     Args:
         folder: made if there is none. cameras: by view. points: [M, 3]. colors: [M, 3] uint8.
         suffix: the images are called the view's name and this.
+        comments: lines for the head of each file.
     """
     model = pycolmap.Reconstruction()
     for number, (name, camera) in enumerate(cameras.items(), start=1):
@@ -42,6 +49,9 @@ def write_colmap(
         model.add_point3D(place, pycolmap.Track(), color)
     with atomic_folder(folder) as temporary:
         model.write_text(str(temporary))
+        head = "".join(f"# {line}\n" for line in comments).encode()
+        for path in temporary.iterdir():
+            path.write_bytes(head + path.read_bytes())
         _require_whole(temporary, len(cameras), len(points))
 
 
@@ -78,6 +88,6 @@ def transforms(cameras: Mapping[str, Camera], suffix: str = ".png") -> dict[str,
     return {"camera_model": "OPENCV", "frames": frames}
 
 
-def write_transforms(path: Path, cameras: Mapping[str, Camera]) -> None:
-    """Write ``transforms.json``."""
-    write_text(path, json.dumps(transforms(cameras), indent=1) + "\n")
+def write_transforms(path: Path, cameras: Mapping[str, Camera], about: Mapping[str, Any] = {}) -> None:
+    """Write ``transforms.json``, with more to say ``about`` it, which readers pass over."""
+    write_text(path, json.dumps({**transforms(cameras), **about}, indent=1) + "\n")

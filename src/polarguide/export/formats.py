@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from polarguide.camera import Camera
 from polarguide.capture import read_model
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.evaluation.table import shown_metrics
 from polarguide.export.cameras import write_colmap, write_transforms
 from polarguide.export.mesh import write_mesh
+from polarguide.export.placement import Origin, Placement, comments, rewrite_splats
 from polarguide.export.points import surface_points, write_points
 from polarguide.export.share import share_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
 from polarguide.files import make_folder, temporary_folder, write_text
 from polarguide.options import ExportFormat, PathLike, check_choice, check_range
+from polarguide.presentation import balanced
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.mesh import RESOLUTION, scene_mesh
 from polarguide.rendering.relight import needs_radiance, panorama, write_exr
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.point_cloud import write_run_ply
-from polarguide.scene_frame import scene_frame
+from polarguide.shading.gbuffer import render
+from polarguide.shading.model import Parameters
+from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
 
 PANORAMA_HEIGHT = 512
@@ -41,7 +46,7 @@ def export(
     spz_version: int = 3,
     reporter: Reporter = SILENT,
 ) -> list[Path]:
-    """Write a run as the files of other programs.
+    """Write a run as the files of other programs, as it is presented: cropped, in meters, upright (see ``Placement``).
 
     Args:
         run: the run; its scene is read for all but ply, spz and sog.
@@ -62,17 +67,18 @@ def export(
     """
     folder = run.folder / "export" if out is None else Path(out)
     writers: dict[str, Callable[[], list[Path]]] = {
-        "ply": lambda: [_ply(run, folder / "splats.ply")],
-        "spz": lambda: [_compressed(run, folder / "splats.spz", partial(write_spz, version=spz_version))],
-        "sog": lambda: [_compressed(run, folder / "splats.sog", write_sog)],
-        "mesh": lambda: _mesh(run, folder, resolution, reporter),
-        "points": lambda: _points(run, folder),
-        "environment": lambda: _environment(run, folder),
-        "cameras": lambda: _cameras(run, folder),
+        "ply": lambda: [_ply(run, shown, folder / "splats.ply")],
+        "spz": lambda: [_spz(run, shown, folder / "splats.spz", spz_version)],
+        "sog": lambda: [_sog(run, shown, folder / "splats.sog")],
+        "mesh": lambda: _mesh(run, shown, folder, resolution, reporter),
+        "points": lambda: _points(run, shown, folder),
+        "environment": lambda: _environment(run, shown, folder),
+        "cameras": lambda: _cameras(run, shown, folder),
     }
     check_choice("format", format, writers)
     check_range("resolution", resolution, 16, 1024)
     check_range("spz_version", spz_version, 3, 4)
+    shown = _Shown(run)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return writers[format]()
@@ -86,7 +92,7 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
     Args:
         run: the run; its scene is read.
         path: file to write, ending in .html; ``share.html`` in the run's folder by default.
-        title: heading of the page; the scene's name by default.
+        title: heading of the page; that of the presentation, or the scene's name, by default.
         caption: text below it; the recipe and its steps by default.
 
     Returns:
@@ -100,29 +106,68 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         raise PolarguideError(
             "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
         )
+    shown = _Shown(run)
     views = run.scene.test_views + run.scene.train_views
     scored = (run.folder / METRICS_FILE).exists()
     scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
     page = share_page(
-        run.model.state.gaussians,
+        shown.gaussians,
         run.model.light,
         run.model.shading,
         {view.name: view.camera for view in views},
         first=views[0].name,
-        title=title or run.scene.name,
+        title=title or shown.presentation.title or run.scene.name,
         caption=caption or f"{run.recipe.name}, {run.steps:,} steps",
         metrics=[
             *((f"{label}, test views", text) for label, text in scores),
-            ("Gaussians", f"{len(run.model):,}"),
+            ("Gaussians", f"{len(shown.gaussians['means']):,}"),
         ],
+        presentation=shown.presentation,
     )
     make_folder(path.parent)
     write_text(path, page)
     return path
 
 
-def _ply(run: OpenedRun, path: Path) -> Path:
-    write_run_ply(path, run.model.state, run.model.shading, _camera_centers(run))
+class _Shown:
+    """How a run is presented, and what of it is.
+
+    Raises:
+        PolarguideError: the presentation cannot be read, or nothing lies within its crop box.
+    """
+
+    def __init__(self, run: OpenedRun) -> None:
+        self.presentation = run.presentation
+        self.gaussians: Parameters = run.model.state.gaussians
+        self.kept: Tensor | None = None
+        if (crop := self.presentation.crop) is not None:
+            self.kept = crop.inside(self.gaussians["means"].detach(), run.camera_frame)
+            if not bool(self.kept.any()):
+                raise PolarguideError(
+                    "the crop box",
+                    expected="Gaussians in it",
+                    found=f"none of {len(self.kept)}",
+                    remedy="Move it: polarguide present RUN --crop, or in polarguide view.",
+                )
+            names = run.model.state.gaussians.names
+            self.gaussians = {name: self.gaussians[name].detach()[self.kept] for name in names}
+        around = run.frame if self.presentation.up_axis is not None else None
+        self.placement = Placement.of(self.presentation, around)
+        scene = run.configuration.scene_digest[:12]
+        self.origin = Origin(self.presentation, f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}")
+
+    @property
+    def comments(self) -> list[str]:
+        """For the head of a file."""
+        return comments(self.origin, self.placement)
+
+
+def _ply(run: OpenedRun, shown: _Shown, path: Path, placement: Placement | None = None) -> Path:
+    with temporary_folder(path.with_suffix(".whole")) as folder:
+        whole = folder / path.name
+        write_run_ply(whole, run.model.state, run.model.shading, _camera_centers(run))
+        kept = None if shown.kept is None else shown.kept.cpu()
+        rewrite_splats(path, whole, placement or shown.placement, kept, shown.comments)
     return path
 
 
@@ -135,42 +180,73 @@ def _camera_centers(run: OpenedRun) -> Tensor | None:
         return None
 
 
-def _compressed(run: OpenedRun, path: Path, write: Callable[[Path, Path], None]) -> Path:
-    """From a PLY that is gone afterwards."""
+def _spz(run: OpenedRun, shown: _Shown, path: Path, version: int) -> Path:
+    """From a PLY that is gone afterwards. In units of the scene: its positions are multiples of 1/4096 of a unit."""
     with temporary_folder(path.with_suffix(".ply")) as place:
-        write(path, _ply(run, place / "splats.ply"))
+        ply = _ply(run, shown, place / "splats.ply", replace(shown.placement, scale=1.0, metric=False))
+        write_spz(path, ply, version)
     return path
 
 
-def _mesh(run: OpenedRun, folder: Path, resolution: int, reporter: Reporter) -> list[Path]:
-    cameras = run.cameras
-    mesh = scene_mesh(cameras, lambda camera: run.model.render(camera, depth=True), resolution=resolution)
+def _sog(run: OpenedRun, shown: _Shown, path: Path) -> Path:
+    """From a PLY that is gone afterwards."""
+    credit = shown.presentation.credit
+    about = {"extras": {**shown.origin.record(), **shown.placement.record()}}
+    with temporary_folder(path.with_suffix(".ply")) as place:
+        ply = _ply(run, shown, place / "splats.ply")
+        write_sog(path, ply, {**({"copyright": credit} if credit else {}), **about})
+    return path
+
+
+def _mesh(run: OpenedRun, shown: _Shown, folder: Path, resolution: int, reporter: Reporter) -> list[Path]:
+    model = run.model
+
+    def seen(camera: Camera) -> RenderResult:
+        return render(
+            shown.gaussians,
+            camera,
+            model.backend.rasterize,
+            shading=model.shading,
+            light=model.light,
+            normals=True,
+            depth=True,
+        )
+
+    with torch.no_grad():
+        mesh = scene_mesh(run.cameras, seen, resolution=resolution)
+    if (crop := shown.presentation.crop) is not None:
+        inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
+        mesh = mesh.within(inside)
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
-        write_mesh(path, mesh, scene_frame(list(cameras.values())))
+        write_mesh(path, mesh, run.frame, shown.placement, shown.origin)
     reporter.say(f"{len(mesh.surface.vertices):,} vertices, {len(mesh.surface.faces):,} triangles")
     return paths
 
 
-def _points(run: OpenedRun, folder: Path) -> list[Path]:
-    path, model = folder / "points.ply", run.model
+def _points(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
+    path, model, placement = folder / "points.ply", run.model, shown.placement
     views, rasterize = run.scene.views, model.backend.rasterize
-    write_points(path, *surface_points(model.state.gaussians, model.shading, views, rasterize))
+    places, normals, colors = surface_points(shown.gaussians, model.shading, views, rasterize)
+    write_points(path, placement.points(places), placement.directions(normals), colors, shown.comments)
     return [path]
 
 
-def _environment(run: OpenedRun, folder: Path) -> list[Path]:
+def _environment(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
     cubemap = needs_radiance(run.model.shading, what="format")
-    around = scene_frame(list(run.cameras.values()))
-    picture = panorama(run.light[cubemap.name], cubemap, around, PANORAMA_HEIGHT)
+    picture = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
     paths = [folder / "environment.exr", folder / "environment.png"]
-    write_exr(paths[0], picture)
-    figures.write_png(paths[1], figures.radiance_to_rgb(picture))
+    credit = shown.presentation.credit
+    write_exr(paths[0], picture, {"owner": credit} if credit else {})
+    figures.write_png(paths[1], figures.radiance_to_rgb(balanced(picture, shown.presentation.gains)))
     return paths
 
 
-def _cameras(run: OpenedRun, folder: Path) -> list[Path]:
-    scene = run.scene
-    write_colmap(folder / "sparse" / "0", run.cameras, scene.points, scene.point_colors)
-    write_transforms(folder / "transforms.json", run.cameras)
+def _cameras(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
+    scene, placement = run.scene, shown.placement
+    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
+    points = placement.points(scene.points)
+    write_colmap(folder / "sparse" / "0", cameras, points, scene.point_colors, comments=shown.comments)
+    about = {**shown.origin.record(), **placement.record()}
+    write_transforms(folder / "transforms.json", cameras, about)
     return [folder / "sparse" / "0", folder / "transforms.json"]

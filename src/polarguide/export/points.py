@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +56,10 @@ def surface_points(
     return means, normals, colors
 
 
-def write_points(path: Path, points: Tensor, normals: Tensor, colors: Tensor) -> None:
-    """Write a PLY of points."""
+def write_points(
+    path: Path, points: Tensor, normals: Tensor, colors: Tensor, comments: Sequence[str] = ()
+) -> None:
+    """Write a PLY of points, with comments."""
     table = np.empty(len(points), dtype=FIELDS)
     values = np.concatenate((points.numpy(), normals.numpy()), axis=1)
     for index, (name, _) in enumerate(FIELDS[:6]):
@@ -66,4 +68,5 @@ def write_points(path: Path, points: Tensor, normals: Tensor, colors: Tensor) ->
     for index, name in enumerate(("red", "green", "blue")):
         table[name] = shades[:, index]
     with atomic(path) as temporary:
-        PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary)
+        element = PlyElement.describe(table, "vertex", comments=list(comments))
+        PlyData([element], byte_order="<").write(temporary)

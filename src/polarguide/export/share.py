@@ -20,13 +20,24 @@ from polarguide import __version__
 from polarguide.camera import Camera
 from polarguide.export.records import TEXEL, planes, records
 from polarguide.gaussians.ply import refit_sh_to_display
+from polarguide.presentation import Presentation
 from polarguide.runs.point_cloud import gaussian_colors
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
 from polarguide.visualization.embedded import content_policy, page_part, script_json
 
-SCRIPTS = ("algebra.js", "sorter.js", "renderer.js", "navigation.js", "controls.js", "unpack.js", "main.js")
+SCRIPTS = (
+    "algebra.js",
+    "sorter.js",
+    "renderer.js",
+    "navigation.js",
+    "controls.js",
+    "presentation.js",
+    "unpack.js",
+    "main.js",
+)
+NOTHING = Presentation()
 SHADERS = {
     "records": "records.glsl",
     "derive": "derive.frag",
@@ -54,6 +65,7 @@ def share_page(
     title: str,
     caption: str = "",
     metrics: Sequence[tuple[str, str]] = (),
+    presentation: Presentation = NOTHING,
 ) -> str:
     """The page.
 
@@ -63,6 +75,7 @@ def share_page(
         cameras: poses to choose from by name, at least one. first: name of the one to begin with.
         title, caption: any text; it is escaped.
         metrics: labels and values, any text.
+        presentation: white balance, up axis, scale and credit.
 
     Returns:
         HTML that asks for nothing from outside; its own policy forbids it to.
@@ -80,7 +93,7 @@ def share_page(
         "index": 1.5,
         "resolution": int(page.light[0].shape[1]) if page.light else 1,
         "levels": max(1, len(page.light)),
-        **_frame(cameras, first),
+        **_frame(cameras, first, presentation),
         **page.constants,
     }
     arrays: dict[str, NDArray[np.generic] | None] = {
@@ -98,6 +111,8 @@ def share_page(
         metrics="".join(
             f"<tr><th>{html.escape(label)}</th><td>{html.escape(value)}</td></tr>" for label, value in metrics
         ),
+        credit=_credit(presentation),
+        meta=_meta(presentation),
         style=page_part(__package__, "page.css"),
         script=script,
         scene=script_json(scene),
@@ -116,9 +131,26 @@ def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> Pa
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
 
 
-def _frame(cameras: Mapping[str, Camera], first: str) -> dict[str, Any]:
-    around = scene_frame(list(cameras.values()))
+def _credit(presentation: Presentation) -> str:
+    """A line of whom the scene is owed to, and what machines read of it; empty where nobody is named."""
+    shown = presentation
+    lines = [text for text in (shown.credit and f"© {shown.credit}", shown.provenance) if text]
+    return f'<p class="credit">{html.escape(" · ".join(lines))}</p>' if lines else ""
+
+
+def _meta(presentation: Presentation) -> str:
+    names = {"author": presentation.author, "dcterms.license": presentation.license}
+    names["dcterms.provenance"] = presentation.provenance
+    return "".join(
+        f'<meta name="{name}" content="{html.escape(text)}">\n' for name, text in names.items() if text
+    )
+
+
+def _frame(cameras: Mapping[str, Camera], first: str, presentation: Presentation) -> dict[str, Any]:
+    around = presentation.upright(scene_frame(list(cameras.values())))
     return {
+        "white": list(presentation.white_balance or (1.0, 1.0, 1.0)),
+        "metersPerUnit": presentation.meters_per_unit,
         "up": around.up.tolist(),
         "center": around.center.tolist(),
         "distance": around.distance,

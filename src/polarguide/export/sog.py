@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,21 +32,21 @@ SEED = 0
 Pixels = NDArray[np.uint8]
 
 
-def write_sog(path: Path, ply: Path) -> None:
+def write_sog(path: Path, ply: Path, asset: Mapping[str, Any] = {}) -> None:
     """Convert a PLY of Gaussians; our own fields in it are left out. A fixed file for a fixed PLY.
 
     Positions keep 16 bits of their signed logarithm, rotations 8 bits a component, the rest a code of 256 values;
     harmonics beyond the first become one of at most 8,192.
 
     Args:
-        path: the file to write. ply: as ``write_run_ply`` writes it.
+        path: the file to write. ply: as ``write_run_ply`` writes it. asset: what ``meta.json`` says of the file.
     """
     gaussians = {name: values for name, values in read_ply(ply).items() if name != "extra"}
     order = _morton_order(gaussians["means"])
     gaussians = {name: values[order] for name, values in gaussians.items()}
     width = math.ceil(math.sqrt(len(order)))
     pictures: dict[str, Pixels] = {}
-    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "polarguide"}, "count": len(order)}
+    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "polarguide", **asset}, "count": len(order)}
     meta["means"] = _means(gaussians["means"], width, pictures)
     meta["scales"] = _coded("scales.webp", gaussians["log_scales"], None, width, pictures)
     pictures["quats.webp"] = _picture(_smallest_three(gaussians["quaternions"]), width)

@@ -20,10 +20,11 @@ from polarguide.files import write_whole, writing
 from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.orders import FileOrder, swaps
+from polarguide.presentation import PRESENTATION_FILE
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import read_record, to_json
 
-COPIED = ("sparse", "masks", "invalid", "gt", "split.json")
+COPIED = ("sparse", "masks", "invalid", "gt", "split.json", PRESENTATION_FILE)
 """Files and folders that are copied unchanged."""
 METADATA = "scene.json"
 

@@ -19,7 +19,7 @@ from polarguide.trajectory import interpolated, orbit, read_path, spiral
 from polarguide.visualization import figures
 from polarguide.visualization.layers import Picture, layer_picture
 
-PATHS = {"orbit": orbit, "spiral": spiral, "interpolate": interpolated}
+PATHS = {"orbit": orbit, "spiral": spiral}
 FRAMES_PER_SECOND = 30.0
 
 
@@ -35,8 +35,11 @@ def path_cameras(run: OpenedRun, path: str, frames: int) -> tuple[list[Camera], 
         PolarguideError: too many frames, or a file that cannot be read.
     """
     check_range("frames", frames, 1, 100_000)
+    cameras = list(run.cameras.values())
+    if path == "interpolate":
+        return interpolated(cameras, frames), FRAMES_PER_SECOND
     if path in PATHS:
-        return PATHS[path](list(run.cameras.values()), frames), FRAMES_PER_SECOND
+        return PATHS[path](cameras, frames, around=run.frame), FRAMES_PER_SECOND
     return read_path(Path(path))
 
 
@@ -79,9 +82,10 @@ def _pictures(
 ) -> Iterator[Picture]:
     depths = _depths(run, cameras) if "depth" in layers else None
     shape: tuple[int, ...] | None = None
+    gains = run.presentation.gains
     with reporter.track("rendering", len(cameras)) as advance:
         for number, camera in enumerate(cameras):
-            picture = _picture(run, layers, camera, depths)
+            picture = _picture(run, layers, camera, depths, gains)
             if shape is not None and picture.shape != shape:
                 raise PolarguideError(
                     "path",
@@ -95,12 +99,16 @@ def _pictures(
 
 
 def _picture(
-    run: OpenedRun, layers: list[str], camera: Camera, depths: tuple[float, float] | None
+    run: OpenedRun,
+    layers: list[str],
+    camera: Camera,
+    depths: tuple[float, float] | None,
+    gains: torch.Tensor | None,
 ) -> Picture:
     """Layers side by side."""
     result = run.model.render(camera, depth="depth" in layers)
     run.chosen_layers(result, layers)
-    pictures = [layer_picture(result, name, camera, depths) for name in layers]
+    pictures = [layer_picture(result, name, camera, depths, gains=gains) for name in layers]
     return np.concatenate([picture for picture in pictures if picture is not None], axis=1)
 
 

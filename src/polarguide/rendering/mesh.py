@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.errors import optional_import
+from polarguide.errors import PolarguideError, optional_import
 from polarguide.rendering.fusion import TRUNCATION, Box, Surface, box_around, fuse, seen_points, surface_of
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import RenderResult
@@ -31,6 +31,23 @@ class ColoredMesh:
 
     surface: Surface
     colors: NDArray[np.float64]
+
+    def within(self, kept: NDArray[np.bool_]) -> ColoredMesh:
+        """The faces all of whose vertices are kept, [V] bool.
+
+        Raises:
+            PolarguideError: there are none.
+        """
+        faces = self.surface.faces[kept[self.surface.faces].all(axis=1)]
+        if not len(faces):
+            raise PolarguideError(
+                "the crop box", expected="a surface in it", found="none", remedy="Make it larger, or move it."
+            )
+        used, numbers = np.unique(faces, return_inverse=True)
+        surface = Surface(
+            self.surface.vertices[used], numbers.reshape(faces.shape), self.surface.normals[used]
+        )
+        return ColoredMesh(surface, self.colors[used])
 
 
 @torch.no_grad()

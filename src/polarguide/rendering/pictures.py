@@ -68,8 +68,8 @@ def write_pictures(
         views: ``test``, ``train``, ``all``, or names separated by commas.
         layers: names of layers, all of the run's by default; one that the recipe has not is left out, and named to
             the reporter.
-        format: png as a display shows layers; exr and npy hold their linear numbers, in the units that ``layers.json``
-            beside them states. The contact sheet is PNG.
+        format: png as a display shows layers, with the white balance of the run's presentation; exr and npy hold their
+            linear numbers, in the units that ``layers.json`` beside them states. The contact sheet is PNG.
 
     Returns:
         The path of the contact sheet.
@@ -84,12 +84,15 @@ def write_pictures(
     check_choice("format", format, get_args(PictureFormat))
     shown: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
+    gains = run.presentation.gains
     with reporter.track("rendering", len(chosen)) as advance:
         for number, view in enumerate(chosen):
             result = run.result(view.camera).to("cpu")
             depths = true_depth_range(view)
             pictures = {
-                name: layer_picture(result, name, view.camera, depths, exposed=name == "reflection")
+                name: layer_picture(
+                    result, name, view.camera, depths, exposed=name == "reflection", gains=gains
+                )
                 for name in names
             }
             for name, picture in pictures.items():
@@ -100,7 +103,7 @@ def write_pictures(
                 else:
                     _write_numbers(folder / f"{view.name}_{name}.{format}", getattr(result, name))
             if len(shown) < SHEET_VIEWS:
-                known = ground_truth_pictures(view)
+                known = ground_truth_pictures(view, gains)
                 cells = {name: picture for name, picture in pictures.items() if picture is not None}
                 shown.append(
                     (view.name, cells | {f"{name}, true": known[name] for name in cells if name in known})

@@ -8,6 +8,7 @@ radiance on the scale of the photographs (S0 / 2).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from polarguide.files import atomic
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
-from polarguide.scene_frame import SceneFrame, scene_frame
+from polarguide.scene_frame import SceneFrame
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
 from polarguide.shading.model import RadianceCubemap, ShadingModel
 
@@ -51,7 +52,7 @@ def relight(
         raise PolarguideError(what, expected="degrees", found=str(degrees), remedy="Give a number.")
     cubemap = needs_radiance(run.model.shading, what=what)
     light = run.model.light
-    around = scene_frame(list(run.cameras.values()))
+    around = run.frame
     if panorama is not None:
         texels = texels_of(read_panorama(Path(panorama)), cubemap, around, RELIT_RESOLUTION)
         light[cubemap.name] = texels.to(light[cubemap.name].device)
@@ -118,14 +119,14 @@ def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
     return found.reshape(6, resolution, resolution, -1)
 
 
-def write_exr(path: Path, picture: Tensor) -> None:
-    """Write linear radiance [H, W, 3] as 32-bit floats.
+def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -> None:
+    """Write linear radiance [H, W, 3] as 32-bit floats, with standard attributes of the format, such as ``owner``.
 
     Raises:
         PolarguideError: OpenEXR is not installed.
     """
     exr = optional_import("OpenEXR", "an EXR file")
-    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage, **attributes}
     pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32))
     with atomic(path) as temporary, exr.File(header, {"RGB": pixels}) as file:
         try:

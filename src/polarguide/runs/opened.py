@@ -13,14 +13,17 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.capture import Scene, load_scene
+from polarguide.capture import Scene, load_scene, read_model
+from polarguide.capture.layout import find_layout
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
+from polarguide.presentation import Presentation, read_presentation
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend, choose_backend
 from polarguide.raster.in_front import alpha_in_front
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
+from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.gbuffer import render, splats
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
@@ -198,6 +201,38 @@ class OpenedRun:
         if found.digest != configuration.scene_digest:
             _warn(f"{found.root} has changed since {self.folder} was trained on it.")
         return found
+
+    @property
+    def scene_folder(self) -> Path:
+        """Where the scene is, or was when it was trained on."""
+        found = self._scene_source
+        return found.root if isinstance(found, Scene) else Path(found or self.configuration.scene)
+
+    @property
+    def presentation(self) -> Presentation:
+        """How the run is presented: its own ``presentation.json`` over that of its scene, as they are now.
+
+        Raises:
+            PolarguideError: a file is not such a record.
+        """
+        return read_presentation(self.folder).over(read_presentation(self.scene_folder))
+
+    @cached_property
+    def camera_frame(self) -> SceneFrame:
+        """The frame of the scene's cameras, with up as they say; reads their poses, not their pictures.
+
+        Raises:
+            PolarguideError: the scene is not there any more, or has no such poses.
+        """
+        if "scene" in self.__dict__ or isinstance(self._scene_source, Scene):
+            return scene_frame(list(self.cameras.values()))
+        model = read_model(self.scene_folder)
+        return scene_frame([model.camera(name) for name in find_layout(self.scene_folder).names])
+
+    @property
+    def frame(self) -> SceneFrame:
+        """``camera_frame``, with the up axis of the presentation where one was chosen."""
+        return self.presentation.upright(self.camera_frame)
 
     @property
     def cameras(self) -> dict[str, Camera]:

@@ -4,52 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
 from polarguide.optics import aolp, dolp, luminance, stokes
+from polarguide.presentation import Crop, Presentation, Vector, balanced
+from polarguide.rendering.picking import SurfacePoint, surface_at
 from polarguide.scene_frame import SceneFrame
 from polarguide.shading.result import RenderResult
 from polarguide.viewer.shown import Shown
 from polarguide.viewer.viewport import letterbox
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
-from polarguide.visualization.layers import depth_range, layer_picture
+from polarguide.visualization.layers import RADIANCE, depth_range, layer_picture
 
 MEASURED = ("photograph", "DoLP", "AoLP", "error")
 """Layers that only a photograph's pose has."""
-
-RADIANCE = {"final", "diffuse", "specular", "base", "reflection"}
-
-
-@dataclass(frozen=True)
-class Crop:
-    """A box about the scene's center along the cameras' common right, up and back.
-
-    Attributes:
-        low, high: corners in shares of the cameras' distance.
-    """
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-
-    def corners(self, around: SceneFrame) -> Tensor:
-        """Its eight corners in the world, [8, 3] float64, the last axis fastest."""
-        sides = torch.tensor([self.low, self.high], dtype=torch.float64)
-        local = torch.cartesian_prod(*sides.T) * around.distance
-        return around.center + local @ around.panorama_axes().T
-
-    def inside(self, means: Tensor, around: SceneFrame) -> Tensor:
-        """Which means [N, 3] lie in it, [N] bool."""
-        axes, center = (t.to(means) for t in (around.panorama_axes(), around.center))
-        local = (means - center) @ axes / around.distance
-        low, high = (
-            torch.tensor(side, dtype=local.dtype, device=local.device) for side in (self.low, self.high)
-        )
-        return ((local >= low) & (local <= high)).all(dim=1)
 
 
 @dataclass(frozen=True)
@@ -62,6 +34,7 @@ class Appearance:
         strength: factor on the specular layer.
         turn: degrees of the far environment, counter-clockwise seen from above.
         crop: what is shown of the scene; None: all.
+        white_balance: gains of R, G and B on radiance. up_axis: the axis of turning; None: as the cameras say.
     """
 
     layer: str = "final"
@@ -69,13 +42,15 @@ class Appearance:
     strength: float = 1.0
     turn: float = 0.0
     crop: Crop | None = None
+    white_balance: Vector | None = None
+    up_axis: Vector | None = None
 
 
 class Painter:
     """Draws a scene as a visitor wants it.
 
     Args:
-        around: the scene's surroundings.
+        around: the frame of the scene's cameras.
     """
 
     def __init__(self, around: SceneFrame) -> None:
@@ -115,11 +90,27 @@ class Painter:
         camera = place.camera(view.camera)
         return self._layer(self._result(shown, camera, appearance), camera, appearance, settled=settled)
 
+    def point(
+        self,
+        shown: Shown,
+        camera: Camera,
+        appearance: Appearance,
+        view: View | None,
+        place: tuple[float, float],
+    ) -> SurfacePoint | None:
+        """What is seen at a place of the picture that ``paint`` draws, in shares of its width and height."""
+        if view is not None:
+            camera = letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
+        plain = Appearance(layer="depth", crop=appearance.crop)
+        result = self._result(shown, camera, plain)
+        return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
+
     def _result(self, shown: Shown, camera: Camera, appearance: Appearance) -> RenderResult:
         crop, turn = appearance.crop, None
         kept = None if crop is None else lambda means: crop.inside(means, self.around)
         if appearance.turn % 360:
-            turn = self.around.turn(appearance.turn)
+            presented = Presentation(up_axis=appearance.up_axis)
+            turn = presented.upright(self.around).turn(appearance.turn)
         result = shown.render(camera, depth=appearance.layer == "depth", kept=kept, turn=turn)
         if result.specular is None or result.diffuse is None or appearance.strength == 1.0:
             return result
@@ -134,7 +125,7 @@ class Painter:
         if values is None:
             return None
         if layer in RADIANCE:
-            return figures.radiance_to_rgb(values * 2.0**appearance.exposure)
+            return figures.radiance_to_rgb(_shown(values, appearance))
         if layer == "depth" and (settled or self._depths is None):
             self._depths = depth_range(values, result.alpha > 0.5)
         return layer_picture(result, layer, camera, self._depths)
@@ -143,7 +134,7 @@ class Painter:
         """A picture of the photograph's size."""
         brighter = 2.0**appearance.exposure
         if appearance.layer == "photograph":
-            return figures.radiance_to_rgb(view.photograph() * brighter)
+            return figures.radiance_to_rgb(_shown(view.photograph(), appearance))
         if appearance.layer == "error":
             final = self._result(shown, view.camera, appearance).final
             return figures.error_to_rgb(final * brighter, view.photograph() * brighter)
@@ -151,3 +142,9 @@ class Painter:
         if appearance.layer == "DoLP":
             return figures.dolp_to_rgb(dolp(gray), DOLP_HIGH)
         return figures.aolp_to_rgb(aolp(gray), dolp(gray) / AOLP_FULL_DOLP)
+
+
+def _shown(radiance: Tensor, appearance: Appearance) -> Tensor:
+    """Radiance [H, W, 3] as bright and as white as wanted, linear."""
+    gains = Presentation(white_balance=appearance.white_balance).gains
+    return balanced(radiance, gains) * 2.0**appearance.exposure

@@ -13,8 +13,8 @@ import torch
 
 from polarguide.camera import quaternion
 from polarguide.capture import Scene, View
+from polarguide.presentation import Crop
 from polarguide.scene_frame import SceneFrame
-from polarguide.viewer.appearance import Crop
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 

@@ -48,6 +48,11 @@ class _Click(msgspec.Struct):
     name: str
 
 
+class _Pointer(msgspec.Struct):
+    event_type: str
+    screen_pos: list[tuple[float, float]]
+
+
 def checked(raw: bytes | str, control: Callable[[str], Accepts | None], reach: float) -> bytes | None:
     """A message as viser may read it, or None where it is to be passed over.
 
@@ -77,6 +82,9 @@ def checked(raw: bytes | str, control: Callable[[str], Accepts | None], reach: f
             owner = msgspec.msgpack.decode(raw, type=dict[str, Any]).get("owner", "")
             given = {"name": name, "instance_index": None, "modifier": None, "owner": str(owner)[:100]}
             return _encoded(kind, {**given, **nowhere})
+        if kind == "ScenePointerMessage":
+            pointer = msgspec.msgpack.decode(raw, type=_Pointer)
+            return _encoded(kind, _clicked(pointer)) if pointer.event_type == "click" else None
     except (ValueError, RecursionError, OverflowError) as error:  # msgspec's are ValueErrors
         raise Refused("not a message") from error
     return None
@@ -139,6 +147,15 @@ def _camera(camera: _Camera, reach: float) -> dict[str, Any]:
         "image_height": pixels(camera.image_height),
         "image_width": pixels(camera.image_width),
     }
+
+
+def _clicked(pointer: _Pointer) -> dict[str, Any]:
+    """A click by its place in the window; the ray, which a session knows better, is left out."""
+    if len(pointer.screen_pos) != 1:
+        raise Refused("not one place")
+    place = tuple(min(max(_finite(value), 0.0), 1.0) for value in pointer.screen_pos[0])
+    ray = {"ray_origin": (0.0,) * 3, "ray_direction": (0.0, 0.0, 1.0)}
+    return {"event_type": "click", **ray, "screen_pos": (place,), "modifier": None}
 
 
 def _unit(vector: Sequence[float]) -> tuple[float, ...]:

@@ -6,13 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from polarguide.presentation import Crop, Presentation, Vector
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.appearance import MEASURED, Appearance, Crop
+from polarguide.viewer.appearance import MEASURED, Appearance
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
+from polarguide.viewer.presenting import PresentingControls
 
 FREE_VIEW = "(free)"
 STEPS = ("previous", "next")
+NOTHING = Presentation()
 # Ranges of the controls.
+SIDES = ("Left, right", "Down, up", "Front, back")
 EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-4.0, 4.0), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
 
 
@@ -24,12 +28,15 @@ class PanelOptions:
         layers: of the shading model. turns: whether the environment can be rotated.
         views: names of the photographs.
         trains: whether a training runs, which can be paused.
+        presentation: as it was saved. saves: whether it can be saved to the run, rather than downloaded.
     """
 
     layers: Sequence[str]
     turns: bool
     views: Sequence[str]
     trains: bool
+    presentation: Presentation = NOTHING
+    saves: bool = False
 
 
 class Panel:
@@ -48,8 +55,10 @@ class Panel:
 
     def __init__(self, gui: Any, options: PanelOptions, changed: Callable[[], None]) -> None:
         self._crop: list[Any] = []
+        # The box as it was saved, until a slider is moved; it is told more exactly than sliders can.
+        self._saved_crop = options.presentation.crop
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self._status = gui.add_markdown("")
+        self._status, self._lines, self._note = gui.add_markdown(""), tuple[str, ...](), ""
         self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
         layers = [name for name in LAYERS if name in options.layers]
         self.layer = gui.add_dropdown(
@@ -64,10 +73,11 @@ class Panel:
             self.step = gui.add_button_group("", STEPS)
             self.frusta = gui.add_checkbox("Show cameras", True)
         with gui.add_folder("Crop", expand_by_default=False):
-            self._use_crop = gui.add_checkbox("Crop", False)
+            self._use_crop = gui.add_checkbox("Crop", self._saved_crop is not None)
             self.box = gui.add_checkbox("Show box", True)
-            for label in ("Left, right", "Down, up", "Front, back"):
-                self._crop.append(gui.add_multi_slider(label, *CROP, 1, (-40, 40), min_range=1))
+            for label, sides in zip(SIDES, _percent(self._saved_crop), strict=True):
+                self._crop.append(gui.add_multi_slider(label, *CROP, 1, sides, min_range=1))
+        self.presenting = PresentingControls(gui, options.presentation, saves=options.saves)
         with gui.add_folder("Picture and camera path", expand_by_default=False):
             self.screenshot = gui.add_button("Save picture")
             self.keyframes = gui.add_text("Keyframes", "0", disabled=True)
@@ -78,8 +88,13 @@ class Panel:
             self.save_path = gui.add_button("Save path")
         self.accepts = self._accepted([*layers, *MEASURED], options.views)
         shown = (self.layer, self.exposure, self.strength, self.turn, self._use_crop, *self._crop)
+        for control in self._crop:
+            control.on_update(lambda _: self._forget_saved())
         for control in shown:
             control.on_update(lambda _: changed())
+
+    def _forget_saved(self) -> None:
+        self._saved_crop = None
 
     def _accepted(self, layers: Sequence[str], views: Sequence[str]) -> dict[str, Accepts]:
         pushed = (self.screenshot, self.add_keyframe, self.remove_keyframe, self.play, self.save_path)
@@ -95,31 +110,50 @@ class Panel:
             *((control, pair(*CROP)) for control in self._crop),
             *((control, push) for control in pushed),
         ]
-        return {control._impl.uuid: accepts for control, accepts in controls}
+        return {control._impl.uuid: accepts for control, accepts in controls} | self.presenting.accepts
+
+    def show_note(self, note: str) -> None:
+        """Show another note below the status, of which the same holds."""
+        self._note = note
+        self.show_status(*self._lines)
 
     def show_status(self, *lines: str) -> None:
         """Show status lines; they must not contain names from files."""
-        text = "  \n".join(lines)
+        self._lines = lines
+        text = "  \n".join((*lines, f"**{self._note}**") if self._note else lines)
         if self._status.content != text:
             self._status.content = text
 
-    @property
-    def crop(self) -> Crop | None:
-        """The crop box, or None if it is off."""
+    def crop(self, up_axis: Vector | None = None) -> Crop | None:
+        """The crop box along an axis (None: as the cameras say), or None if it is off."""
         if not self._use_crop.value:
             return None
+        if self._saved_crop is not None:
+            return self._saved_crop
         sides = [control.value for control in self._crop]
         low = (sides[0][0] / 100, sides[1][0] / 100, sides[2][0] / 100)
-        high = (sides[0][1] / 100, sides[1][1] / 100, sides[2][1] / 100)
-        return Crop(low, high)
+        high = tuple(max(side[1], side[0] + 1) / 100 for side in sides)  # a message may make them equal
+        return Crop(low, (high[0], high[1], high[2]), up_axis)
 
-    @property
-    def appearance(self) -> Appearance:
-        """The current choice of the user."""
+    def appearance(self, chosen: Presentation = NOTHING) -> Appearance:
+        """The current choice of the user, with the white and the up axis that were chosen."""
         return Appearance(
             layer=self.layer.value,
             exposure=float(self.exposure.value),
             strength=float(self.strength.value),
             turn=float(self.turn.value),
-            crop=self.crop,
+            crop=self.crop(chosen.up_axis),
+            white_balance=chosen.white_balance,
+            up_axis=chosen.up_axis,
         )
+
+
+def _percent(crop: Crop | None) -> list[tuple[int, int]]:
+    """Where the sliders of a crop box stand."""
+    if crop is None:
+        return [(-40, 40)] * 3
+    found = []
+    for low, high in zip(crop.low, crop.high, strict=True):
+        first = min(max(round(100 * low), CROP[0]), CROP[1] - 1)
+        found.append((first, max(first + 1, min(round(100 * high), CROP[1]))))
+    return found

@@ -10,17 +10,20 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.options import LOOPBACK, VisitorOptions
+from polarguide.presentation import Presentation, Vector
+from polarguide.rendering.picking import gray_world
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.model import ShadingModel
 from polarguide.viewer.frusta import Photograph
 from polarguide.viewer.gate import Gate
 from polarguide.viewer.guard import guarded
 from polarguide.viewer.messages import Accepts, checked
-from polarguide.viewer.panel import PanelOptions
+from polarguide.viewer.panel import NOTHING, PanelOptions
 from polarguide.viewer.session import Session
 from polarguide.viewer.shown import Shown
 
@@ -47,6 +50,8 @@ class Viewer:
         shading: model of the recipe. trains: whether the panel can pause a training.
         host, port: address to listen at; another port is used if this one is taken.
         visitors: who may look besides pages of this machine.
+        presentation: as it was saved. save: writes what a visitor chose to the run, and says so, in plain text; None:
+            visitors can download it. They can only do that, too, where others than this machine may look.
         title: plain text.
         warn: told why a browser was let go.
 
@@ -64,6 +69,8 @@ class Viewer:
         host: str = LOOPBACK[0],
         port: int = 8080,
         visitors: VisitorOptions = VisitorOptions(),
+        presentation: Presentation = NOTHING,
+        save: Callable[[Presentation], str] | None = None,
         title: str = "polarguide",
         warn: Callable[[str], None] = lambda text: None,
     ) -> None:
@@ -73,7 +80,11 @@ class Viewer:
         self._current, self._photographs = current, photographs
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
         turns = shading.radiance_cubemap is not None
-        self._options = PanelOptions(shading.layers, turns, tuple(photographs), trains)
+        self._save = save if host in LOOPBACK else None
+        self._options = PanelOptions(
+            shading.layers, turns, tuple(photographs), trains, presentation, self._save is not None
+        )
+        self._gray: Vector | None = None
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -88,7 +99,7 @@ class Viewer:
                 self._server = _listening(viser, host, port, title)
                 stack.callback(self.close)
             stack.pop_all()
-        self._server.scene.set_up_direction(tuple(self._scene_frame.up.tolist()))
+        self._server.scene.set_up_direction(tuple(presentation.upright(around).up.tolist()))
         self._server.scene.world_axes.visible = False
         self.address = viewing_address(host, self._server.get_port())
         self._server.on_client_connect(self._connected)
@@ -106,7 +117,14 @@ class Viewer:
 
         try:
             session = Session(
-                client, self._photographs, self._scene_frame, self._options, self._wake.set, drop=drop
+                client,
+                self._photographs,
+                self._scene_frame,
+                self._options,
+                self._wake.set,
+                gray_world=self._gray_world,
+                save=None if self._save is None else self._saved,
+                drop=drop,
             )
             session.go(next(iter(self._photographs)))
         except Exception as error:
@@ -115,6 +133,26 @@ class Viewer:
         with self._lock:
             self._sessions[client.client_id] = session
         self._wake.set()
+
+    def _gray_world(self) -> Vector:
+        """Gains of the photographs' mean, computed when they are first asked for."""
+        if self._gray is None:
+            photographs = self._photographs.values()
+            kept = [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
+            self._gray = gray_world(kept)
+        return self._gray
+
+    def _saved(self, presentation: Presentation) -> str:
+        """Save, so that browsers which come later begin with it."""
+        assert self._save is not None
+        try:
+            text = self._save(presentation)
+        except PolarguideError as error:
+            self._warn(str(error))
+            return f"Not saved: found {error.found}"
+        with self._lock:
+            self._options = replace(self._options, presentation=presentation)
+        return text
 
     def _control(self, name: str) -> Accepts | None:
         """What a control of any session takes; viser itself looks for it among those of the one that sends."""

@@ -7,9 +7,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from polarguide.camera import Camera
+from polarguide.presentation import PRESENTATION_FILE, Presentation, Vector
+from polarguide.records import to_json
 from polarguide.scene_frame import SceneFrame
 from polarguide.viewer.appearance import Painter
 from polarguide.viewer.frame_pacing import FramePacing
@@ -17,6 +20,7 @@ from polarguide.viewer.frusta import Frusta, Photograph
 from polarguide.viewer.keyframes import FRAMES_PER_SECOND, Keyframes
 from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
 from polarguide.viewer.pose import ViewPose, move_to_view
+from polarguide.viewer.presenting import Presenting
 from polarguide.viewer.shown import Shown
 from polarguide.viewer.viewport import free_camera
 from polarguide.visualization.figures import Picture, png_bytes
@@ -39,6 +43,8 @@ class Session:
     Args:
         client: viser's handle. photographs: by name. scene_frame: of the scene.
         options: of the panel. wake: called when a picture may be due.
+        gray_world: gives the gains of the photographs' mean.
+        save: writes a presentation to the run, and says so; None: the browser downloads it.
         drop: called with what a callback has raised, to let the browser go.
     """
 
@@ -50,6 +56,8 @@ class Session:
         options: PanelOptions,
         wake: Callable[[], None],
         *,
+        gray_world: Callable[[], Vector] = lambda: (1.0, 1.0, 1.0),
+        save: Callable[[Presentation], str] | None = None,
         drop: Callable[[Exception], None] = _raise,
     ) -> None:
         self._client, self._photographs, self._drop = client, photographs, drop
@@ -64,6 +72,18 @@ class Session:
         self._size = first.width, first.height
         self._keyframes = Keyframes(self._size)
         self.panel = Panel(client.gui, options, lambda: self._caught(self._changed)(None))
+        self._save = save
+        self._presenting = Presenting(
+            client,
+            self.panel.presenting,
+            options.presentation,
+            gray_world=gray_world,
+            save=self._save_presentation,
+            distance=scene_frame.distance,
+            changed=self._changed,
+            said=lambda: self.panel.show_note(self._presenting.note),
+            caught=self._caught,
+        )
         self._frusta = Frusta(
             client.scene,
             list(photographs.values()),
@@ -96,6 +116,7 @@ class Session:
         panel.seconds.on_update(self._caught(self._show_count))
         panel.play.on_click(self._caught(self._play))
         panel.save_path.on_click(self._caught(self._save_path))
+        self._caught(self._changed)(None)  # the box that was saved
 
     def _caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
         """A callback whose faults cost this browser its connection, and nobody else anything."""
@@ -120,8 +141,20 @@ class Session:
     def _changed(self) -> None:
         with self._lock:
             self.pacing.mark_changed(time.monotonic())
-        self._frusta.show_box(self.panel.crop if self.panel.box.value else None)
+        crop = self.panel.crop(self._presenting.chosen.up_axis)
+        self._frusta.show_box(crop if self.panel.box.value else None)
         self._wake()
+
+    def _save_presentation(self) -> str:
+        if self._soon_again("presentation"):
+            return "Saved just now"
+        chosen = self._presenting.chosen
+        chosen = msgspec.structs.replace(chosen, crop=self.panel.crop(chosen.up_axis))
+        if self._save is not None:
+            return self._save(chosen)
+        content = to_json(chosen.to_record())
+        self._client.send_file_download(PRESENTATION_FILE, content, save_immediately=True)
+        return "Put it into the run's folder"
 
     def _moved(self) -> None:
         """The browser reports the pose of its camera."""
@@ -134,6 +167,7 @@ class Session:
             ):
                 self._view_pose = None
                 self.panel.view.value = FREE_VIEW
+                self._presenting.turn_upright()
         self._wake()
 
     def go(self, name: str) -> None:
@@ -214,7 +248,9 @@ class Session:
         """The kind of picture that is due: "coarse", "sharp", or None."""
         with self._lock:
             self._follow_path()
-            return "sharp" if self._screenshot else self.pacing.due(time.monotonic())
+            return (
+                "sharp" if self._screenshot or self._presenting.waits else self.pacing.due(time.monotonic())
+            )
 
     def draw(self, shown: Shown, kind: str) -> None:
         """Render a picture and send it to the browser."""
@@ -227,7 +263,10 @@ class Session:
             viewpoint = self._camera(frame_size)
         view = None if view_pose is None else view_pose.view
         sharp = kind == "sharp"
-        appearance = self.panel.appearance
+        if (place := self._presenting.take_click()) is not None:
+            appearance = self.panel.appearance(self._presenting.chosen)
+            self._presenting.found(self._painter.point(shown, viewpoint, appearance, view, place))
+        appearance = self.panel.appearance(self._presenting.chosen)
         picture = self._painter.paint(shown, viewpoint, appearance, view, settled=sharp)
         self._send(picture, frame_size, sharp=sharp)
         self._frusta.hide_near(None if view else viewpoint.center.numpy())

@@ -6,15 +6,24 @@ import functools
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 
+import msgspec
+
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.options import LOOPBACK, VisitorOptions
+from polarguide.presentation import (
+    PRESENTATION_FILE,
+    Presentation,
+    read_presentation,
+    write_presentation,
+)
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
 from polarguide.training.trainer import Trainer
 from polarguide.viewer.frusta import photographs
+from polarguide.viewer.panel import NOTHING
 from polarguide.viewer.server import Viewer
 from polarguide.viewer.shown import Shown, shown_run, shown_training
 
@@ -42,9 +51,37 @@ def view_run(
     """
     shown, name = shown_run(run), run.folder.resolve().name
     place = (host, port, visitors)
-    with _opened(lambda: shown, run.scene, run.model.shading, name, place, reporter) as viewer:
+    as_it_is = run.presentation
+    with _opened(
+        lambda: shown,
+        run.scene,
+        run.model.shading,
+        name,
+        place,
+        reporter,
+        presentation=as_it_is,
+        save=functools.partial(save_to_run, run),
+    ) as viewer:
         while True:
             viewer.serve(1.0)
+
+
+def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
+    """Write white, up, scale and crop to the run's ``presentation.json``, and say so in plain text.
+
+    What its scene says just so is left to the scene. The run's own credit stays.
+    """
+    own, above = read_presentation(run.folder), read_presentation(run.scene_folder)
+    fields, kept = {}, []
+    for name in ("white_balance", "up_axis", "meters_per_unit", "crop"):
+        value, given = getattr(chosen, name), getattr(above, name)
+        fields[name] = None if value == given else value
+        if value is None and given is not None:
+            kept.append(name)
+    write_presentation(run.folder, msgspec.structs.replace(own, **fields))
+    if kept:
+        return f"Saved; the scene's own {', '.join(kept)} still counts"
+    return f"Saved to {PRESENTATION_FILE}"
 
 
 @contextmanager
@@ -77,7 +114,10 @@ def watched(
 
     current = functools.partial(shown_training, trainer)
     place = (host, port, visitors)
-    with _opened(current, scene, trainer.shading, scene.name, place, reporter, trains=True) as viewer:
+    presentation = read_presentation(scene.root)
+    with _opened(
+        current, scene, trainer.shading, scene.name, place, reporter, trains=True, presentation=presentation
+    ) as viewer:
         yield look
 
 
@@ -91,6 +131,8 @@ def _opened(
     reporter: Reporter,
     *,
     trains: bool = False,
+    presentation: Presentation = NOTHING,
+    save: Callable[[Presentation], str] | None = None,
 ) -> Iterator[Viewer]:
     """A viewer: says where to look, and warns of strangers."""
     host, port, visitors = place
@@ -102,6 +144,8 @@ def _opened(
         host=host,
         port=port,
         visitors=visitors,
+        presentation=presentation,
+        save=save,
         title=f"polarguide {name}",
         warn=reporter.warn,
     )

@@ -8,9 +8,13 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import View
+from polarguide.presentation import balanced
 from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
 from polarguide.visualization.sheet import Picture
+
+RADIANCE = frozenset(("final", "base", "reflection", "specular", "diffuse"))
+"""Layers that are linear radiance."""
 
 
 def layer_picture(
@@ -20,16 +24,20 @@ def layer_picture(
     depths: tuple[float, float] | None = None,
     *,
     exposed: bool = False,
+    gains: Tensor | None = None,
 ) -> Picture | None:
     """One layer as an 8-bit picture, or None where the recipe has no such layer.
 
     Args:
         result, camera: the rendering. name: of the layer. depths: nearest and farthest, for depth's colors.
         exposed: show radiance darker where more than 1 % of the pixels would clip.
+        gains: [3] of a white balance, of layers of radiance.
     """
     values: Tensor | None = getattr(result, name)
     if values is None:
         return None
+    if name in RADIANCE:
+        values = balanced(values, gains)
     if exposed:
         values = values * clipping_exposure(values)
     near, far = depths or (0.0, 1.0)
@@ -68,9 +76,9 @@ def true_depth_range(view: View) -> tuple[float, float] | None:
     return depth_range(ground_truth.depth, ground_truth.mask)
 
 
-def ground_truth_pictures(view: View) -> dict[str, Picture]:
-    """The photograph as ``final``, and what is known of the other layers, as 8-bit pictures."""
-    pictures = {"final": figures.radiance_to_rgb(view.photograph())}
+def ground_truth_pictures(view: View, gains: Tensor | None = None) -> dict[str, Picture]:
+    """The photograph as ``final``, and what is known of the other layers, as 8-bit pictures; ``gains`` as above."""
+    pictures = {"final": figures.radiance_to_rgb(balanced(view.photograph(), gains))}
     ground_truth = view.ground_truth
     if ground_truth is None:
         return pictures
@@ -78,7 +86,7 @@ def ground_truth_pictures(view: View) -> dict[str, Picture]:
         pictures["normal"] = figures.normal_to_rgb(ground_truth.normal, view.camera)
     for name, layer in (("specular", ground_truth.specular), ("diffuse", ground_truth.diffuse)):
         if layer is not None:
-            pictures[name] = figures.radiance_to_rgb(layer / 2)
+            pictures[name] = figures.radiance_to_rgb(balanced(layer / 2, gains))
     depths = true_depth_range(view)
     if ground_truth.depth is not None and depths is not None:
         pictures["depth"] = figures.scalar_to_rgb(ground_truth.depth, *depths)

@@ -7,7 +7,8 @@ class Page {
     Object.assign(this, { scene, renderer, orders });
     this.canvas = renderer.canvas;
     this.navigation = new Navigation(scene);
-    this.looks = { layer: 0, turn: 0, gain: 1, exposure: 1 };
+    this.looks = { layer: 0, turn: 0, gain: 1, exposure: 1, white: scene.white };
+    this.scale = new ScaleBar(byId("scale"), scene.metersPerUnit);
     this.compare = 0.5;
     this.comparing = false;
     this.coarse = 1; // screen pixels per rendered pixel while the camera moves
@@ -40,6 +41,8 @@ class Page {
         this.looks[name] = name === "exposure" ? 2 ** value : value;
         this.redraw();
       };
+    byId("balance").hidden = scene.white.every((gain) => gain === 1);
+    byId("white").onchange = () => this.setBalanced(byId("white").checked);
     byId("lit").hidden = scene.kind === "plain";
     byId("reset").onclick = () => this.reset();
     byId("compare").onclick = () => this.setComparing(!this.comparing);
@@ -68,6 +71,12 @@ class Page {
     this.redraw();
   }
 
+  setBalanced(on) {
+    byId("white").checked = on;
+    this.looks.white = on ? this.scene.white : [1, 1, 1];
+    this.redraw();
+  }
+
   setComparing(on) {
     this.comparing = on;
     byId("handle").hidden = !on;
@@ -93,6 +102,7 @@ class Page {
       this.looks[name] = name === "exposure" ? 1 : value;
     }
     byId("view").value = String(this.scene.first);
+    this.setBalanced(true);
     this.setComparing(false);
     this.choose(this.scene.layers[0]);
     this.navigation.open();
@@ -103,6 +113,7 @@ class Page {
     const { layers, cameras, kind } = this.scene, step = { n: 1, p: -1 }[key];
     if (layers[Number(key) - 1]) this.choose(layers[Number(key) - 1]);
     else if (key === "c" && kind !== "plain") this.setComparing(!this.comparing);
+    else if (key === "w" && !byId("balance").hidden) this.setBalanced(!byId("white").checked);
     else if (key === "r") this.reset();
     else if (step) {
       byId("view").value = String((Number(byId("view").value) + step + cameras.length) % cameras.length);
@@ -136,6 +147,7 @@ class Page {
     const sharp = Math.min(window.devicePixelRatio || 1, 2) / (this.moving ? this.coarse : 1);
     const size = [box.clientWidth, box.clientHeight].map((side) => Math.max(1, Math.round(side * sharp)));
     const camera = this.navigation.camera(...size);
+    this.scale.show(camera, Math.hypot(...add(this.navigation.pivot, this.navigation.eye, -1)), box.clientWidth);
     if (!this.drawing) await this.draw(camera);
     else this.again = true;
     if (!this.moving) return;

@@ -168,7 +168,7 @@ class Renderer {
   }
 
   /** Shade the splatted layers into the canvas. */
-  shade(camera, { layer, split, turn, gain, exposure }) {
+  shade(camera, { layer, split, turn, gain, exposure, white }) {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, camera.width, camera.height);
@@ -176,7 +176,7 @@ class Renderer {
     this.use(this.shader, { ...this.tables, ...targets }, {
       ...this.lens(camera),
       turn: ["mat3", turning(this.scene.up, -turn * Math.PI / 180)],
-      layer: ["1i", layer], split: ["1f", split], gain: ["1f", gain], exposure: ["1f", exposure],
+      layer: ["1i", layer], split: ["1f", split], gain: ["1f", gain], exposure: ["1f", exposure], white: ["3f", white],
       index: ["1f", this.scene.index], resolution: ["1i", this.scene.resolution], levels: ["1i", this.scene.levels],
     });
     gl.bindVertexArray(this.nothing);

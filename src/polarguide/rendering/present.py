@@ -1,0 +1,299 @@
+"""Set how a scene or a run is presented, from what the command line or a program says."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene, View, load_scene, read_model
+from polarguide.capture.layout import find_layout
+from polarguide.errors import PolarguideError
+from polarguide.files import require_folder
+from polarguide.options import DeviceName, PathLike
+from polarguide.presentation import (
+    CREDITS,
+    PRESENTATION_FILE,
+    Presentation,
+    Vector,
+    parse_length,
+    read_presentation,
+    shown_length,
+    write_presentation,
+)
+from polarguide.progress import SILENT, Reporter
+from polarguide.records import decode
+from polarguide.rendering.picking import gains_of, gray_world, photograph_color, surface_at
+from polarguide.runs.folder import CONFIGURATION
+from polarguide.runs.opened import OpenedRun
+
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def present(
+    folder: PathLike,
+    *,
+    white_balance: str | None = None,
+    up_axis: str | None = None,
+    points: Sequence[str] = (),
+    distance: str | None = None,
+    meters_per_unit: str | None = None,
+    crop: str | None = None,
+    title: str | None = None,
+    author: str | None = None,
+    license: str | None = None,
+    provenance: str | None = None,
+    device: DeviceName = "cpu",
+    reporter: Reporter = SILENT,
+) -> Presentation:
+    """Set how a scene or a run is presented, in its ``presentation.json``. What is not given stays as it is.
+
+    A PLACE is X,Y,Z in the scene's axes; VIEW, for the camera of a photograph; or VIEW,X,Y, for the surface that a
+    run shows at a pixel of a photograph, counted from the top left corner.
+
+    Args:
+        folder: of a scene, whose runs then have it from there, or of a run.
+        white_balance: ``none``, ``gray`` (the mean of the photographs becomes gray), gains of R, G and B such as
+            ``1.9,1,1.6``, or VIEW,X,Y: a place in a photograph that should be white or gray.
+        up_axis: ``none`` (as the cameras say), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a place
+            whose surface is level; up is its normal there.
+        points: two PLACEs whose distance is known. distance: it, such as ``85mm``.
+        meters_per_unit: how long one unit of the scene is, or ``none``.
+        crop: ``none``, or left,right,down,up,front,back in percent of the cameras' distance, as the viewer counts.
+        title, author, license, provenance: one line of text each; ``none`` or nothing removes it.
+        device: what surfaces are rendered on.
+        reporter: told what takes long.
+
+    Returns:
+        What is now said of the folder: for a run, its own over its scene's.
+
+    Raises:
+        PolarguideError: no such folder, or a value that is none; nothing is written then.
+    """
+    place = _Place(Path(folder), device, reporter)
+    own = read_presentation(place.folder)
+    changes: dict[str, Any] = {}
+    if white_balance is not None:
+        changes["white_balance"] = _white_balance(white_balance, place)
+    if up_axis is not None:
+        changes["up_axis"] = _up_axis(up_axis, place)
+    if points or distance is not None or meters_per_unit is not None:
+        changes["meters_per_unit"] = _scale(points, distance, meters_per_unit, place)
+    if crop is not None:
+        up = changes["up_axis"] if "up_axis" in changes else place.shown(own).up_axis
+        changes["crop"] = _crop(crop, up)
+    texts = {"title": title, "author": author, "license": license, "provenance": provenance}
+    changes |= {
+        name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
+    }
+    place.refuse_inherited(name for name, value in changes.items() if value in (None, ""))
+    record = {**own.to_record(), **changes}
+    made = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
+    if changes:
+        write_presentation(place.folder, made)
+    return place.shown(made)
+
+
+class _Place:
+    """A scene's or a run's folder, of which only what is asked for is read."""
+
+    def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
+        require_folder(
+            folder, expected="the folder of a scene or a run", remedy="Give what prepare or train wrote."
+        )
+        self.folder, self._device, self._reporter = folder, device, reporter
+        self._is_run = os.path.lexists(folder / CONFIGURATION)
+        if not self._is_run:
+            find_layout(folder)
+
+    @cached_property
+    def _run(self) -> OpenedRun:
+        return OpenedRun.open(self.folder, device=self._device, reporter=self._reporter)
+
+    @property
+    def _scene_folder(self) -> Path:
+        return self._run.scene_folder if self._is_run else self.folder
+
+    @cached_property
+    def _scene(self) -> Scene:
+        return self._run.scene if self._is_run else load_scene(self.folder, reporter=self._reporter)
+
+    def shown(self, own: Presentation) -> Presentation:
+        """What applies, where the folder's own says this."""
+        return own.over(read_presentation(self._scene_folder)) if self._is_run else own
+
+    def refuse_inherited(self, names: Any) -> None:
+        """Refuse to remove from a run what its scene says.
+
+        Raises:
+            PolarguideError: the scene says it.
+        """
+        removed = list(names)
+        if not (self._is_run and removed):
+            return
+        above = read_presentation(self._scene_folder)
+        for name in removed:
+            if getattr(above, name) not in (None, ""):
+                raise PolarguideError(
+                    name,
+                    expected="a value of the run's own to remove",
+                    found=f"one of its scene's ({self._scene_folder / PRESENTATION_FILE})",
+                    remedy=f"Remove it there (polarguide present {self._scene_folder}), or give the run another.",
+                )
+
+    def training_views(self) -> Sequence[View]:
+        """Photographs that were trained on."""
+        return self._scene.train_views
+
+    def pixel(self, text: str) -> tuple[str, float, float] | None:
+        """A view and a place in it, if the text is VIEW,X,Y."""
+        name, *numbers = text.rsplit(",", 2)
+        places = _numbers(",".join(numbers))
+        if len(places) != 2 or (_numbers(name) and name not in find_layout(self._scene_folder).names):
+            return None
+        return name, places[0], places[1]
+
+    def view(self, name: str) -> View:
+        """A view by its name."""
+        return self._scene.view(name)
+
+    def surface(self, name: str, x: float, y: float, where: str) -> tuple[Tensor, Tensor | None]:
+        """Point and normal of the surface at a pixel of a view.
+
+        Raises:
+            PolarguideError: there is none, or no run that would know of one.
+        """
+        if not self._is_run:
+            raise PolarguideError(
+                where,
+                expected="a run, whose depth tells where the surface is",
+                found=f"the scene {self.folder}",
+                remedy="Give the folder of a run of it, or numbers X,Y,Z.",
+            )
+        camera = self.view(name).camera
+        found = surface_at(self._run.result(camera, depth=True).to("cpu"), camera, x, y)
+        if found is None:
+            raise PolarguideError(
+                where,
+                expected=f"a surface at a place in {name}, which is {camera.width} x {camera.height}",
+                found=f"none at {x:g},{y:g}",
+                remedy="Pick a place on an object; polarguide view shows where it is.",
+            )
+        return found.point, found.normal
+
+    def point(self, text: str) -> Tensor:
+        """A PLACE as a point [3] in the world.
+
+        Raises:
+            PolarguideError: it is none.
+        """
+        pixel = self.pixel(text)
+        if pixel is not None:
+            return self.surface(*pixel, "points")[0]
+        numbers = _numbers(text)
+        if len(numbers) == 3:
+            return torch.tensor(numbers, dtype=torch.float64)
+        return read_model(self._scene_folder).camera(text).center
+
+
+def _white_balance(text: str, place: _Place) -> Vector | None:
+    if text == "none":
+        return None
+    if text == "gray":
+        return gray_world(place.training_views())
+    numbers = _numbers(text)
+    pixel = place.pixel(text)
+    if pixel is not None:
+        name, x, y = pixel
+        return gains_of(photograph_color(place.view(name), x, y, "white_balance"))
+    if len(numbers) != 3:
+        raise _none_of("white_balance", "none, gray, three gains such as 1.9,1,1.6, or VIEW,X,Y", text)
+    return numbers[0], numbers[1], numbers[2]
+
+
+def _up_axis(text: str, place: _Place) -> Vector | None:
+    if text == "none":
+        return None
+    if (axis := AXES.get(text.removeprefix("-").removeprefix("+").lower())) is not None:
+        sign = -1.0 if text.startswith("-") else 1.0
+        return sign * axis[0], sign * axis[1], sign * axis[2]
+    pixel = place.pixel(text)
+    if pixel is not None:
+        _, normal = place.surface(*pixel, "up_axis")
+        if normal is None:
+            raise _none_of("up_axis", "a place whose normal is known", text)
+        x, y, z = normal.tolist()
+        return x, y, z
+    numbers = _numbers(text)
+    if len(numbers) != 3:
+        raise _none_of("up_axis", "none, an axis such as z or -y, three numbers, or VIEW,X,Y", text)
+    return numbers[0], numbers[1], numbers[2]
+
+
+def _scale(
+    points: Sequence[str], distance: str | None, meters_per_unit: str | None, place: _Place
+) -> float | None:
+    if meters_per_unit is not None:
+        if points or distance is not None:
+            raise _none_of("meters_per_unit", "either this, or --points and --distance", "both")
+        if meters_per_unit == "none":
+            return None
+        numbers = _numbers(meters_per_unit)
+        if len(numbers) != 1:
+            raise _none_of("meters_per_unit", "a number above 0, or none", meters_per_unit)
+        return numbers[0]
+    if len(points) != 2 or distance is None:
+        found = f"{len(points)} points and {'a' if distance else 'no'} distance"
+        raise _none_of("points", "two points, and their --distance", found)
+    meters = parse_length(distance)
+    apart = float((place.point(points[0]) - place.point(points[1])).norm())
+    if apart < 1e-9:
+        raise _none_of("points", "two points that lie apart", "one and the same")
+    return meters / apart
+
+
+def _crop(text: str, up: Vector | None) -> dict[str, Any] | None:
+    if text == "none":
+        return None
+    numbers = _numbers(text)
+    if len(numbers) != 6:
+        raise _none_of("crop", "none, or left,right,down,up,front,back in percent", text)
+    left, right, down, above, front, back = (number / 100 for number in numbers)
+    return {"low": (left, down, front), "high": (right, above, back), "up": up}
+
+
+def _numbers(text: str) -> list[float]:
+    """Numbers separated by commas; none where something else is among them."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+
+
+def _none_of(where: str, expected: str, found: str) -> PolarguideError:
+    return PolarguideError(where, expected=expected, found=found, remedy="Correct the value.")
+
+
+def described(presentation: Presentation) -> list[str]:
+    """What is set, a line each; one that says so where nothing is."""
+    lines = {
+        "white balance": _listed(presentation.white_balance),
+        "up axis": _listed(presentation.up_axis),
+        "scale": ""
+        if presentation.meters_per_unit is None
+        else f"1 unit is {shown_length(1.0, presentation.meters_per_unit)}",
+    }
+    if (crop := presentation.crop) is not None:
+        sides = (100 * side for pair in zip(crop.low, crop.high, strict=True) for side in pair)
+        lines["crop"] = f"{_listed(tuple(sides))} % of the cameras' distance"
+    lines |= {name: getattr(presentation, name) for name in CREDITS}
+    return [f"{name}: {text}" for name, text in lines.items() if text] or ["nothing is set"]
+
+
+def _listed(numbers: Sequence[float] | None) -> str:
+    return "" if numbers is None else ", ".join(f"{number:.4g}" for number in numbers)
