@@ -20,7 +20,7 @@ import spoil
 from base import EVAL, HEIGHT, MOSAICS, READ, RESUME, SHOTS, TRAIN, WIDTH
 from forked import Case
 
-Change = Callable[[Path], None]
+Change = Callable[[Path], object]
 PICTURE, TRUTH = "scene/polar/v001_045.png", "scene/gt/v000.npz"
 SAME = "it is the same content in another form"
 UNUSED = "what is wrong with it is not read"
@@ -38,7 +38,9 @@ def more_cases() -> Iterator[Case]:
         yield from make()
 
 
-def _case(name: str, change: Change, command: Sequence[str], accepted: str = "", check: Change | None = None) -> Case:
+def _case(
+    name: str, change: Change, command: Sequence[str], accepted: str = "", check: Change | None = None
+) -> Case:
     def make(folder: Path, rng: random.Random) -> list[str]:
         change(folder)
         return list(command)
@@ -49,7 +51,9 @@ def _case(name: str, change: Change, command: Sequence[str], accepted: str = "",
 # Pictures.
 
 
-def _instead(suffix: str, write: Callable[..., None], *arguments: Any, at: str = PICTURE, **more: Any) -> Change:
+def _instead(
+    suffix: str, write: Callable[..., None], *arguments: Any, at: str = PICTURE, **more: Any
+) -> Change:
     """A file of another suffix in the place of a picture."""
 
     def change(folder: Path) -> None:
@@ -62,11 +66,17 @@ def _instead(suffix: str, write: Callable[..., None], *arguments: Any, at: str =
 
 def picture_cases() -> Iterator[Case]:
     """Headers that lie, and decoders that believe them."""
+
     def tags(*changed: made.Tag, drop: Sequence[int] = ()) -> Change:
         size = 2 * WIDTH * HEIGHT
         table = {tag[0]: tag for tag in made.gray_tags(WIDTH, HEIGHT, size)}
         table |= {tag[0]: tag for tag in changed}
-        return _instead(".tif", made.tiff, [table[key] for key in sorted(table) if key not in drop], bytes(max(size, 4096)))
+        return _instead(
+            ".tif",
+            made.tiff,
+            [table[key] for key in sorted(table) if key not in drop],
+            bytes(max(size, 4096)),
+        )
 
     where = "scene/polar/v000_000.png"
     for name, change in {
@@ -98,10 +108,22 @@ def picture_cases() -> Iterator[Case]:
         path.write_bytes(bytes(data))
 
     yield _case("picture TIFF whose next directory is its first", _instead(".tif", ring), READ, UNUSED)
-    yield _case("picture TIFF of 65535 entries", _instead(".tif", lambda path: path.write_bytes(b"II*\0\x08\0\0\0\xff\xff" + bytes(12 * 65535 + 64))), READ)
+    yield _case(
+        "picture TIFF of 65535 entries",
+        _instead(".tif", lambda path: path.write_bytes(b"II*\0\x08\0\0\0\xff\xff" + bytes(12 * 65535 + 64))),
+        READ,
+    )
 
     def chunked(folder: Path) -> None:
-        made.png(folder / PICTURE, WIDTH, HEIGHT, before=[(b"zTXt", b"bomb\0\0" + zlib.compress(bytes(1 << 28), 9)), (b"iCCP", b"x\0\0" + zlib.compress(bytes(1 << 28), 9))])
+        made.png(
+            folder / PICTURE,
+            WIDTH,
+            HEIGHT,
+            before=[
+                (b"zTXt", b"bomb\0\0" + zlib.compress(bytes(1 << 28), 9)),
+                (b"iCCP", b"x\0\0" + zlib.compress(bytes(1 << 28), 9)),
+            ],
+        )
 
     yield _case("picture PNG with a bomb of text", chunked, READ, UNUSED)
     for name, change in {
@@ -114,7 +136,12 @@ def picture_cases() -> Iterator[Case]:
         "PNG of a million frames": lambda f: made.png(f / PICTURE, WIDTH, HEIGHT, before=[(b"acTL", struct.pack(">II", 1 << 20, 0)), (b"fcTL", struct.pack(">IIIIIHHBB", 0, 60000, 60000, 0, 0, 1, 1, 0, 0))]),
         "JPEG of two sizes": _instead(".jpg", made.two_sizes_jpeg, 30000),
     }.items():  # fmt: skip
-        yield _case(f"picture {name}", change, READ, "a frame beside the picture is not shown" if "frames" in name else "")
+        yield _case(
+            f"picture {name}",
+            change,
+            READ,
+            "a frame beside the picture is not shown" if "frames" in name else "",
+        )
 
     def masks(folder: Path) -> None:
         made.png(folder / "scene/masks/v000.png", 12000, 12000, color=6)
@@ -126,7 +153,9 @@ def picture_cases() -> Iterator[Case]:
         for index in range(9):
             for angle in ("045", "090", "135"):
                 if (index, angle) != (0, "045"):
-                    shutil.copyfile(folder / "scene/polar/v000_045.png", folder / f"scene/polar/v00{index}_{angle}.png")
+                    shutil.copyfile(
+                        folder / "scene/polar/v000_045.png", folder / f"scene/polar/v00{index}_{angle}.png"
+                    )
 
     yield _case("masks of 12000 pixels a side", masks, TRAIN)
     yield _case("three angles of 12000 pixels a side", angles, TRAIN)
@@ -148,13 +177,45 @@ def picture_cases() -> Iterator[Case]:
     yield _case("shots of 12000 pixels a side", shots, SHOTS)
     yield _case("shots of 4000 scans", scans, SHOTS)
     big = "mosaics/v001.png"
-    yield _case("mosaic TIFF of signed sizes", _instead(".tif", made.deflated_tiff, 30000, kind=9, at=big), MOSAICS)
-    yield _case("mosaic .npy of a broken head", _instead(".npy", lambda p: p.write_bytes(made.header("{'descr': (")), at=big), MOSAICS)
-    yield _case("mosaic .npy of a deep head", _instead(".npy", lambda p: p.write_bytes(made.header("-" * 9000 + "1")), at=big), MOSAICS)
-    yield _case("mosaic .npy of a wrong key", _instead(".npy", lambda p: p.write_bytes(made.header("{{}: 1}")), at=big), MOSAICS)
-    yield _case("mosaic .npy of version 9", _instead(".npy", lambda p: p.write_bytes(made.header("{}", version=(9, 0))), at=big), MOSAICS)
-    yield _case("mosaic .npy of negative sides", _instead(".npy", lambda p: p.write_bytes(made.header("{'descr': '<u2', 'fortran_order': False, 'shape': (-64, -64), }") + bytes(8192)), at=big), MOSAICS)
-    yield _case("mosaic .npy of objects", _instead(".npy", lambda p: np.save(p, np.array([[{}]], dtype=object)), at=big), MOSAICS)
+    yield _case(
+        "mosaic TIFF of signed sizes", _instead(".tif", made.deflated_tiff, 30000, kind=9, at=big), MOSAICS
+    )
+    yield _case(
+        "mosaic .npy of a broken head",
+        _instead(".npy", lambda p: p.write_bytes(made.header("{'descr': (")), at=big),
+        MOSAICS,
+    )
+    yield _case(
+        "mosaic .npy of a deep head",
+        _instead(".npy", lambda p: p.write_bytes(made.header("-" * 9000 + "1")), at=big),
+        MOSAICS,
+    )
+    yield _case(
+        "mosaic .npy of a wrong key",
+        _instead(".npy", lambda p: p.write_bytes(made.header("{{}: 1}")), at=big),
+        MOSAICS,
+    )
+    yield _case(
+        "mosaic .npy of version 9",
+        _instead(".npy", lambda p: p.write_bytes(made.header("{}", version=(9, 0))), at=big),
+        MOSAICS,
+    )
+    yield _case(
+        "mosaic .npy of negative sides",
+        _instead(
+            ".npy",
+            lambda p: p.write_bytes(
+                made.header("{'descr': '<u2', 'fortran_order': False, 'shape': (-64, -64), }") + bytes(8192)
+            ),
+            at=big,
+        ),
+        MOSAICS,
+    )
+    yield _case(
+        "mosaic .npy of objects",
+        _instead(".npy", lambda p: np.save(p, np.array([[{}]], dtype=object)), at=big),
+        MOSAICS,
+    )
     yield _case("mosaic sparse of 2 GiB", _instead(".tif", _sparse, (1 << 31) - 1, b"II*\0", at=big), MOSAICS)
 
 
@@ -198,33 +259,52 @@ def truth_cases() -> Iterator[Case]:
         "has booleans as sides": text("{'descr': '<f4', 'fortran_order': False, 'shape': (True, 24), }"),
         "has a head of 2 GiB": member(b"\x93NUMPY\x02\0" + struct.pack("<I", (1 << 31) - 1) + bytes(2000)),
         "has a path as name": lambda f: made.archive(f / TRUTH, [("../../outside/victim.npy", good), ("depth.npy", good[:-4])]),
-        "ends within": lambda f: (made.archive(f / TRUTH, [("depth.npy", good)]), (f / TRUTH).write_bytes((f / TRUTH).read_bytes()[:-30])) and None,
+        "ends within": lambda f: (made.archive(f / TRUTH, [("depth.npy", good)]), (f / TRUTH).write_bytes((f / TRUTH).read_bytes()[:-30])),
         "has numbers of objects that are negative": lambda f: np.savez(f / TRUTH, objid=np.full((20, 24), -1)),
         "has numbers of objects that are huge": lambda f: np.savez(f / TRUTH, objid=np.full((20, 24), 1 << 63, np.uint64)),
         "has numbers of objects that are fractions": lambda f: np.savez(f / TRUTH, objid=np.full((20, 24), 0.5)),
         "has numbers without objects": lambda f: np.savez(f / TRUTH, objid=np.full((20, 24), 7)),
-        "is a picture": lambda f: shutil.copyfile(f / PICTURE, f / TRUTH) and None,
-        "is a folder of files": lambda f: ((f / TRUTH).unlink(), (f / TRUTH).mkdir(), (f / TRUTH / "depth.npy").write_bytes(good)) and None,
+        "is a picture": lambda f: shutil.copyfile(f / PICTURE, f / TRUTH),
+        "is a folder of files": lambda f: ((f / TRUTH).unlink(), (f / TRUTH).mkdir(), (f / TRUTH / "depth.npy").write_bytes(good)),
         "has huge depths": lambda f: np.savez(f / TRUTH, depth=np.full((20, 24), 1e300)),
         "has huge normals": lambda f: np.savez(f / TRUTH, normal=np.full((20, 24, 3), 3e38, np.float32)),
         "has negative depths": lambda f: np.savez(f / TRUTH, depth=np.full((20, 24), -5.0), mask=np.ones((20, 24))),
     }.items():  # fmt: skip
-        reason = {"has negative depths": "no depth is known where it is not positive", "has numbers without objects": "objects may go without a table", "has huge normals": "they have unit length when they are read"}.get(name, "")
+        reason = {
+            "has negative depths": "no depth is known where it is not positive",
+            "has numbers without objects": "objects may go without a table",
+            "has huge normals": "they have unit length when they are read",
+        }.get(name, "")
         yield _case(f"gt {name}", change, READ, reason)
-    yield _case("gt has the same array 2000 times", lambda f: made.archive(f / TRUTH, [("depth.npy", good)] * 2000), READ, UNUSED)
-    yield _case("gt has 60000 other files", lambda f: made.archive(f / TRUTH, [(f"{k}", b"") for k in range(60000)], zipfile.ZIP_STORED), READ, "there may be none of the arrays")
-    yield _case("gt behind a picture", lambda f: (f / TRUTH).write_bytes((f / PICTURE).read_bytes() + (f / TRUTH).read_bytes()) and None, READ, SAME)
+    yield _case(
+        "gt has the same array 2000 times",
+        lambda f: made.archive(f / TRUTH, [("depth.npy", good)] * 2000),
+        READ,
+        UNUSED,
+    )
+    yield _case(
+        "gt has 60000 other files",
+        lambda f: made.archive(f / TRUTH, [(f"{k}", b"") for k in range(60000)], zipfile.ZIP_STORED),
+        READ,
+        "there may be none of the arrays",
+    )
+    yield _case(
+        "gt behind a picture",
+        lambda f: (f / TRUTH).write_bytes((f / PICTURE).read_bytes() + (f / TRUTH).read_bytes()),
+        READ,
+        SAME,
+    )
 
 
 # Scene folders.
 
 
 def _json(path: str, content: Any) -> Change:
-    return lambda folder: (folder / path).write_text(json.dumps(content)) and None
+    return lambda folder: (folder / path).write_text(json.dumps(content))
 
 
 def _bytes(path: str, data: bytes) -> Change:
-    return lambda folder: (folder / path).write_bytes(data) and None
+    return lambda folder: (folder / path).write_bytes(data)
 
 
 def _objects(objects: Any) -> Change:
@@ -267,12 +347,28 @@ def scene_cases() -> Iterator[Case]:
         "an object of half a character": [{"id": 1, "name": "\ud800"}],
         "an object with markup": [{"id": 1, "name": "<img src=x onerror=alert(1)>", "material": "[bold]"}],
     }.items():
-        reason = {"60000 objects": "there may be many", "an object with markup": "a name is shown as it is", "an object of half a character": "any name will do"}.get(name, "")
+        reason = {
+            "60000 objects": "there may be many",
+            "an object with markup": "a name is shown as it is",
+            "an object of half a character": "any name will do",
+        }.get(name, "")
         yield _case(f"scene with {name}", _objects(objects), READ, reason)
     yield _case("split with half a character", _json("scene/split.json", {"test": ["\ud800"]}), READ)
-    yield _case("split with a name of a million letters", _json("scene/split.json", {"test": ["x" * 1_000_000]}), READ)
-    yield _case("split with a name 300000 times", _json("scene/split.json", {"test": ["v000"] * 300_000}), READ, "a view may be named twice")
-    yield _case("scene with corrections that are none", _json("scene/scene.json", {"corrections": 5}), [*INSPECT, "--fix", "fixed"], UNUSED)
+    yield _case(
+        "split with a name of a million letters", _json("scene/split.json", {"test": ["x" * 1_000_000]}), READ
+    )
+    yield _case(
+        "split with a name 300000 times",
+        _json("scene/split.json", {"test": ["v000"] * 300_000}),
+        READ,
+        "a view may be named twice",
+    )
+    yield _case(
+        "scene with corrections that are none",
+        _json("scene/scene.json", {"corrections": 5}),
+        [*INSPECT, "--fix", "fixed"],
+        UNUSED,
+    )
 
     def exchanged(folder: Path, more: Change = lambda folder: None) -> None:
         """So that there is something to fix: the pictures of two angles change places."""
@@ -287,8 +383,15 @@ def scene_cases() -> Iterator[Case]:
         for name in "abcd":
             (folder / "scene/masks" / name).symlink_to("../masks")
 
-    yield _case("masks with links to themselves", lambda f: exchanged(f, rings), [*INSPECT, "--fix", "fixed"], UNUSED)
-    yield _case("corrections that are a number", lambda f: exchanged(f, _json("scene/scene.json", {"corrections": 5})), [*INSPECT, "--fix", "fixed"], "there is nothing to fix where geometry does not decide")
+    yield _case(
+        "masks with links to themselves", lambda f: exchanged(f, rings), [*INSPECT, "--fix", "fixed"], UNUSED
+    )
+    yield _case(
+        "corrections that are a number",
+        lambda f: exchanged(f, _json("scene/scene.json", {"corrections": 5})),
+        [*INSPECT, "--fix", "fixed"],
+        "there is nothing to fix where geometry does not decide",
+    )
 
     def put(path: str, how: str) -> Change:
         def change(folder: Path) -> None:
@@ -309,7 +412,11 @@ def scene_cases() -> Iterator[Case]:
 
     for path in ("scene", "scene/polar", "scene/sparse", "scene/sparse/0", "scene/gt", "scene/invalid"):
         for how in ("file", "pipe", "loop", "root", "itself"):
-            reason = "a folder may hold none of what is looked for" if how == "root" and path in ("scene/gt", "scene/invalid") else ""
+            reason = (
+                "a folder may hold none of what is looked for"
+                if how == "root" and path in ("scene/gt", "scene/invalid")
+                else ""
+            )
             yield _case(f"{path} is {how}", put(path, how), READ, reason)
 
     def suffixes(folder: Path) -> None:
@@ -341,7 +448,9 @@ def colmap_cases() -> Iterator[Case]:
     names = [f"v00{k}.png".encode() for k in range(9)]
 
     def images(**of_first: Any) -> list[Any]:
-        rows = [[k + 1, (1.0, 0, 0, 0, 0.1 * k - 0.4, 0.05 * (k % 3), 2.5), 1, names[k], []] for k in range(9)]
+        rows = [
+            [k + 1, (1.0, 0, 0, 0, 0.1 * k - 0.4, 0.05 * (k % 3), 2.5), 1, names[k], []] for k in range(9)
+        ]
         for key, value in of_first.items():
             rows[1][("number", "pose", "camera", "name", "points").index(key)] = value
         return rows
@@ -427,7 +536,11 @@ def colmap_cases() -> Iterator[Case]:
         ("of an unknown kind", one, struct.pack("<Q", 1) + frame[:-16] + struct.pack("<iIQ", 99, 1, 1)),
         ("twice", one, struct.pack("<Q", 2) + frame + frame),
         ("whose rig has no such camera", struct.pack("<QIIiI", 1, 1, 1, 0, 44), struct.pack("<Q", 1) + frame),
-        ("whose rig stands there twice", struct.pack("<Q", 2) + one[8:] + one[8:], struct.pack("<Q", 1) + frame),
+        (
+            "whose rig stands there twice",
+            struct.pack("<Q", 2) + one[8:] + one[8:],
+            struct.pack("<Q", 1) + frame,
+        ),
         ("whose rig has no sensor", struct.pack("<QII", 1, 1, 0), struct.pack("<Q", 1) + frame),
         ("that is none", struct.pack("<Q", 0), struct.pack("<Q", 0)),
     ):
@@ -456,8 +569,19 @@ def colmap_cases() -> Iterator[Case]:
         reason = SAME if name in ("of lines as Windows has them", "in hexadecimal") else ""
         yield _case(f"cameras.txt {name}", text("cameras", content), READ, reason)
     yield _case("images.txt of 400000 empty lines", text("images", "\n" * 400_000), READ)
-    yield _case("images.txt of one line", lambda f: (f / "scene/sparse/0/images.txt").write_text((f / "scene/sparse/0/images.txt").read_text().replace("\n", " ")) and None, READ)
-    yield _case("points3D.txt of a negative number", text("points3D", "-1 0 0 0 1 2 3 0.5\n"), READ, "numbers are names")
+    yield _case(
+        "images.txt of one line",
+        lambda f: (f / "scene/sparse/0/images.txt").write_text(
+            (f / "scene/sparse/0/images.txt").read_text().replace("\n", " ")
+        ),
+        READ,
+    )
+    yield _case(
+        "points3D.txt of a negative number",
+        text("points3D", "-1 0 0 0 1 2 3 0.5\n"),
+        READ,
+        "numbers are names",
+    )
     yield _case("points3D.txt of colors beyond bytes", text("points3D", "1 0 0 0 300 -2 3 0.5\n"), READ)
 
 
@@ -517,13 +641,20 @@ def pose_cases() -> Iterator[Case]:
     sensor = ('<sensor id="0" type="frame"><resolution width="{w}" height="{h}"/><calibration type="frame" '
               'class="adjusted"><resolution width="{w}" height="{h}"/><f>{f}</f>{more}</calibration></sensor>')  # fmt: skip
 
-    def xml(w: object = 32, h: object = 24, f: object = 40, more: str = "", head: str = "", cameras: str | None = None) -> bytes:
+    def xml(
+        w: object = 32,
+        h: object = 24,
+        f: object = 40,
+        more: str = "",
+        head: str = "",
+        cameras: str | None = None,
+    ) -> bytes:
         rows = "".join(
             f'<camera id="{k}" sensor_id="0" label="v00{k}.png"><transform>{numbers.format(x=0.1 * k)}</transform></camera>'
             for k in range(3)
         )
         body = sensor.format(w=w, h=h, f=f, more=more)
-        return f'{head}<document><chunk><sensors>{body}</sensors><cameras>{rows if cameras is None else cameras}</cameras></chunk></document>'.encode()
+        return f"{head}<document><chunk><sensors>{body}</sensors><cameras>{rows if cameras is None else cameras}</cameras></chunk></document>".encode()
 
     laughs = '<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">' + "".join(
         f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">' for k in range(8)) + "]>"  # fmt: skip
@@ -536,13 +667,28 @@ def pose_cases() -> Iterator[Case]:
         "of a focal length of words": xml(f="x"),
         "of a distortion of 1e300": xml(more="<k1>1e300</k1>"),
         "of a skew": xml(more="<b2>10</b2>"),
-        "of a camera twice": xml(cameras=2 * f'<camera id="1" sensor_id="0" label="v001"><transform>{numbers.format(x=1)}</transform></camera>'),
-        "of a camera of 15 numbers": xml(cameras='<camera id="1" sensor_id="0" label="v001"><transform>1 2 3 4 5 6 7 8 9 10 11 12 13 14 15</transform></camera>'),
-        "of a camera without a sensor": xml(cameras=f'<camera id="1" sensor_id="9" label="v001"><transform>{numbers.format(x=1)}</transform></camera>'),
-        "of a camera without a label": xml(cameras=f'<camera id="1" sensor_id="0"><transform>{numbers.format(x=1)}</transform></camera>'),
+        "of a camera twice": xml(
+            cameras=2
+            * f'<camera id="1" sensor_id="0" label="v001"><transform>{numbers.format(x=1)}</transform></camera>'
+        ),
+        "of a camera of 15 numbers": xml(
+            cameras='<camera id="1" sensor_id="0" label="v001"><transform>1 2 3 4 5 6 7 8 9 10 11 12 13 14 15</transform></camera>'
+        ),
+        "of a camera without a sensor": xml(
+            cameras=f'<camera id="1" sensor_id="9" label="v001"><transform>{numbers.format(x=1)}</transform></camera>'
+        ),
+        "of a camera without a label": xml(
+            cameras=f'<camera id="1" sensor_id="0"><transform>{numbers.format(x=1)}</transform></camera>'
+        ),
         "of laughs": (laughs + xml(more="<k1>&i;</k1>").decode()).encode(),
-        "of laughs in UTF-16": (laughs.replace('?xml version="1.0"', '?xml version="1.0" encoding="UTF-16"') + xml(more="<k1>&i;</k1>").decode()).encode("utf-16"),
-        "of a file outside in UTF-16": ('<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>' + xml(more="<k1>&a;</k1>").decode()).encode("utf-16"),
+        "of laughs in UTF-16": (
+            laughs.replace('?xml version="1.0"', '?xml version="1.0" encoding="UTF-16"')
+            + xml(more="<k1>&i;</k1>").decode()
+        ).encode("utf-16"),
+        "of a file outside in UTF-16": (
+            '<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
+            + xml(more="<k1>&a;</k1>").decode()
+        ).encode("utf-16"),
         "of a million levels": b"<a>" * 1_000_000,
         "of 20 million elements": b"<a>" + b"<b/>" * 16_000_000 + b"</a>",
         "of an unknown encoding": b'<?xml version="1.0" encoding="klingon"?><a/>',
@@ -552,7 +698,9 @@ def pose_cases() -> Iterator[Case]:
         yield _case(f"cameras.xml {name}", _posed("poses.xml", data), command("poses.xml"))
 
     eye, good = np.eye(4), np.array([[40.0, 0, 16, 0], [0, 40, 12, 0], [0, 0, 1, 2.5], [0, 0, 0, 1]])
-    whole = {f"{kind}_{k}": value for k in range(3) for kind, value in (("world_mat", good), ("scale_mat", eye))}
+    whole = {
+        f"{kind}_{k}": value for k in range(3) for kind, value in (("world_mat", good), ("scale_mat", eye))
+    }
 
     def arrays(**changed: Any) -> Change:
         return lambda folder: np.savez(folder / "poses.npz", **{**whole, **changed})
@@ -561,7 +709,10 @@ def pose_cases() -> Iterator[Case]:
         return lambda folder: made.archive(folder / "poses.npz", rows, method)
 
     def damaged(folder: Path) -> None:
-        made.archive(folder / "poses.npz", [("world_mat_0.npy", made.npy(np.random.default_rng(0).random((4, 4)))), ("x", b"y" * 900)])
+        made.archive(
+            folder / "poses.npz",
+            [("world_mat_0.npy", made.npy(np.random.default_rng(0).random((4, 4)))), ("x", b"y" * 900)],
+        )
         data = bytearray((folder / "poses.npz").read_bytes())
         data[60:110] = bytes(50)
         (folder / "poses.npz").write_bytes(bytes(data))
@@ -580,9 +731,15 @@ def pose_cases() -> Iterator[Case]:
         "of a deep head": members(("world_mat_0.npy", made.header("-" * 9000 + "1"))),
         "of a head with a dictionary as key": members(("world_mat_0.npy", made.header("{{}: 1}"))),
         "that is damaged within": damaged,
-        "that lies about its size": lambda f: made.lying_archive(f / "poses.npz", "world_mat_0.npy", 3 << 30, says=200),
-        "that lies in bzip2": lambda f: made.lying_archive(f / "poses.npz", "world_mat_0.npy", 1 << 28, says=200, method=zipfile.ZIP_BZIP2),
-        "that is junk in LZMA": lambda f: made.lying_archive(f / "poses.npz", "world_mat_0.npy", 0, says=200, method=zipfile.ZIP_LZMA),
+        "that lies about its size": lambda f: made.lying_archive(
+            f / "poses.npz", "world_mat_0.npy", 3 << 30, says=200
+        ),
+        "that lies in bzip2": lambda f: made.lying_archive(
+            f / "poses.npz", "world_mat_0.npy", 1 << 28, says=200, method=zipfile.ZIP_BZIP2
+        ),
+        "that is junk in LZMA": lambda f: made.lying_archive(
+            f / "poses.npz", "world_mat_0.npy", 0, says=200, method=zipfile.ZIP_LZMA
+        ),
     }.items():
         yield _case(f"cameras.npz {name}", change, command("poses.npz"))
 
@@ -642,17 +799,56 @@ def link_cases() -> Iterator[Case]:
         ("folder of an inspection", _link("scene-inspection"), ["inspect", "scene", "--normals", "points"]),
         ("pictures of an unfinished scene", _link("unfinished/polar"), UNFINISHED),
         ("sparse of an unfinished scene", _link("unfinished/sparse"), [*UNFINISHED[:-1], "model"]),
-        ("photographs of an unfinished scene", _link("unfinished/.sfm/images", "../../../outside"), [*UNFINISHED[:-1], "sfm"]),
-        ("masks of an unfinished scene", _link("unfinished/.sfm/masks", "../../../outside"), [*UNFINISHED[:-1], "sfm"]),
-        ("database of an unfinished scene", _link("unfinished/.sfm/database.db", "../../../outside/made.db"), [*UNFINISHED[:-1], "sfm"]),
+        (
+            "photographs of an unfinished scene",
+            _link("unfinished/.sfm/images", "../../../outside"),
+            [*UNFINISHED[:-1], "sfm"],
+        ),
+        (
+            "masks of an unfinished scene",
+            _link("unfinished/.sfm/masks", "../../../outside"),
+            [*UNFINISHED[:-1], "sfm"],
+        ),
+        (
+            "database of an unfinished scene",
+            _link("unfinished/.sfm/database.db", "../../../outside/made.db"),
+            [*UNFINISHED[:-1], "sfm"],
+        ),
         ("a picture of an unfinished scene", _link("unfinished/polar/v000_000.png", victim), UNFINISHED),
-        ("journal of an unfinished scene", lambda f: (shutil.move(f / "unfinished/prepare.json", f / "kept.json"), (f / "unfinished/prepare.json").symlink_to("../kept.json")) and None, UNFINISHED),
-        ("partial model of an unfinished scene", _link("unfinished/.sparse.partial"), [*UNFINISHED[:-1], "model"]),
-        ("lock of a comparison", _link("new/.lock", victim), ["compare", "scene", "--recipes", "3dgs", "--out", "new", "--steps", "0"]),
+        (
+            "journal of an unfinished scene",
+            lambda f: (
+                (
+                    shutil.move(f / "unfinished/prepare.json", f / "kept.json"),
+                    (f / "unfinished/prepare.json").symlink_to("../kept.json"),
+                )
+            ),
+            UNFINISHED,
+        ),
+        (
+            "partial model of an unfinished scene",
+            _link("unfinished/.sparse.partial"),
+            [*UNFINISHED[:-1], "model"],
+        ),
+        (
+            "lock of a comparison",
+            _link("new/.lock", victim),
+            ["compare", "scene", "--recipes", "3dgs", "--out", "new", "--steps", "0"],
+        ),
     ):
         yield _case(f"link for the {name}", change, command, "a link is replaced, and what it led to stays")
-    yield _case("odd temporary name", lambda f: (f / "run/.run.json.\u00b2.tmp").write_text("") and None, RESUME, "it is nobody's")
-    yield _case("temporary folder of this process", lambda f: (f / f"new/.sparse.{os.getpid()}.tmp").mkdir(parents=True), [*export, "cameras", "--out", "new"], "what an earlier process of this number left is removed")
+    yield _case(
+        "odd temporary name",
+        lambda f: (f / "run/.run.json.\u00b2.tmp").write_text(""),
+        RESUME,
+        "it is nobody's",
+    )
+    yield _case(
+        "temporary folder of this process",
+        lambda f: (f / f"new/.sparse.{os.getpid()}.tmp").mkdir(parents=True),
+        [*export, "cameras", "--out", "new"],
+        "what an earlier process of this number left is removed",
+    )
 
 
 def run_cases() -> Iterator[Case]:
@@ -676,7 +872,7 @@ def run_cases() -> Iterator[Case]:
         ("version of a million letters", lambda f: spoil.json_field(f / "run/run.json", ("version",), "x" * 10**6), EVAL, ""),
         ("device of control characters", lambda f: spoil.json_field(f / "run/run.json", ("device",), "\x1b[2J"), EVAL, "it is a note"),
         ("run.json of 2 GiB", lambda f: _sparse(f / "run/run.json", (1 << 31) - 1, b"{"), EVAL, ""),
-        ("run.json in UTF-16", lambda f: (f / "run/run.json").write_bytes((f / "run/run.json").read_text().encode("utf-16")) and None, EVAL, SAME),
+        ("run.json in UTF-16", lambda f: (f / "run/run.json").write_bytes((f / "run/run.json").read_text().encode("utf-16")), EVAL, SAME),
     ):  # fmt: skip
         yield _case(f"run {name}", change, command, reason)
     yield from _checkpoint_cases()
@@ -695,12 +891,20 @@ def run_cases() -> Iterator[Case]:
         ("of 1 pixel", [{**camera, "width": 1, "height": 1}] * 2, 30, "any size will do"),
     ):  # fmt: skip
         for how in (["--video", "new.mp4"], ["--out", "new"]):
-            yield _case(f"path {name} {how[0]}", _json("path.json", {"frames_per_second": rate, "cameras": cameras}), ["render", "run", "--path", "path.json", *how, "--layers", "final", "--device", "cpu"], reason)
+            yield _case(
+                f"path {name} {how[0]}",
+                _json("path.json", {"frames_per_second": rate, "cameras": cameras}),
+                ["render", "run", "--path", "path.json", *how, "--layers", "final", "--device", "cpu"],
+                reason,
+            )
 
 
 def _checkpoint_cases() -> Iterator[Case]:
     def raw(head: bytes, data: bytes = b"", length: int | None = None) -> Change:
-        return _bytes("run/checkpoint.safetensors", struct.pack("<Q", len(head) if length is None else length) + head + data)
+        return _bytes(
+            "run/checkpoint.safetensors",
+            struct.pack("<Q", len(head) if length is None else length) + head + data,
+        )
 
     for name, change in {
         "of a head of 2^63 bytes": raw(b"{}", length=1 << 63),
@@ -730,9 +934,19 @@ def _checkpoint_cases() -> Iterator[Case]:
     extreme = "values in range are rendered as they are"
     for tensor, value in (("log_scales", 60.0), ("log_scales", -1e4), ("means", 1e12), ("means", 0.0), ("quaternions", 1e-40),
                           ("quaternions", 1e8), ("opacities", 1e8), ("opacities", -1e8)):  # fmt: skip
-        for verb, command in (("eval", EVAL), ("share", SHARE), ("ply", ["export", "run", "--format", "ply", "--out", "new"]), ("resume", RESUME)):
+        for verb, command in (
+            ("eval", EVAL),
+            ("share", SHARE),
+            ("ply", ["export", "run", "--format", "ply", "--out", "new"]),
+            ("resume", RESUME),
+        ):
             if verb in ("eval", "share") or value in (60.0, 1e12, 1e-40):
-                yield _case(f"checkpoint with all {tensor} {value:g} {verb}", set_all(f"gaussians.{tensor}", value), command, extreme)
+                yield _case(
+                    f"checkpoint with all {tensor} {value:g} {verb}",
+                    set_all(f"gaussians.{tensor}", value),
+                    command,
+                    extreme,
+                )
     yield _case("checkpoint with a step of 2^50", lambda f: _scalars(f, [1 << 50, 0]), RESUME)
     yield _case("checkpoint with a later freeze", lambda f: _scalars(f, [10, 1 << 50]), RESUME, extreme)
 
@@ -773,7 +987,20 @@ def _environment_cases() -> Iterator[Case]:
 
 def folder_cases() -> Iterator[Case]:
     """Where something is to be written, and what stands there already."""
-    compare = ["compare", "scene", "--recipes", "3dgs", "--steps", "1", "--out", "new", "--threads", "1", "--device", "cpu"]
+    compare = [
+        "compare",
+        "scene",
+        "--recipes",
+        "3dgs",
+        "--steps",
+        "1",
+        "--out",
+        "new",
+        "--threads",
+        "1",
+        "--device",
+        "cpu",
+    ]
 
     def begun(spoiler: Change) -> Change:
         """A comparison whose runs' folders are known beforehand."""
@@ -796,16 +1023,25 @@ def folder_cases() -> Iterator[Case]:
         return os.path.relpath(folder.resolve().parents[5] / "outside/victim.txt", folder.resolve())
 
     for name, spoiler in {
-        "a deep log": lambda f: (f / "log.jsonl").write_text("[" * 4000) and None,
-        "a log of words": lambda f: (f / "log.jsonl").write_text('{"step": "x", "psnr": "y", "gaussians": "z"}\n') and None,
-        "a log of infinities": lambda f: (f / "log.jsonl").write_text('{"step": 1e400, "psnr": 1, "gaussians": 2}\n') and None,
+        "a deep log": lambda f: (f / "log.jsonl").write_text("[" * 4000),
+        "a log of words": lambda f: (f / "log.jsonl").write_text(
+            '{"step": "x", "psnr": "y", "gaussians": "z"}\n'
+        ),
+        "a log of infinities": lambda f: (f / "log.jsonl").write_text(
+            '{"step": 1e400, "psnr": 1, "gaussians": 2}\n'
+        ),
         "a log that is a pipe": lambda f: os.mkfifo(f / "log.jsonl"),
         "an error file that is a link": lambda f: (f / "stderr.txt").symlink_to(far(f)),
         "an error file that is a pipe": lambda f: os.mkfifo(f / "stderr.txt"),
         "a note that is a link": lambda f: (f / "beside_others.txt").symlink_to(far(f)),
-        "a run.json that is none": lambda f: (f / "run.json").write_text("[]") and None,
+        "a run.json that is none": lambda f: (f / "run.json").write_text("[]"),
     }.items():
-        yield _case(f"comparison with {name}", begun(spoiler), [*compare, "--jobs", "2", "--seeds", "1"], "the run is begun anew")
+        yield _case(
+            f"comparison with {name}",
+            begun(spoiler),
+            [*compare, "--jobs", "2", "--seeds", "1"],
+            "the run is begun anew",
+        )
     for name, change in {
         "a file": _bytes("new", b""),
         "a device": _link("new", "/dev/null"),
@@ -816,7 +1052,11 @@ def folder_cases() -> Iterator[Case]:
     }.items():
         for verb, command in {"train": TRAIN, "prepare": MOSAICS, "render": RENDER, "priors": READ, "compare": compare, "inspect": INSPECT,
                               "export": ["export", "run", "--format", "cameras", "--out", "new"]}.items():  # fmt: skip
-            arguments = [("run/run.json/x" if word == "new" else word) for word in command] if name == "under a file" else command
+            arguments = (
+                [("run/run.json/x" if word == "new" else word) for word in command]
+                if name == "under a file"
+                else command
+            )
             yield _case(f"out {name} {verb}", change, arguments)
 
     def bench(spoiler: Change) -> Change:
@@ -842,21 +1082,31 @@ def folder_cases() -> Iterator[Case]:
 
     for name, spoiler in {
         "a request with nothing more": changed("more", None),
-        "a request of a list": lambda p: (p / "request.json").write_text("[]") and None,
+        "a request of a list": lambda p: (p / "request.json").write_text("[]"),
         "a request of a scene that is a number": changed("scene", 3),
         "a request of settings that are text": changed("settings", "x"),
-        "a request that is a pipe": lambda p: ((p / "request.json").unlink(), os.mkfifo(p / "request.json")) and None,
-        "checksums that leave": lambda p: (p / "checksums.txt").write_text(f"{'0' * 64}  ../../../../outside/victim.txt\n") and None,
-        "checksums that are none": lambda p: (p / "checksums.txt").write_bytes(b"\xff\xfe\x00 x\n") and None,
-        "checksums of one word": lambda p: (p / "checksums.txt").write_text("word\n") and None,
-        "checksums that are a pipe": lambda p: ((p / "checksums.txt").unlink(), os.mkfifo(p / "checksums.txt")) and None,
+        "a request that is a pipe": lambda p: (
+            ((p / "request.json").unlink(), os.mkfifo(p / "request.json"))
+        ),
+        "checksums that leave": lambda p: (p / "checksums.txt").write_text(
+            f"{'0' * 64}  ../../../../outside/victim.txt\n"
+        ),
+        "checksums that are none": lambda p: (p / "checksums.txt").write_bytes(b"\xff\xfe\x00 x\n"),
+        "checksums of one word": lambda p: (p / "checksums.txt").write_text("word\n"),
+        "checksums that are a pipe": lambda p: (
+            ((p / "checksums.txt").unlink(), os.mkfifo(p / "checksums.txt"))
+        ),
         "no checksums": lambda p: (p / "checksums.txt").unlink(),
-        "a scene.json of a list": lambda p: (p / "scene.json").write_text("[]") and None,
-        "a scene.json that is none": lambda p: (p / "scene.json").write_bytes(b"\xff") and None,
-        "a scene.json that is a pipe": lambda p: ((p / "scene.json").unlink(), os.mkfifo(p / "scene.json")) and None,
-        "a deep scene.json": lambda p: (p / "scene.json").write_text("[" * 100_000) and None,
+        "a scene.json of a list": lambda p: (p / "scene.json").write_text("[]"),
+        "a scene.json that is none": lambda p: (p / "scene.json").write_bytes(b"\xff"),
+        "a scene.json that is a pipe": lambda p: (((p / "scene.json").unlink(), os.mkfifo(p / "scene.json"))),
+        "a deep scene.json": lambda p: (p / "scene.json").write_text("[" * 100_000),
     }.items():
-        yield _case(f"bench with {name}", bench(spoiler), ["bench", "--out", "new", "--render-only", "--device", "cpu"])
+        yield _case(
+            f"bench with {name}",
+            bench(spoiler),
+            ["bench", "--out", "new", "--render-only", "--device", "cpu"],
+        )
 
 
 # Published datasets.
@@ -864,6 +1114,7 @@ def folder_cases() -> Iterator[Case]:
 
 def dataset_cases() -> Iterator[Case]:
     """Datasets with a file that is not as it was published."""
+
     def of(kind: str, spoiler: Change) -> Change:
         def change(folder: Path) -> None:
             from dataset_files import WRITERS
@@ -906,19 +1157,19 @@ def dataset_cases() -> Iterator[Case]:
         ("neisf", "rows of zeros", rows(0.0)),
         ("neisf", "rows of 1e300", rows(1e300)),
         ("neisf", "EXR of a huge window", first("images_s0/*.exr", lambda p: made.exr(p, 40000))),
-        ("neisf", "poses in a broken head", lambda r: (r / "poses_bounds.npy").write_bytes(made.header("{'descr': (")) and None),
+        ("neisf", "poses in a broken head", lambda r: (r / "poses_bounds.npy").write_bytes(made.header("{'descr': ("))),
         ("nersp", "light of NaN", first("s0/*.npy", lambda p: np.save(p, np.full((48, 64, 3), np.nan)))),
         ("nersp", "light of 1e300", first("s0/*.npy", lambda p: np.save(p, np.full((48, 64, 3), 1e300)))),
         ("nersp", "negative light", first("s0/*.npy", lambda p: np.save(p, np.full((48, 64, 3), -1.0)))),
         ("nersp", "light of another size", first("s1/*.npy", lambda p: np.save(p, np.ones((4, 4, 3))))),
-        ("nersp", "a picture of two sizes", first("image/*.png", lambda p: (p.unlink(), made.deflated_tiff(p.with_suffix(".tif"), 30000, kind=9)) and None)),
+        ("nersp", "a picture of two sizes", first("image/*.png", lambda p: (p.unlink(), made.deflated_tiff(p.with_suffix(".tif"), 30000, kind=9)))),
         ("pandora", "HDR of two sizes", first("images_stokes/*.hdr", lambda p: made.two_sizes_hdr(p, 30000))),
-        ("pandora", "a view of superscripts", first("images_stokes/*_s0.hdr", lambda p: shutil.copyfile(p, p.with_name("\u0661\u0662_s0.hdr")) and None)),
+        ("pandora", "a view of superscripts", first("images_stokes/*_s0.hdr", lambda p: shutil.copyfile(p, p.with_name("\u0661\u0662_s0.hdr")))),
         ("pisr", "distortion of 1e300", lambda r: np.savez(r / "intrinsics.npz", camera_matrix=np.diag([1500.0, 1500, 1]), dist_coeffs=np.full((1, 5), 1e300))),
         ("pisr", "distortion of texts", lambda r: np.savez(r / "intrinsics.npz", camera_matrix=np.diag([1500.0, 1500, 1]), dist_coeffs=np.full((1, 5), "x"))),
         ("pisr", "two gammas", lambda r: (r / "gamma2.txt").touch()),
-        ("pisr", "a gamma of nan", lambda r: [p.rename(r / "gammanan.txt") for p in r.glob("gamma*")] and None),
-        ("gnerp", "cameras of deep JSON", lambda r: (r / "cameras.json").write_text("[" * 100_000) and None),
+        ("pisr", "a gamma of nan", lambda r: [p.rename(r / "gammanan.txt") for p in r.glob("gamma*")]),
+        ("gnerp", "cameras of deep JSON", lambda r: (r / "cameras.json").write_text("[" * 100_000)),
         ("gnerp", "cameras of texts", lambda r: spoil.json_field(r / "cameras.json", ("w2c_mat_0",), "x")),
         ("gnerp", "polarization of NaN", first("dop/*.npy", lambda p: np.save(p, np.full((48, 64), np.nan)))),
         ("gnerp", "polarization of 50", first("dop/*.npy", lambda p: np.save(p, np.full((48, 64), 50.0)))),
@@ -936,9 +1187,21 @@ def option_cases() -> Iterator[Case]:
     path = ["render", "run", "--out", "new", "--device", "cpu"]
     for name, command, reason in (
         ("views of 50000 commas", [*path, "--views", "," * 50_000], ""),
-        ("a view 300 times", [*path, "--views", ",".join(["v000"] * 300), "--layers", "final"], "a view may be named twice"),
-        ("a layer 300 times", [*path, "--views", "v000", "--layers", ",".join(["final"] * 300)], "a layer may be named twice"),
-        ("a turn of 1e308", [*path, "--views", "v000", "--layers", "final", "--rotate-environment", "1e308"], "any angle will do"),
+        (
+            "a view 300 times",
+            [*path, "--views", ",".join(["v000"] * 300), "--layers", "final"],
+            "a view may be named twice",
+        ),
+        (
+            "a layer 300 times",
+            [*path, "--views", "v000", "--layers", ",".join(["final"] * 300)],
+            "a layer may be named twice",
+        ),
+        (
+            "a turn of 1e308",
+            [*path, "--views", "v000", "--layers", "final", "--rotate-environment", "1e308"],
+            "any angle will do",
+        ),
         ("a video without a suffix", [*path[:2], "--path", "orbit", "--frames", "2", "--video", "new"], ""),
         ("a video as text", [*path[:2], "--path", "orbit", "--frames", "2", "--video", "new.txt"], ""),
         ("a video that is a folder", [*path[:2], "--path", "orbit", "--frames", "2", "--video", "run"], ""),
@@ -971,9 +1234,11 @@ def option_cases() -> Iterator[Case]:
 
 def name_cases() -> Iterator[Case]:
     """Names that mean something to whoever shows them: pages, tables, terminals."""
+
     def no_control(folder: Path) -> None:
         said = (folder.parent / "said").read_bytes()
-        assert b"\x1b" not in said and "\u202e".encode() not in said, said[-300:]
+        assert b"\x1b" not in said, said[-300:]
+        assert "\u202e".encode() not in said, said[-300:]
 
     control = "\x1b[2J\x1b]0;mine\x07\u202e"
 
@@ -987,9 +1252,22 @@ def name_cases() -> Iterator[Case]:
         return change
 
     yield _case("view with control characters and no pose", renamed(control), READ, check=no_control)
-    yield _case("stranger with control characters", lambda f: shutil.copyfile(f / PICTURE, f / f"scene/polar/{control}.png") and None, READ, check=no_control)
-    yield _case("scene of control characters", lambda f: (f / "scene").rename(f / control), ["priors", control, *READ[2:]], "it is shown without them", check=no_control)
-    yield _case("option of control characters", lambda f: None, [*TRAIN, "--recipe", control], check=no_control)
+    yield _case(
+        "stranger with control characters",
+        lambda f: shutil.copyfile(f / PICTURE, f / f"scene/polar/{control}.png"),
+        READ,
+        check=no_control,
+    )
+    yield _case(
+        "scene of control characters",
+        lambda f: (f / "scene").rename(f / control),
+        ["priors", control, *READ[2:]],
+        "it is shown without them",
+        check=no_control,
+    )
+    yield _case(
+        "option of control characters", lambda f: None, [*TRAIN, "--recipe", control], check=no_control
+    )
     yield _case("verb of control characters", lambda f: None, [control], check=no_control)
     script = "<script>alert(1)</script><img src=x onerror=alert(1)>"
 
@@ -998,16 +1276,29 @@ def name_cases() -> Iterator[Case]:
             for name in names:
                 for path in folder.glob(name):
                     shown = path.read_text(errors="replace")
-                    assert "<script>alert(1)" not in shown and "<img src=x" not in shown, path
+                    assert "<script>alert(1)" not in shown, path
+                    assert "<img src=x" not in shown, path
 
         return check
 
-    yield _case("page of a hostile title", lambda f: None, [*SHARE, "--title", script, "--caption", "</title>" + script + "<!--"], "it is escaped", no_script("new.html"))
+    yield _case(
+        "page of a hostile title",
+        lambda f: None,
+        [*SHARE, "--title", script, "--caption", "</title>" + script + "<!--"],
+        "it is escaped",
+        no_script("new.html"),
+    )
 
     def hostile(folder: Path) -> None:
         (folder / "scene").rename(folder / "x<img src=x onerror=alert(1)>")
 
-    yield _case("inspection of a hostile name", hostile, ["inspect", "x<img src=x onerror=alert(1)>", "--normals", "points", "--out", "new"], "it is escaped", no_script("new/*.html", "new/*.svg"))
+    yield _case(
+        "inspection of a hostile name",
+        hostile,
+        ["inspect", "x<img src=x onerror=alert(1)>", "--normals", "points", "--out", "new"],
+        "it is escaped",
+        no_script("new/*.html", "new/*.svg"),
+    )
 
     def newline(folder: Path) -> None:
         for path in list((folder / "scene/polar").glob("v001_*")):
@@ -1023,5 +1314,9 @@ def name_cases() -> Iterator[Case]:
         text.write_text(text.read_text().replace("v000.png", f"{name}.png"))
         (folder / "scene/split.json").write_text(json.dumps({"test": [name]}))
 
-    yield _case("view of the longest name", long, ["priors", "scene", "--out", "new", "--views", "x" * 246, "--threads", "1"])
+    yield _case(
+        "view of the longest name",
+        long,
+        ["priors", "scene", "--out", "new", "--views", "x" * 246, "--threads", "1"],
+    )
     yield _case("option that begins like another", lambda f: None, ["train", "--", "--out", "new"])

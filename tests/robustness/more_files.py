@@ -1,4 +1,5 @@
-"""Files made by hand that a library would not write: headers that lie, archives that unfold, models with wrong numbers."""
+# ruff: noqa: E501
+"""Files that no library would write: headers that lie, archives that unfold, models with wrong numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ Tag = tuple[int, int, int, int]
 
 
 def tiff(path: Path, tags: Sequence[Tag], data: bytes = bytes(4096)) -> None:
-    """A TIFF file with its directory at byte 8 and ``data`` behind it; values of ``-1`` become the place of the data."""
+    """A TIFF file: its directory at byte 8, ``data`` behind it; values of ``-1`` become the place of the data."""
     start = 8 + 2 + 12 * len(tags) + 4
     head = struct.pack("<2sHIH", b"II", 42, 8, len(tags))
     for number, kind, count, value in tags:
@@ -47,7 +48,11 @@ def deflated_tiff(path: Path, side: int, *, kind: int = 4, twice: int = 0) -> No
     start = 8 + 2 + 12 * len(tags) + 4
     places, sizes = start + len(packed), start + len(packed) + 4 * strips
     tags = [(n, k, c, {273: places, 279: sizes}.get(n, v)) for n, k, c, v in tags]
-    data = packed + struct.pack(f"<{strips}I", *[start] * strips) + struct.pack(f"<{strips}I", *[len(packed)] * strips)
+    data = (
+        packed
+        + struct.pack(f"<{strips}I", *[start] * strips)
+        + struct.pack(f"<{strips}I", *[len(packed)] * strips)
+    )
     tiff(path, tags, data)
 
 
@@ -127,7 +132,9 @@ def archive(path: Path, members: Sequence[tuple[str, bytes]], method: int = zipf
             file.writestr(name, data)
 
 
-def lying_archive(path: Path, name: str, unfolds: int, *, says: int, method: int = zipfile.ZIP_DEFLATED) -> None:
+def lying_archive(
+    path: Path, name: str, unfolds: int, *, says: int, method: int = zipfile.ZIP_DEFLATED
+) -> None:
     """A zip file of one member that says it has ``says`` bytes, and unfolds to far more."""
     begin = header("{'descr': '<f4', 'fortran_order': False, 'shape': (20, 24), }")
     if method == zipfile.ZIP_DEFLATED:
@@ -140,9 +147,14 @@ def lying_archive(path: Path, name: str, unfolds: int, *, says: int, method: int
         parts = [squeezer.compress(begin), *(squeezer.compress(bytes(1 << 24)) for _ in range(unfolds >> 24))]
         packed = b"".join(parts) + squeezer.flush()
     else:
-        packed = b"\x09\x04\x05\x00\x5d\xff\xff\xff\xff" + b"\xff" * 200  # LZMA with a dictionary of 4 GiB, and junk
+        packed = (
+            b"\x09\x04\x05\x00\x5d\xff\xff\xff\xff" + b"\xff" * 200
+        )  # LZMA with a dictionary of 4 GiB, and junk
     raw, flags = name.encode(), 0
-    local = struct.pack("<4s5H3I2H", b"PK\x03\x04", 63, flags, method, 0, 0, 0, len(packed), says, len(raw), 0) + raw
+    local = (
+        struct.pack("<4s5H3I2H", b"PK\x03\x04", 63, flags, method, 0, 0, 0, len(packed), says, len(raw), 0)
+        + raw
+    )
     central = struct.pack("<4s6H3I5H2I", b"PK\x01\x02", 63, 63, flags, method, 0, 0, 0, len(packed), says, len(raw),
                           0, 0, 0, 0, 0, 0) + raw  # fmt: skip
     end = struct.pack("<4s4H2IH", b"PK\x05\x06", 0, 0, 1, 1, len(central), len(local) + len(packed), 0)
@@ -151,16 +163,23 @@ def lying_archive(path: Path, name: str, unfolds: int, *, says: int, method: int
 
 def exr(path: Path, side: int) -> None:
     """An EXR file of few bytes whose window is ``side`` x ``side``; its lines are missing."""
+
     def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:
         return name + b"\0" + kind + b"\0" + struct.pack("<I", len(value)) + value
 
     window = struct.pack("<4i", 0, 0, side - 1, side - 1)
-    channels = b"".join(name + b"\0" + struct.pack("<IB3xII", 2, 0, 1, 1) for name in (b"B", b"G", b"R")) + b"\0"
+    channels = (
+        b"".join(name + b"\0" + struct.pack("<IB3xII", 2, 0, 1, 1) for name in (b"B", b"G", b"R")) + b"\0"
+    )
     data = b"\x76\x2f\x31\x01\x02\0\0\0"
     data += attribute(b"channels", b"chlist", channels) + attribute(b"compression", b"compression", b"\x03")
     data += attribute(b"dataWindow", b"box2i", window) + attribute(b"displayWindow", b"box2i", window)
-    data += attribute(b"lineOrder", b"lineOrder", b"\0") + attribute(b"pixelAspectRatio", b"float", struct.pack("<f", 1))
-    data += attribute(b"screenWindowCenter", b"v2f", bytes(8)) + attribute(b"screenWindowWidth", b"float", struct.pack("<f", 1))
+    data += attribute(b"lineOrder", b"lineOrder", b"\0") + attribute(
+        b"pixelAspectRatio", b"float", struct.pack("<f", 1)
+    )
+    data += attribute(b"screenWindowCenter", b"v2f", bytes(8)) + attribute(
+        b"screenWindowWidth", b"float", struct.pack("<f", 1)
+    )
     data += b"\0"
     lines = -(-side // 16)
     packed = zlib.compress(bytes(side * 16 * 12), 9)
@@ -178,13 +197,17 @@ def two_sizes_hdr(path: Path, side: int) -> None:
 # COLMAP, binary.
 
 
-def cameras_bin(cameras: Sequence[tuple[int, int, int, int, Sequence[float]]], count: int | None = None) -> bytes:
+def cameras_bin(
+    cameras: Sequence[tuple[int, int, int, int, Sequence[float]]], count: int | None = None
+) -> bytes:
     """Number, model, width, height and parameters of each."""
     parts = [struct.pack("<IiQQ", n, m, w, h) + struct.pack(f"<{len(p)}d", *p) for n, m, w, h, p in cameras]
     return struct.pack("<Q", len(cameras) if count is None else count) + b"".join(parts)
 
 
-def images_bin(images: Sequence[tuple[int, Sequence[float], int, bytes, Sequence[tuple[float, float, int]]]]) -> bytes:
+def images_bin(
+    images: Sequence[tuple[int, Sequence[float], int, bytes, Sequence[tuple[float, float, int]]]],
+) -> bytes:
     """Number, pose (7 numbers), camera, name and points of each."""
     parts = []
     for number, pose, camera, name, points in images:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,14 @@ from numpy.typing import NDArray
 from polarguide.camera import Camera
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
+from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes, read_file
 from polarguide.capture.ground_truth import read_ground_truth
 from polarguide.capture.layout import Layout
 from polarguide.capture.view import ANGLES, GroundTruth, View
 from polarguide.errors import PolarguideError
+from polarguide.files import LARGEST_FILE
+from polarguide.records import LARGEST_RECORD
 
 
 class Files:
@@ -29,15 +33,16 @@ class Files:
     def __init__(self) -> None:
         self.digests: dict[Path, str] = {}
 
-    def read(self, path: Path) -> bytes:
-        """The bytes of a file."""
-        data = read_file(path)
+    def read(self, path: Path, largest: int = LARGEST_FILE) -> bytes:
+        """The bytes of a file of up to ``largest``."""
+        data = read_file(path, largest=largest)
         self.digests[path] = hashlib.sha256(data).hexdigest()
         return data
 
     def read_if_there(self, path: Path) -> bytes | None:
-        """The bytes of a file, or None if there is no such file."""
-        return self.read(path) if os.path.lexists(path) else None  # a link to nowhere is no absence
+        """The bytes of a JSON file, or None if there is no such file."""
+        there = os.path.lexists(path)  # a link to nowhere is no absence
+        return self.read(path, LARGEST_RECORD) if there else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +131,33 @@ def _read_angles(files: Files, paths: dict[int, Path]) -> list[NDArray[Any]]:
     pictures: list[NDArray[Any]] = []
     for angle in ANGLES:
         path = paths[angle]
-        picture = decode_picture(path, files.read(path))
+        data = files.read(path)
+        if pictures:
+            require_size(path, data, pictures[0].shape[:2], like=paths[0])
+        picture = decode_picture(path, data)
         if pictures:
             require_alike(path, picture, paths[0], pictures[0])
         pictures.append(picture)
     return pictures
+
+
+def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | None = None) -> None:
+    """Check the size that a picture file states, height and width, before memory is taken to decode it.
+
+    Raises:
+        PolarguideError: it states another one.
+    """
+    stated = declared_size(data)
+    if stated is not None and stated != (size[1], size[0]):
+        alike = "the size of the pictures" if like is None else f"the size of {'/'.join(like.parts[-2:])}"
+        raise PolarguideError(
+            path,
+            expected=f"{alike}, {size[1]}x{size[0]}",
+            found=f"{stated[0]}x{stated[1]}",
+            remedy="Make it anew for these pictures."
+            if like is None
+            else "Export the four pictures of a view alike.",
+        )
 
 
 def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: NDArray[Any]) -> None:
@@ -149,15 +176,9 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
 
 
 def _read_mask(files: Files, path: Path, size: tuple[int, int], *, any_value: bool) -> NDArray[np.bool_]:
-    mask = decode_mask(path, files.read(path), any_value=any_value)
-    if mask.shape != size:
-        raise PolarguideError(
-            path,
-            expected=f"the size of the pictures, {size[1]}x{size[0]}",
-            found=f"{mask.shape[1]}x{mask.shape[0]}",
-            remedy="Make the mask for these pictures.",
-        )
-    return mask
+    data = files.read(path)
+    require_size(path, data, size)
+    return decode_mask(path, data, any_value=any_value)
 
 
 def _kind(picture: NDArray[Any]) -> str:

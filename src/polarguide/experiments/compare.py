@@ -17,7 +17,7 @@ from polarguide.experiments.report import write_report
 from polarguide.experiments.results import Results
 from polarguide.experiments.study import write_study
 from polarguide.experiments.worker import Scoring, Task, Training
-from polarguide.files import make_folder
+from polarguide.files import make_folder, require_inside, write_text
 from polarguide.options import ComputeOptions, PathLike, check_choice, check_count
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
@@ -83,6 +83,7 @@ def compare(
     entries = scene_entries(comparison, reporter)
     plan = plan_runs(comparison, entries)
     make_folder(comparison.out)
+    require_inside(comparison.out, *(run.folder for run in plan))
     with locked(comparison.out):
         failures = _train(comparison, entries, plan, reporter)
         if options.speed:
@@ -151,7 +152,7 @@ def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
     if state in ("new", "begun"):
         if not alone:
             make_folder(run.folder)
-            (run.folder / BESIDE_OTHERS).write_text("Trained beside other runs: its seconds do not count.\n")
+            write_text(run.folder / BESIDE_OTHERS, "Trained beside other runs: its seconds do not count.\n")
         tasks.append(
             Training(
                 scene=str(run.scene.path),

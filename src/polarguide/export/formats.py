@@ -19,7 +19,7 @@ from polarguide.export.points import surface_points, write_points
 from polarguide.export.share import share_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
-from polarguide.files import make_folder, temporary_folder, write_text
+from polarguide.files import make_folder, require_inside, temporary_folder, write_text
 from polarguide.options import ExportFormat, PathLike, check_choice, check_range
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.mesh import RESOLUTION, scene_mesh
@@ -61,6 +61,8 @@ def export(
         PolarguideError: an optional package is missing, or the recipe has nothing of this kind.
     """
     folder = run.folder / "export" if out is None else Path(out)
+    if out is None:
+        require_inside(run.folder, folder)
     writers: dict[str, Callable[[], list[Path]]] = {
         "ply": lambda: [_ply(run, folder / "splats.ply")],
         "spz": lambda: [_compressed(run, folder / "splats.spz", partial(write_spz, version=spz_version))],
@@ -171,6 +173,7 @@ def _environment(run: OpenedRun, folder: Path) -> list[Path]:
 
 def _cameras(run: OpenedRun, folder: Path) -> list[Path]:
     scene = run.scene
+    require_inside(folder, folder / "sparse" / "0")
     write_colmap(folder / "sparse" / "0", run.cameras, scene.points, scene.point_colors)
     write_transforms(folder / "transforms.json", run.cameras)
     return [folder / "sparse" / "0", folder / "transforms.json"]
