@@ -188,3 +188,14 @@ def test_the_last_row_of_a_log(tmp_path: Path) -> None:
     assert row.step == 19
     log.write_text("nonsense\n")
     assert last_row(log) is None
+
+
+@pytest.mark.parametrize("text", ["[" * 4000, '{"step": "x"}', '{"step": 1e400}', '{"step": -1}', "{}"])
+def test_lines_that_are_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / "log.jsonl").write_text(text + "\n")
+    assert last_row(tmp_path / "log.jsonl") is None
+
+
+def test_a_log_that_is_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "log.jsonl")
+    assert last_row(tmp_path / "log.jsonl") is None

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import more_files as made
+import hostile_files as made
 import numpy as np
 import spoil
 from base import EVAL, HEIGHT, MOSAICS, READ, RESUME, SHOTS, TRAIN, WIDTH
@@ -323,14 +323,14 @@ def scene_cases() -> Iterator[Case]:
         key = b'"test": ["v000"]' if file == "split.json" else b'"refractive_index": 1.5'
         for name, data, reason in (
             ("in UTF-16", (b"{" + key + b"}").decode().encode("utf-16"), SAME),
-            ("with a mark of its bytes", b"\xef\xbb\xbf{" + key + b"}", ""),
+            ("with a mark of its bytes", b"\xef\xbb\xbf{" + key + b"}", SAME),
             ("with a key twice", b"{" + key + b", " + key.replace(b"1.5", b"1.4").replace(b"v000", b"v001") + b"}", "the last one counts, as Python's JSON has it"),
             ("with a number of 5000 digits", b'{"x": ' + b"9" * 5000 + b", " + key + b"}", ""),
             ("with half a character", b'{"x": "\\ud800", ' + key + b"}", UNUSED),
             ("with zeros behind", b"{" + key + b"}" + bytes(4096), ""),
             ("as a list", b"[{" + key + b"}]", ""),
             ("as a number", b"1", ""),
-            ("of many brackets", b'{"x": [' + b"[]," * 15_000_000 + b"[]], " + key + b"}", ""),
+            ("of many brackets", b'{"x": [' + b"[]," * 2_000_000 + b"[]], " + key + b"}", UNUSED),
         ):  # fmt: skip
             yield _case(f"{file} {name}", _bytes(at, data), READ, reason)
         yield _case(f"{file} of 2 GiB", lambda f, at=at: _sparse(f / at, (1 << 31) - 1, b"{"), READ)

@@ -223,7 +223,7 @@ def test_strangers_pages_are_turned_away(served: Served, headers: dict[str, str]
 
 def test_the_page_cannot_be_framed_by_others(served: Served) -> None:
     with urllib.request.urlopen(served.viewer.address, timeout=PATIENCE) as answer:
-        assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'self'"
+        assert answer.headers["Content-Security-Policy"] == POLICY.format(host=f"127.0.0.1:{port}")
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 

@@ -1,4 +1,3 @@
-# ruff: noqa: E501
 """Files that no library would write: headers that lie, archives that unfold, models with wrong numbers."""
 
 from __future__ import annotations
