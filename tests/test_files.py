@@ -137,7 +137,7 @@ def test_places_that_links_lead_out_of_a_folder(tmp_path: Path) -> None:
     (tmp_path / "whole" / "render").symlink_to(tmp_path)
     run = tmp_path / "run"
     require_inside(run, run / "export", run / "inner", run / "inner" / "deep")
-    with pytest.raises(PolarguideError, match="render: expected a place in .*found a link to "):
+    with pytest.raises(PolarguideError, match=r"render: expected a place in .*found a link to "):
         require_inside(run, run / "render")
     with pytest.raises(PolarguideError, match="deep: expected a place in"):
         require_inside(run, run / "render" / "deep")
