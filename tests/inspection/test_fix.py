@@ -152,7 +152,7 @@ def test_links_that_lead_in_a_circle_are_refused(tmp_path) -> None:
     for name in "ab":  # followed, they would be copied without end
         (root / "masks" / name).symlink_to("../masks")
     change = Calibration(order=(90, 45, 0, 135))
-    with pytest.raises(PolarguideError, match="masks/[ab]: expected a file of the scene"):
+    with pytest.raises(PolarguideError, match=r"masks/[ab]: expected a file of the scene"):
         fix.fix_scene(read_capture(root), change, tmp_path / "fixed")
     assert not (tmp_path / "fixed").exists()
 

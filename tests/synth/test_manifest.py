@@ -42,7 +42,7 @@ def test_files_that_are_none(tmp_path: Path, spoil: Callable[[Path], object], fo
 
 @pytest.mark.parametrize("listed", [b"word\n", b"\xff\xfe\x00 x\n", b"0  \n"])
 def test_lists_that_are_none(tmp_path: Path, listed: bytes) -> None:
-    with pytest.raises(PolarguideError, match="expected the file that checksums.txt lists"):
+    with pytest.raises(PolarguideError, match=r"expected the file that checksums\.txt lists"):
         verify_scene(scene(tmp_path / "scene", listed))
 
 

@@ -79,7 +79,10 @@ def run(arguments: Sequence[str]) -> int:
         return 1
     except OSError as error:  # missing rights, a full disk, a file where a folder should be
         errors.print("[bold red]error:[/] ", end="")
-        errors.print(printable(f"{error.filename or 'files'}: {error.strerror or error}."), markup=False)
+        said = (
+            f"{error.filename or 'files'}: expected to read or write there, found {error.strerror or error}."
+        )
+        errors.print(printable(f"{said} Check the name, the rights, and the room on the disk."), markup=False)
         return 2
     return 0
 
