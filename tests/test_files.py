@@ -10,7 +10,16 @@ from pathlib import Path
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, atomic_folder, make_folder, read_file, write_text, write_whole, writing
+from polarguide.files import (
+    atomic,
+    atomic_folder,
+    make_folder,
+    read_file,
+    require_inside,
+    write_text,
+    write_whole,
+    writing,
+)
 
 
 def test_a_file_is_replaced(tmp_path: Path) -> None:
@@ -123,3 +132,40 @@ def test_a_folder_that_cannot_be_copied_is_one_reason(
     with pytest.raises(PolarguideError) as caught, writing(tmp_path / "new"):
         shutil.copytree(tmp_path / "old", tmp_path / "new")
     assert caught.value.found == "[Errno 28] No space left on device"
+
+
+def test_nothing_is_written_through_what_bears_this_processs_number(tmp_path: Path) -> None:
+    victim, path = tmp_path / "victim", tmp_path / "folder" / "run.json"
+    victim.write_text("mine")
+    path.parent.mkdir()
+    path.with_name(f".run.json.{os.getpid()}.tmp").symlink_to(victim)
+    path.with_name(".run.json.\u00b2.tmp").touch()  # a digit, but no number
+    write_text(path, "new")
+    assert (victim.read_text(), path.read_text()) == ("mine", "new")
+    folder = tmp_path / "folder" / "sparse"
+    folder.with_name(f".sparse.{os.getpid()}.tmp").mkdir()  # a container gives every process the same number
+    with atomic_folder(folder) as temporary:
+        (temporary / "a").touch()
+    assert (folder / "a").exists()
+
+
+def test_places_that_links_lead_out_of_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "run").symlink_to("whole")  # the folder itself may be one
+    (tmp_path / "whole" / "inner").symlink_to("../whole/other")
+    (tmp_path / "whole" / "render").symlink_to(tmp_path)
+    run = tmp_path / "run"
+    require_inside(run, run / "export", run / "inner", run / "inner" / "deep")
+    with pytest.raises(PolarguideError, match=r"render: expected a place in .*found a link to "):
+        require_inside(run, run / "render")
+    with pytest.raises(PolarguideError, match="deep: expected a place in"):
+        require_inside(run, run / "render" / "deep")
+
+
+def test_files_larger_than_they_may_be(tmp_path: Path) -> None:
+    with open(tmp_path / "sparse", "wb") as file:
+        file.truncate(1 << 32)
+    with pytest.raises(PolarguideError, match="more than 2048 MiB"):
+        read_file(tmp_path / "sparse")
+    with pytest.raises(PolarguideError, match="more than 1 MiB"):
+        read_file(tmp_path / "sparse", largest=1 << 20)

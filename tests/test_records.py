@@ -11,7 +11,7 @@ import pytest
 from msgspec import Meta
 
 from polarguide.errors import PolarguideError
-from polarguide.records import check_options, decode, read_record, to_json
+from polarguide.records import LARGEST_RECORD, check_options, decode, read_record, to_json
 
 
 class Part(msgspec.Struct, forbid_unknown_fields=True):
@@ -111,3 +111,10 @@ def test_what_is_nested_too_deeply_is_refused(depth: int) -> None:
     for data in (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth):
         with pytest.raises(PolarguideError, match="JSON"):
             decode(data, dict[str, Any], "file.json")
+
+
+def test_a_file_that_no_record_needs_is_not_read(tmp_path: Path) -> None:
+    with open(tmp_path / "run.json", "wb") as file:
+        file.truncate(LARGEST_RECORD + 1)
+    with pytest.raises(PolarguideError, match="more than 64 MiB"):
+        read_record(tmp_path / "run.json", dict[str, Any])

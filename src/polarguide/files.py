@@ -13,7 +13,7 @@ from pathlib import Path
 
 from polarguide.errors import PolarguideError
 
-_LARGEST_FILE = 1 << 31
+LARGEST_FILE = 1 << 31
 _MASK = os.umask(0)  # what rights new files do not get; it can only be asked for by setting it
 os.umask(_MASK)
 
@@ -81,11 +81,15 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def _temporary(path: Path) -> Path:
-    """The temporary name of a file or folder in this process; removes those of processes that are no more."""
+    """The temporary name of a file or folder in this process; removes those of processes that are no more.
+
+    What has this process's own number is of an earlier one, or a link that somebody put there to be written through.
+    """
     with contextlib.suppress(OSError):
         for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp*"):
             process = old.name.removeprefix(f".{path.name}.").partition(".")[0]
-            if process.isdigit() and int(process) != os.getpid() and not _is_alive(int(process)):
+            ours = process.isascii() and process.isdigit()
+            if ours and (int(process) == os.getpid() or not _is_alive(int(process))):
                 with contextlib.suppress(OSError):
                     shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -191,24 +195,47 @@ def check_out(path: Path) -> None:
     """Check that a folder can be written to where there may be none yet.
 
     Raises:
-        PolarguideError: there is a file of this name.
+        PolarguideError: there is a file of this name, or a link to nowhere.
     """
-    if path.exists():
+    if os.path.lexists(path):
         require_folder(path, expected="a folder to write", remedy="Give another --out.")
 
 
-def read_file(path: Path, *, remedy: str = "Check that the file exists and may be read.") -> bytes:
-    """The bytes of a file of up to 2 GiB; ``remedy`` is for messages.
+def require_inside(folder: Path, *paths: Path) -> None:
+    """Refuse places that links lead out of a folder: somebody else may have made what it holds.
+
+    Args:
+        folder: what is written into; it may be a link itself. paths: places in it, which need not exist.
 
     Raises:
-        PolarguideError: the file cannot be read.
+        PolarguideError: one lies elsewhere.
+    """
+    whole = Path(os.path.realpath(folder))
+    for path in paths:
+        real = Path(os.path.realpath(path))
+        if not real.is_relative_to(whole):
+            raise PolarguideError(
+                path,
+                expected=f"a place in {folder}",
+                found=f"a link to {real}",
+                remedy="Remove the link, or name the other place with --out; nothing was written there.",
+            )
+
+
+def read_file(
+    path: Path, *, largest: int = LARGEST_FILE, remedy: str = "Check that the file exists and may be read."
+) -> bytes:
+    """The bytes of a file of up to ``largest``, 2 GiB; ``remedy`` is for messages.
+
+    Raises:
+        PolarguideError: the file cannot be read, or is larger.
     """
     try:
         about = path.stat()
         if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):  # reading may never end
             raise OSError("a pipe or device")
-        if about.st_size > _LARGEST_FILE:
-            raise OSError(f"one of {about.st_size} bytes, more than 2 GiB")
+        if about.st_size > largest:
+            raise OSError(f"one of {about.st_size} bytes, more than {largest >> 20} MiB")
         return path.read_bytes()
     except OSError as error:
         raise PolarguideError(

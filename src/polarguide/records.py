@@ -22,6 +22,8 @@ _WORDS = {
     "object": "a JSON object {...}", "str": "text",
 }  # fmt: skip
 _DEEPEST = 50
+LARGEST_RECORD = 1 << 26
+"""Bytes of a JSON file; what they unfold to takes some twenty times as much."""
 _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 
 
@@ -35,7 +37,7 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
     Raises:
         PolarguideError: the file cannot be read, or ``decode`` refuses it.
     """
-    return decode(read_file(path, remedy=remedy), kind, path, remedy=remedy)
+    return decode(read_file(path, largest=LARGEST_RECORD, remedy=remedy), kind, path, remedy=remedy)
 
 
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:

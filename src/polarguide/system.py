@@ -92,9 +92,11 @@ def exclusive_lock(path: Path) -> Iterator[None]:
 
     Raises:
         BlockingIOError: another process holds it.
+        OSError: it cannot be opened, or is a link: what that leads to is not ours to open.
     """
     fcntl = _posix("fcntl")
-    with open(path, "w") as file:
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    with open(handle, "w") as file:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.set_inheritable(file.fileno(), True)

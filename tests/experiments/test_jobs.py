@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from polarguide.experiments.jobs import Job, last_line, run_jobs
+from polarguide.experiments.jobs import Job, last_row, run_jobs
 from polarguide.experiments.worker import Scoring
 from polarguide.options import ComputeOptions
 from polarguide.progress import Advance, Reporter
@@ -179,10 +179,23 @@ def test_the_library_installs_no_signal_handlers(job: Callable[..., Job]) -> Non
     assert all(handlers == before for handlers in during)
 
 
-def test_the_last_line_of_a_log(tmp_path: Path) -> None:
+def test_the_last_row_of_a_log(tmp_path: Path) -> None:
     log = tmp_path / "log.jsonl"
-    assert last_line(log) is None
+    assert last_row(log) is None
     log.write_text('{"step": 9}\n' * 1000 + '{"step": 19}\n{"st')
-    assert last_line(log) == {"step": 19}
+    row = last_row(log)
+    assert row is not None
+    assert row.step == 19
     log.write_text("nonsense\n")
-    assert last_line(log) is None
+    assert last_row(log) is None
+
+
+@pytest.mark.parametrize("text", ["[" * 4000, '{"step": "x"}', '{"step": 1e400}', '{"step": -1}', "{}"])
+def test_lines_that_are_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / "log.jsonl").write_text(text + "\n")
+    assert last_row(tmp_path / "log.jsonl") is None
+
+
+def test_a_log_that_is_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "log.jsonl")
+    assert last_row(tmp_path / "log.jsonl") is None

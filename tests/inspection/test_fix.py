@@ -144,3 +144,21 @@ def test_a_link_within_the_scene_is_copied(tmp_path) -> None:
     copy = tmp_path / "fixed" / "masks" / "v0.png"
     assert not copy.is_symlink()
     assert copy.read_bytes() == (root / "polar" / "v0_000.png").read_bytes()
+
+
+def test_links_that_lead_in_a_circle_are_refused(tmp_path) -> None:
+    root = write_scene(tmp_path / "scene")
+    (root / "masks").mkdir()
+    for name in "ab":  # followed, they would be copied without end
+        (root / "masks" / name).symlink_to("../masks")
+    change = Calibration(order=(90, 45, 0, 135))
+    with pytest.raises(PolarguideError, match=r"masks/[ab]: expected a file of the scene"):
+        fix.fix_scene(read_capture(root), change, tmp_path / "fixed")
+    assert not (tmp_path / "fixed").exists()
+
+
+def test_corrections_that_are_none(tmp_path) -> None:
+    root = write_scene(tmp_path / "scene")
+    (root / "scene.json").write_text('{"corrections": 5}')
+    fix.fix_scene(read_capture(root), Calibration(order=(90, 45, 0, 135)), tmp_path / "fixed")
+    assert len(json.loads((tmp_path / "fixed" / "scene.json").read_text())["corrections"]) == 1

@@ -358,6 +358,20 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
     for path in elsewhere.iterdir():
         path.write_bytes(b"mine")
     (out / "scene.json").rename(out / "prepare.json")
-    with pytest.raises(PolarguideError, match="a link to another place"):
+    with pytest.raises(PolarguideError, match="found a link to "):
         prepare_scene(source, out, MOSAIC)
     assert {path.read_bytes() for path in elsewhere.iterdir()} == {b"mine"}
+
+
+@pytest.mark.parametrize("place", [".sfm/images", ".sfm/database.db", ".sparse.partial", "sparse"])
+def test_no_link_in_an_unfinished_scene_is_written_through(tmp_path: Path, place: str) -> None:
+    source, out, elsewhere = tmp_path / "source", tmp_path / "out", tmp_path / "elsewhere"
+    write_mosaics(source)
+    prepare_scene(source, out, MOSAIC)
+    (out / "scene.json").rename(out / "prepare.json")
+    elsewhere.mkdir()
+    (out / place).parent.mkdir(exist_ok=True)
+    (out / place).symlink_to(elsewhere)
+    with pytest.raises(PolarguideError, match=f"{re.escape(place)}: expected a place in .*found a link to "):
+        prepare_scene(source, out, MOSAIC)
+    assert not any(elsewhere.iterdir())

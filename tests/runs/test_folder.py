@@ -261,3 +261,17 @@ def test_the_same_state_is_the_same_bytes(tmp_path: Path, state: TrainingState) 
         save_checkpoint(tmp_path, state)
         found.add((tmp_path / CHECKPOINT).read_bytes())
     assert len(found) == 1
+
+
+def test_lines_of_a_log_that_are_none_are_dropped(tmp_path: Path) -> None:
+    good = b'{"step": 10, "seconds": 2.5, "note": "\xc3\xa4"}'
+    bad = [
+        b"[" * 5000,
+        b'{"step": 1e400}',
+        b'{"step": true}',
+        b'{"step": 1, "psnr": NaN}',
+        b'{"step": 1, "x": "\xff"}',
+        b"{}",
+    ]
+    (tmp_path / "log.jsonl").write_bytes(b"\n".join([*bad, good, *bad]))
+    assert [row["step"] for row in RunLog(tmp_path).rows()] == [10]

@@ -223,7 +223,9 @@ def test_strangers_pages_are_turned_away(served: Served, headers: dict[str, str]
 
 def test_the_page_cannot_be_framed_by_others(served: Served) -> None:
     with urllib.request.urlopen(served.viewer.address, timeout=PATIENCE) as answer:
-        assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'self'"
+        policy = answer.headers["Content-Security-Policy"]
+        assert "frame-ancestors 'self'" in policy
+        assert f"connect-src 'self' ws://{served.viewer.address.removeprefix('http://')} " in policy
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 

@@ -191,5 +191,21 @@ def test_a_name_that_was_bound_to_this_machine_sees_nothing(opened):
     page.close()
 
 
+def test_the_viewers_own_page_talks_to_no_other_server(opened):
+    """viser's page goes to any server that its address names, and would run what that one sends as the viewer's."""
+    stranger = viser.ViserServer(port=18280, verbose=False)
+    page = opened.page.context.browser.new_page()
+    try:
+        stranger.gui.add_html('<img src=x onerror="window.hurt = 1">')
+        with page.expect_console_message(lambda said: "Connecting to" in said.text, timeout=1000 * PATIENCE):
+            page.goto(f"{opened.viewer.address}/?websocket=ws://127.0.0.1:18280")
+        page.wait_for_timeout(5000)
+        assert not stranger.get_clients()
+        assert page.evaluate("window.hurt") is None
+    finally:
+        page.close()
+        stranger.stop()
+
+
 def test_the_viewers_own_page_does_talk(opened):
     assert opened.page.evaluate(TALK, opened.viewer.address.replace("http", "ws")) == "pictures"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide.capture import box_filter as boxes
-from polarguide.capture.formats.arrays import unpacked
+from polarguide.capture.formats.arrays import BROKEN, unpacked
 from polarguide.capture.objects import LARGEST_ID
 from polarguide.capture.view import GroundTruth
 from polarguide.errors import PolarguideError
@@ -20,7 +18,6 @@ from polarguide.errors import PolarguideError
 _CHANNELS = {"normal": 3, "depth": 0, "mask": 0, "specular": 3, "diffuse": 3, "objid": 0}
 
 _LARGEST_NUMBER = 16  # bytes
-_DAMAGED = (ValueError, TypeError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor: int) -> GroundTruth:
@@ -62,7 +59,7 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
 def _read_arrays(path: Path, data: bytes, size: tuple[int, int]) -> dict[str, NDArray[Any]]:
     try:
         return unpacked(data, _CHANNELS, _LARGEST_NUMBER * max(3, *_CHANNELS.values()) * size[0] * size[1])
-    except (*_DAMAGED, MemoryError, SyntaxError) as error:
+    except BROKEN as error:
         raise PolarguideError(
             path,
             expected="a NumPy .npz file with normal, depth, mask, specular, diffuse or objid",

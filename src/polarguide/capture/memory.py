@@ -34,20 +34,34 @@ def check_memory(layout: Layout, names: Sequence[str], *, factor: int, at_once: 
     Raises:
         PolarguideError: the least that suffices is more.
     """
+    pixels = [_largest(layout, name) for name in names]
+    kept = sum(KEPT * count // factor**2 for count in pixels)
+    needed = kept + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
+    remedy = "Give --downscale 2 or more, fewer views, or more --memory."
+    require_memory(layout.root, needed, f"{len(names)} views", limit=limit, remedy=remedy)
+
+
+def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: float = 0.0) -> None:
+    """Refuse what takes more memory than there is.
+
+    Args:
+        where, what, remedy: for messages. needed: bytes, at least.
+        limit: GiB that may be taken; 0: 80 % of what is free.
+
+    Raises:
+        PolarguideError: that is less.
+    """
     free = free_memory()
     if limit <= 0 and free is None:
         return
     allowed = int(limit * GIBIBYTE) if limit > 0 else int(SHARE * (free or 0))
-    pixels = [_largest(layout, name) for name in names]
-    kept = sum(KEPT * count // factor**2 for count in pixels)
-    needed = kept + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
     if needed > allowed:
         whose = "as --memory allows" if limit > 0 else f"{SHARE:.0%} of what is free"
         raise PolarguideError(
-            layout.root,
+            where,
             expected=f"pictures that take up to {allowed / GIBIBYTE:.1f} GiB, {whose}",
-            found=f"{len(names)} views that take {needed / GIBIBYTE:.1f} GiB",
-            remedy="Give --downscale 2 or more, fewer views, or more --memory.",
+            found=f"{what} that take {needed / GIBIBYTE:.1f} GiB",
+            remedy=remedy,
         )
 
 

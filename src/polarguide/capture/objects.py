@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -80,9 +81,9 @@ def objects_of(path: Path, data: bytes | None) -> tuple[SceneObject, ...]:
         return ()
     objects = decode(data, _Scene, path, remedy=_REMEDY).objects or []
     for field in ("id", "name"):
-        values = [getattr(item, field) for item in objects]
-        twice = next((value for value in values if values.count(value) > 1), None)
-        if twice is not None:
+        counts = Counter(getattr(item, field) for item in objects)
+        twice, times = next(iter(counts.most_common(1)), (None, 0))
+        if times > 1:
             raise PolarguideError(
                 f"{path} (objects)",
                 expected=f"objects of which each has its own {field}",

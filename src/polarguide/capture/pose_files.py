@@ -22,7 +22,7 @@ _SQUARE = ((3, 4), (4, 4))
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """nerfstudio's cameras look along -z with y up."""
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-_LARGEST_XML = 1 << 26
+_LARGEST_XML = 1 << 24
 
 
 def read_pose_file(path: Path, views: Sequence[str], size: tuple[int, int]) -> dict[str, PosedCamera]:
@@ -113,6 +113,8 @@ def _perspective(where: str, lens: Mapping[str, Any], matrix: Any) -> PosedCamer
         focal = size[0] / 2 / np.tan(lens["camera_angle_x"] / 2)
     if not focal or not focal > 0:
         raise wrong_camera(where, "a focal length, fl_x or camera_angle_x", str(focal))
+    if lens["fl_y"] is not None and not lens["fl_y"] > 0:
+        raise wrong_camera(where, "a positive focal length fl_y", str(lens["fl_y"]))
     center = [size[k] / 2 if lens[name] is None else lens[name] for k, name in enumerate(("cx", "cy"))]
     inner = (float(focal), float(lens["fl_y"] or focal), *map(float, center))
     radial = [float(lens[name] or 0.0) for name in ("k1", "k2", "p1", "p2", "k3")]
@@ -153,6 +155,8 @@ def _metashape(path: Path) -> dict[str, PosedCamera]:
             if Path(label).suffix.lower() in (".jpg", ".jpeg", ".png", ".tif", ".tiff")
             else label
         )
+        if stem in found:
+            raise wrong_camera(where, f"one camera called {stem}", "two")
         numbers = finite_numbers(where, _numbers(text), ((16,),)).reshape(4, 4)
         found[stem] = _camera(where, *_lens_of(where, sensor), numbers)
     return found
@@ -174,10 +178,10 @@ def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[float, ...
     value = dict(
         zip(names, finite_numbers(where, [_one(best.findtext(n)) for n in names], ((11,),)), strict=True)
     )
-    width, height = (int(_one(resolution.get(side)) or 0) for side in ("width", "height"))
-    if not (0 < width < 1e5 and 0 < height < 1e5 and value["f"] > 0):
+    width, height = (_one(resolution.get(side)) for side in ("width", "height"))
+    if not (1 <= width < 1e5 and 1 <= height < 1e5 and value["f"] > 0):
         raise wrong_camera(
-            where, "a size and a positive focal length", f"{width}x{height}, f = {value['f']:g}"
+            where, "a size and a positive focal length", f"{width:g}x{height:g}, f = {value['f']:g}"
         )
     if value["k4"] or abs(value["b2"]) > 1e-3 * value["f"]:
         raise wrong_camera(
@@ -186,13 +190,18 @@ def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[float, ...
     inner = (value["f"] + value["b1"], value["f"], width / 2 + value["cx"], height / 2 + value["cy"])
     # Metashape's p1 bends along x, OpenCV's p2 does.
     radial = [value[name] for name in ("k1", "k2", "p2", "p1", "k3")]
-    return (width, height), tuple(float(number) for number in inner), [float(number) for number in radial]
+    return (
+        (int(width), int(height)),
+        tuple(float(number) for number in inner),
+        [float(number) for number in radial],
+    )
 
 
 def _parsed(path: Path) -> ElementTree.Element:
-    data = read_file(path)
+    data = read_file(path, largest=_LARGEST_XML)
     found = "something else"
-    if len(data) <= _LARGEST_XML and b"<!ENTITY" not in data and b"<!DOCTYPE" not in data:
+    # In UTF-16, entities would hide from this search.
+    if b"\0" not in data and b"<!ENTITY" not in data and b"<!DOCTYPE" not in data:
         try:
             return ElementTree.fromstring(data)
         except (ElementTree.ParseError, ValueError, LookupError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from polarguide.capture.ground_truth import read_ground_truth
 from polarguide.capture.layout import Layout
 from polarguide.capture.view import ANGLES, GroundTruth, View
 from polarguide.errors import PolarguideError
+from polarguide.files import LARGEST_FILE
+from polarguide.records import LARGEST_RECORD
 
 
 class Files:
@@ -30,15 +33,16 @@ class Files:
     def __init__(self) -> None:
         self.digests: dict[Path, str] = {}
 
-    def read(self, path: Path) -> bytes:
-        """The bytes of a file."""
-        data = read_file(path)
+    def read(self, path: Path, largest: int = LARGEST_FILE) -> bytes:
+        """The bytes of a file of up to ``largest``."""
+        data = read_file(path, largest=largest)
         self.digests[path] = hashlib.sha256(data).hexdigest()
         return data
 
     def read_if_there(self, path: Path) -> bytes | None:
-        """The bytes of a file, or None if there is no such file."""
-        return self.read(path) if os.path.lexists(path) else None  # a link to nowhere is no absence
+        """The bytes of a JSON file, or None if there is no such file."""
+        there = os.path.lexists(path)  # a link to nowhere is no absence
+        return self.read(path, LARGEST_RECORD) if there else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,12 +133,36 @@ def _read_angles(files: Files, paths: dict[int, Path]) -> list[NDArray[Any]]:
         path = paths[angle]
         data = files.read(path)
         if pictures:
-            _require_stated_alike(path, data, paths[0], pictures[0])
+            require_size(path, data, pictures[0].shape[:2], like=paths[0])
         picture = decode_picture(path, data)
         if pictures:
             require_alike(path, picture, paths[0], pictures[0])
         pictures.append(picture)
     return pictures
+
+
+def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | None = None) -> None:
+    """Check the size that a picture file states, height and width, before memory is taken to decode it.
+
+    Raises:
+        PolarguideError: it states another one.
+    """
+    stated = declared_size(data)
+    if stated is not None:
+        _require_same(path, stated, size, like)
+
+
+def _require_same(path: Path, found: tuple[int, int], size: Sequence[int], like: Path | None = None) -> None:
+    if found != (size[1], size[0]):
+        alike = "the size of the pictures" if like is None else f"the size of {'/'.join(like.parts[-2:])}"
+        raise PolarguideError(
+            path,
+            expected=f"{alike}, {size[1]}x{size[0]}",
+            found=f"{found[0]}x{found[1]}",
+            remedy="Make it anew for these pictures."
+            if like is None
+            else "Export the four pictures of a view alike.",
+        )
 
 
 def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: NDArray[Any]) -> None:
@@ -152,38 +180,12 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
         )
 
 
-def _require_stated_alike(path: Path, data: bytes, first_path: Path, first: NDArray[Any]) -> None:
-    """As ``require_alike``, of a larger picture, by its header: it is not decoded to say so."""
-    stated = _larger(data, first.shape)
-    if stated:
-        raise PolarguideError(
-            path,
-            expected=f"{_kind(first)} like {'/'.join(first_path.parts[-2:])}",
-            found=stated,
-            remedy="Export the four pictures of a view alike.",
-        )
-
-
-def _larger(data: bytes, shape: tuple[int, ...]) -> str:
-    """The size of a picture in words if its header states more pixels than an array has, else nothing."""
-    width, height = declared_size(data) or (0, 0)
-    return f"{width}x{height}" if width * height > shape[0] * shape[1] else ""
-
-
 def _read_mask(files: Files, path: Path, size: tuple[int, int], *, any_value: bool) -> NDArray[np.bool_]:
     data = files.read(path)
-    found = _larger(data, size)
-    if not found:
-        mask = decode_mask(path, data, any_value=any_value)
-        if mask.shape == size:
-            return mask
-        found = f"{mask.shape[1]}x{mask.shape[0]}"
-    raise PolarguideError(
-        path,
-        expected=f"the size of the pictures, {size[1]}x{size[0]}",
-        found=found,
-        remedy="Make the mask for these pictures.",
-    )
+    require_size(path, data, size)
+    mask = decode_mask(path, data, any_value=any_value)
+    _require_same(path, (mask.shape[1], mask.shape[0]), size)  # of a format whose header says nothing
+    return mask
 
 
 def _kind(picture: NDArray[Any]) -> str:

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from polarguide import __version__
-from polarguide.cli.console import warnings_printed
+from polarguide.cli.console import printable, warnings_printed
 from polarguide.errors import PolarguideError
 
 VERBS = {
@@ -72,7 +72,7 @@ def run(arguments: Sequence[str]) -> int:
             _call(verb, arguments)
     except PolarguideError as error:
         errors.print("[bold red]error:[/] ", end="")
-        errors.print(_as_flag(error, verb), markup=False)
+        errors.print(printable(_as_flag(error, verb)), markup=False)
         return 2
     except KeyboardInterrupt:
         errors.print("stopped.")
@@ -82,7 +82,10 @@ def run(arguments: Sequence[str]) -> int:
         return 1
     except OSError as error:  # missing rights, a full disk, a file where a folder should be
         errors.print("[bold red]error:[/] ", end="")
-        errors.print(f"{error.filename or 'files'}: {error.strerror or error}.", markup=False)
+        said = (
+            f"{error.filename or 'files'}: expected to read or write there, found {error.strerror or error}."
+        )
+        errors.print(printable(f"{said} Check the name, the rights, and the room on the disk."), markup=False)
         return 2
     return 0
 

@@ -17,10 +17,24 @@ from polarguide.system import process_rank
 console = Console(highlight=False, soft_wrap=True, quiet=process_rank() > 0)
 
 
+def printable(text: str, *, lines: bool = False) -> str:
+    """A text with escapes in place of what a terminal would obey: names in it come from files.
+
+    Args:
+        lines: whether it may have several lines.
+    """
+    return "".join(
+        sign
+        if sign.isprintable() or (lines and sign == "\n")
+        else sign.encode("unicode_escape", "backslashreplace").decode("ascii")
+        for sign in text
+    )
+
+
 def warn(text: object) -> None:
-    """Print a warning; names in it are shown as they are."""
+    """Print a warning; names in it are shown as they are, but for control characters."""
     console.print("[yellow]warning:[/] ", end="")
-    console.print(str(text), markup=False)
+    console.print(printable(str(text)), markup=False)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
-from polarguide.cli.console import console, warn
+from polarguide.cli.console import console, printable, warn
 from polarguide.progress import Advance, Reporter
 
 LINE_SECONDS = 15.0
@@ -79,7 +79,7 @@ class ConsoleReporter(Reporter):
 
     def say(self, text: str) -> None:
         """Print a finding; brackets in it are shown as they are."""
-        console.print(text, markup=False)
+        console.print(printable(text, lines=True), markup=False)
 
     def warn(self, text: str) -> None:
         """Print a warning."""
@@ -88,6 +88,7 @@ class ConsoleReporter(Reporter):
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
         """A progress bar, or lines where there is no terminal."""
+        label = printable(label)
         if not console.is_terminal:
             with lines(label, total) as tell:
                 yield tell

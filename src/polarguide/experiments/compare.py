@@ -17,7 +17,7 @@ from polarguide.experiments.report import write_report
 from polarguide.experiments.results import Results
 from polarguide.experiments.study import write_study
 from polarguide.experiments.worker import Scoring, Task, Training
-from polarguide.files import make_folder, write_text
+from polarguide.files import make_folder, require_inside, write_text
 from polarguide.options import ComputeOptions, PathLike, check_choice, check_count
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
@@ -83,6 +83,7 @@ def compare(
     entries = scene_entries(comparison, reporter)
     plan = plan_runs(comparison, entries)
     make_folder(comparison.out)
+    require_inside(comparison.out, *(run.folder for run in plan))
     with locked(comparison.out):
         failures = _train(comparison, entries, plan, reporter)
         if options.speed:

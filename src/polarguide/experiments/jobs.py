@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -12,9 +11,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+import msgspec
 
 from polarguide.experiments.worker import COMMAND, Task, Training, encoded
+from polarguide.files import make_folder
 from polarguide.progress import Advance, Reporter
 from polarguide.runs.folder import LOG
 
@@ -41,8 +43,8 @@ class Job:
 
     def step(self) -> int:
         """How many steps of the training are done, as its log says."""
-        line = last_line(self.folder / LOG)
-        return min(self.steps, int(line["step"]) + 1) if line and "step" in line else 0
+        row = last_row(self.folder / LOG)
+        return 0 if row is None else min(self.steps, row.step + 1)
 
 
 class Child:
@@ -51,13 +53,14 @@ class Child:
     def __init__(self, job: Job, advance: Advance, command: Sequence[str]) -> None:
         self.job, self._advance, self._command = job, advance, command
         self._waiting = deque(job.tasks)
-        job.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(job.folder)
         self._errors = job.folder / STDERR
         self._start_next()
 
     def _start_next(self) -> None:
         self._task = self._waiting.popleft()
-        with open(self._errors, "wb") as errors:
+        self._errors.unlink(missing_ok=True)  # a link or a pipe, perhaps, in a folder that somebody else made
+        with open(self._errors, "xb") as errors:
             self._process = subprocess.Popen(
                 self._command,
                 stdin=subprocess.PIPE,
@@ -97,10 +100,9 @@ class Child:
     def report(self) -> None:
         """Pass on how far it is."""
         note = "" if isinstance(self._task, Training) else "scoring"
-        line = last_line(self.job.folder / LOG) or {}
-        psnr, count = line.get("psnr"), line.get("gaussians")
-        if not note and psnr is not None and count is not None:
-            note = f"PSNR {psnr:.1f} dB  {count:,} Gaussians"
+        row = last_row(self.job.folder / LOG)
+        if not note and row is not None and row.psnr is not None and row.gaussians is not None:
+            note = f"PSNR {row.psnr:.1f} dB  {row.gaussians:,} Gaussians"
         self._advance(self.job.step(), note=note)
 
     def interrupt(self) -> None:
@@ -202,19 +204,28 @@ def _stop(children: Sequence[Child]) -> None:
             child.kill()
 
 
-def last_line(log: Path) -> dict[str, Any] | None:
+class _Row(msgspec.Struct):
+    """A line of a log, as far as progress shows it."""
+
+    step: Annotated[int, msgspec.Meta(ge=0)]
+    psnr: float | None = None
+    gaussians: int | None = None
+
+
+_ROWS = msgspec.json.Decoder(_Row)
+
+
+def last_row(log: Path) -> _Row | None:
     """The last whole line of a log, or None where there is none yet."""
     try:
+        if not log.is_file():  # a pipe would never end
+            return None
         with open(log, "rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
-            lines = file.read().split(b"\n")
+            lines = file.read(TAIL_BYTES).split(b"\n")
     except OSError:
         return None
     for line in reversed(lines):
-        try:
-            values = json.loads(line)
-        except ValueError:  # empty, half written, or cut by the seek
-            continue
-        if isinstance(values, dict):
-            return values
+        with contextlib.suppress(ValueError, RecursionError):  # empty, half written, or cut by the seek
+            return _ROWS.decode(line)
     return None

@@ -21,7 +21,7 @@ from polarguide.export.points import surface_points, write_points
 from polarguide.export.share import share_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
-from polarguide.files import make_folder, temporary_folder, write_text
+from polarguide.files import make_folder, require_inside, temporary_folder, write_text
 from polarguide.options import ExportFormat, PathLike, check_choice, check_range
 from polarguide.presentation import balanced
 from polarguide.progress import SILENT, Reporter
@@ -66,6 +66,8 @@ def export(
         PolarguideError: an optional package is missing, or the recipe has nothing of this kind.
     """
     folder = run.folder / "export" if out is None else Path(out)
+    if out is None:
+        require_inside(run.folder, folder)
     writers: dict[str, Callable[[], list[Path]]] = {
         "ply": lambda: [_ply(run, shown, folder / "splats.ply")],
         "spz": lambda: [_spz(run, shown, folder / "splats.spz", spz_version)],
@@ -244,6 +246,7 @@ def _environment(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
 
 def _cameras(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
     scene, placement = run.scene, shown.placement
+    require_inside(folder, folder / "sparse" / "0")
     cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     points = placement.points(scene.points)
     write_colmap(folder / "sparse" / "0", cameras, points, scene.point_colors, comments=shown.comments)

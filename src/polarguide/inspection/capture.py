@@ -21,6 +21,7 @@ from polarguide.capture.metadata import applied_calibration, refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
 from polarguide.progress import SILENT, Reporter
+from polarguide.records import LARGEST_RECORD
 
 LONGEST = 640
 """Pixels of the longer side that pictures are averaged down to (by whole factors)."""
@@ -117,7 +118,7 @@ def read_capture(
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
-    said = read_file(metadata) if metadata.exists() else None
+    said = read_file(metadata, largest=LARGEST_RECORD) if metadata.exists() else None
     factor = downscale or _fitting_factor(layout, names[0])
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())

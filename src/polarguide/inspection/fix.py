@@ -122,7 +122,10 @@ def _require_inside(root: Path, source: Path) -> None:
     """
     whole = root.resolve()
     for path in (source, *(source.rglob("*") if source.is_dir() else ())):
-        if path.exists() and not path.resolve().is_relative_to(whole):
+        leaves = path.exists() and not path.resolve().is_relative_to(whole)
+        if leaves or (
+            path != source and path.is_symlink() and path.is_dir()
+        ):  # such links may lead in a circle
             raise PolarguideError(
                 path,
                 expected="a file of the scene",
@@ -159,5 +162,6 @@ def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
         **change.record(),
         "scale": 1.0 / change.peak,
     }
-    content["corrections"] = [*content.get("corrections", []), note]
+    before = content.get("corrections", [])
+    content["corrections"] = [*(before if isinstance(before, list) else []), note]
     return to_json(content)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
-from polarguide.files import check_out
+from polarguide.files import check_out, require_inside
 from polarguide.inspection.analyzers import analyzer_check, corrected
 from polarguide.inspection.angle_checks import (
     AngleFindings,
@@ -71,8 +71,10 @@ def inspection_folder(scene: Path, out: Path | None = None) -> Path:
     Raises:
         PolarguideError: there is a file of this name.
     """
-    folder = out if out is not None else scene.resolve().with_name(scene.resolve().name + "-inspection")
+    beside = scene.resolve().with_name(scene.resolve().name + "-inspection")
+    folder = beside if out is None else out
     check_out(folder)
+    require_inside(beside.parent if out is None else folder, folder, folder / RUN_FOLDER)
     return folder
 
 

@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,6 +21,7 @@ from polarguide.files import write_text
 from polarguide.inspection.surfaces import Surface
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
+from polarguide.records import read_record
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.shading.gbuffer import render
 from polarguide.training.losses import depth_normals
@@ -94,8 +96,8 @@ def short_run(
 def _same(folder: Path, wanted: dict[str, object]) -> bool:
     """Whether the folder holds a readable state of the same training."""
     try:
-        return bool(json.loads((folder / KEY).read_text()) == wanted) and (folder / CHECKPOINT).exists()
-    except (OSError, ValueError):
+        return read_record(folder / KEY, dict[str, Any]) == wanted and (folder / CHECKPOINT).exists()
+    except PolarguideError:
         return False
 
 

@@ -22,6 +22,7 @@ from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
+from polarguide.capture.memory import require_memory, stated_size
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings, white_gains
@@ -29,6 +30,8 @@ from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 _JUDGED_VIEWS = 8
+_WORKED = 4 * 3 * (2 + 2 + 4 + 4 + 4)
+"""Bytes for each pixel of four shots: as stored and stacked, linear, aligned, turned."""
 
 
 class FilterSource(Source):
@@ -62,8 +65,21 @@ class FilterSource(Source):
                 remedy="Omit it.",
             )
 
+    def _require_memory(self) -> None:
+        """Refuse shots that do not fit into memory, from their headers alone.
+
+        Raises:
+            PolarguideError: the largest is too large.
+        """
+        sizes = {path: stated_size(path) or (0, 0) for path in self.paths}
+        path = max(sizes, key=lambda path: sizes[path][0] * sizes[path][1])
+        width, height = sizes[path]
+        remedy = "Make the pictures smaller, all by the same factor."
+        require_memory(path, _WORKED * width * height, f"four shots of {width}x{height}", remedy=remedy)
+
     def measure(self, advance: Advance) -> dict[str, Any]:
         """The transfer of the capture, from a few views spread over it."""
+        self._require_memory()
         asked = self._settings
         notes: list[str] = []
         transfer: str = asked.transfer

@@ -19,12 +19,13 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import ANGLES
 from polarguide.capture.write import intensity_codes, picture_name, write_view
 from polarguide.errors import PolarguideError
-from polarguide.files import check_out, holds_files, make_folder, write_whole
+from polarguide.files import check_out, holds_files, make_folder, require_inside, write_whole
 from polarguide.records import decode, read_record, shortened, to_json
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
 SFM = ".sfm"
+PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
 """What is written into."""
 REMEDY = "Give another --out; nothing was written."
@@ -130,14 +131,8 @@ class SceneFolder:
 
     def start(self) -> None:
         """Create the folder and take note of the request."""
-        for name in (*FOLDERS, SFM):
-            if (self.root / name).is_symlink():
-                raise PolarguideError(
-                    self.root / name,
-                    expected="a folder in the scene",
-                    found="a link to another place",
-                    remedy="Remove the link, or give another --out; nothing was written.",
-                )
+        work = self.root / SFM
+        require_inside(self.root, *(self.root / name for name in (*FOLDERS, PARTIAL, SFM)), *work.rglob("*"))
         make_folder(self.root)
         self.save()  # first: without it nobody could go on with the folder
         make_folder(self.root / "polar")

@@ -18,7 +18,7 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
-from polarguide.preparation.folder import JOURNAL, SCENE, SFM, SceneFolder
+from polarguide.preparation.folder import JOURNAL, PARTIAL, SCENE, SFM, SceneFolder
 from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
@@ -27,7 +27,6 @@ from polarguide.progress import Reporter
 
 MOSTLY = 0.5
 """Share of saturated pixels from which on a view is warned of."""
-_PARTIAL = ".sparse.partial"
 _NOTES = 4
 """Notes on single views that are printed; sixty alike hide what matters."""
 
@@ -203,7 +202,7 @@ def _write_view(
 
 def _write_model(folder: SceneFolder, poses: Poses) -> None:
     """Put the model into place in one step, after reading it back."""
-    partial, final = folder.root / _PARTIAL, folder.root / "sparse"
+    partial, final = folder.root / PARTIAL, folder.root / "sparse"
     for old in (partial, final):
         shutil.rmtree(old, ignore_errors=True)
     make_folder(partial / "sparse" / "0")

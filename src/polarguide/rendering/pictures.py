@@ -11,7 +11,7 @@ from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, make_folder, write_whole
+from polarguide.files import atomic, make_folder, require_inside, write_whole
 from polarguide.options import PathLike, PictureFormat, check_choice
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
@@ -78,6 +78,8 @@ def write_pictures(
         PolarguideError: there is no such view or layer.
     """
     folder = run.folder / "render" if out is None else Path(out)
+    if out is None:
+        require_inside(run.folder, folder)
     names = checked_layers(list(run.layers if layers is None else layers))
     chosen = select_views(run.scene, views)
     make_folder(folder)

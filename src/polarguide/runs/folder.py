@@ -29,7 +29,7 @@ from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.files import atomic, make_folder, read_file, require_file, write_text, writing
 from polarguide.options import Transfer
-from polarguide.records import decode
+from polarguide.records import LARGEST_RECORD, decode
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
@@ -101,7 +101,7 @@ class RunConfiguration:
                 remedy="Give the folder that a training wrote.",
             )
         remedy = "Restore the file, or train again into a new folder."
-        data = read_file(path, remedy=remedy)
+        data = read_file(path, largest=LARGEST_RECORD, remedy=remedy)
         written = decode(data, _Written, path, remedy=remedy).version
         if _series(written) != _series(__version__):
             raise PolarguideError(
@@ -231,9 +231,10 @@ class RunLog:
         if not os.path.lexists(self._path):
             return []
         found = []
-        for line in read_file(self._path, remedy="Remove it: a training needs none.").split(b"\n"):
-            with contextlib.suppress(PolarguideError):
-                row: dict[str, Any] = msgspec.to_builtins(decode(line, _Row, self._path))
+        remedy = "Remove it: a training needs none."
+        for line in read_file(self._path, largest=LARGEST_RECORD, remedy=remedy).split(b"\n"):
+            with contextlib.suppress(ValueError, RecursionError):  # msgspec's are ValueErrors
+                row: dict[str, Any] = msgspec.to_builtins(_ROWS.decode(line))
                 found.append((line.decode(), row))
         return found
 
@@ -250,3 +251,6 @@ class _Row(msgspec.Struct):
     seconds: Annotated[float, msgspec.Meta(ge=0)] = 0.0
     alone: bool = True
     psnr: float | None = None
+
+
+_ROWS = msgspec.json.Decoder(_Row)

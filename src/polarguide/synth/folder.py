@@ -78,7 +78,8 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
 def _difference(before: Any, now: Any, place: str = "") -> str:
     """Where two JSON values differ first, in words."""
     if isinstance(before, dict) and isinstance(now, dict):
-        pairs = [(f"{place}.{key}", before.get(key), now.get(key)) for key in {**now, **before}]
+        none = "nothing"
+        pairs = [(f"{place}.{key}", before.get(key, none), now.get(key, none)) for key in {**now, **before}]
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         pairs = [(f"{place}[{k}]", *both) for k, both in enumerate(zip(before, now, strict=True))]
     else:

@@ -6,14 +6,17 @@ The list leaves out ``scene.json``, which holds the digest of the list: one dige
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from polarguide.errors import PolarguideError
+from polarguide.files import read_file
+from polarguide.records import read_record
 from polarguide.synth.folder import write_file
 
 MANIFEST = "checksums.txt"
+_REMEDY = "Remove the folder to render the scene again, or give another --out."
 _FOLDERS = ("gt", "mesh", "polar", "raw", "sparse")
 _FILES = ("calibration.json", "environment.hdr", "request.json", "sheet.jpg", "split.json")
 
@@ -32,15 +35,14 @@ def verify_scene(out: Path) -> str:
     Raises:
         PolarguideError: a file is missing or has changed, or the list has.
     """
-    try:
-        data = (out / MANIFEST).read_bytes()
-    except OSError:
-        data = b""
+    data = read_file(out / MANIFEST, remedy=_REMEDY)
     if hashlib.sha256(data).hexdigest() != scene_digest(out):
         raise _changed(out / MANIFEST, "the list of checksums whose digest scene.json names")
-    for line in data.decode().splitlines():
+    for line in data.decode(errors="replace").splitlines():
         expected, _, name = line.partition("  ")
         path = out / name
+        if not path.resolve().is_relative_to(out.resolve()):
+            raise _changed(out / MANIFEST, "a list of files of this scene")
         if not path.is_file() or _digest(path) != expected:
             raise _changed(path, f"the file that {MANIFEST} lists")
     return scene_digest(out)
@@ -48,7 +50,7 @@ def verify_scene(out: Path) -> str:
 
 def scene_digest(out: Path) -> str:
     """The digest in ``scene.json``, or an empty string."""
-    return str(json.loads((out / "scene.json").read_text(encoding="utf-8")).get("sha256", ""))
+    return str(read_record(out / "scene.json", dict[str, Any], remedy=_REMEDY).get("sha256", ""))
 
 
 def _written(out: Path) -> Iterator[Path]:
@@ -59,7 +61,7 @@ def _written(out: Path) -> Iterator[Path]:
 
 
 def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(read_file(path, remedy=_REMEDY)).hexdigest()
 
 
 def _changed(path: Path, expected: str) -> PolarguideError:
@@ -67,5 +69,5 @@ def _changed(path: Path, expected: str) -> PolarguideError:
         path,
         expected=expected,
         found="another" if path.is_file() else "no file",
-        remedy="Remove the folder to render the scene again, or give another --out.",
+        remedy=_REMEDY,
     )

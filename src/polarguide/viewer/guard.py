@@ -22,8 +22,14 @@ MOST_BROWSERS = 32
 MESSAGES_PER_SECOND = 200.0
 BURST = 400.0  # messages
 SENDING_SECONDS = 30.0  # a browser that takes nothing for so long is let go
+# viser's page goes to whatever server the address names (?websocket=, ?playbackPath=), and does what that one says, in
+# the name of this one: it may talk to nobody but where it came from. Not every browser takes 'self' for sockets, too.
+POLICY = (
+    "frame-ancestors 'self'; connect-src 'self' ws://{host} wss://{host} blob: data:; object-src 'none'; "
+    "base-uri 'none'; form-action 'none'"
+)
 HEADERS = {
-    "Content-Security-Policy": "frame-ancestors 'self'",
+    "Cross-Origin-Opener-Policy": "same-origin",
     "X-Frame-Options": "SAMEORIGIN",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -83,6 +89,8 @@ def _gated(process: Any, gate: Gate) -> Callable[[Any, Any], Any]:
         if response is not None:
             for name, value in HEADERS.items():
                 response.headers[name] = value
+            # The gate lets no Host pass but an address or a known name, and its port.
+            response.headers["Content-Security-Policy"] = POLICY.format(host=request.headers["Host"])
         return response
 
     return answer

@@ -54,13 +54,16 @@ def open_phygap(root: Path) -> Dataset:
     poses = arrays["extrinsics"]
     if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)):
         raise not_as_published(f"{path} (extrinsics)", "matrices N x 4 x 4", array_size(poses))
-    size = (int(arrays["image_width"]), int(arrays["image_height"]))
-    cameras = {
-        number: pinhole_camera(
-            size, inner, *checked_pose(f"{path} (extrinsics {number})", np.asarray(pose, float))
-        )
-        for number, pose in enumerate(poses)
-    }
+    sides = [finite_numbers(f"{path} ({key})", arrays[key], ((),)) for key in ("image_width", "image_height")]
+    if not all(1 <= side <= 1e5 for side in sides):
+        found = " and ".join(f"{float(side):g}" for side in sides)
+        raise not_as_published(f"{path} (image_width, image_height)", "a size in pixels", found)
+    size = (int(sides[0]), int(sides[1]))
+    cameras = {}
+    for number, pose in enumerate(poses):
+        where = f"{path} (extrinsics {number})"
+        rigid = checked_pose(where, finite_numbers(where, pose, ((3, 4), (4, 4))))
+        cameras[number] = pinhole_camera(size, inner, *rigid)
 
     def read_stokes(view: str) -> StokesImage:
         s0, s1, s2 = read_exr_channels(files[view], _CHANNELS)

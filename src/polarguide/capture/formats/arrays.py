@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,12 @@ from polarguide.capture.formats.pictures import read_file
 from polarguide.errors import PolarguideError
 
 _LARGEST_HEADER = 1 << 16
-_BROKEN = (ValueError, EOFError, OSError, MemoryError, SyntaxError)
+BROKEN = (
+    *(ValueError, TypeError, EOFError, OSError, MemoryError, SyntaxError, RuntimeError),
+    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
+"""What decoding raises for files that are damaged, encrypted, or lie; NumPy parses headers as Python."""
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _LARGEST_ARCHIVE = 1 << 26
 """Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
 
@@ -45,7 +52,7 @@ def read_array(path: Path) -> NDArray[Any]:
     data = read_file(path)
     try:
         return _array(data)
-    except _BROKEN as error:
+    except BROKEN as error:
         found = "an empty file" if not data else f"{len(data)} bytes that are none"
         raise damaged(path, "a complete .npy file of numbers", found) from error
 
@@ -62,11 +69,14 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             size = sum(entry.file_size for entry in archive.infolist())
             if size > _LARGEST_ARCHIVE:
                 raise ValueError(f"an archive that unfolds to {size} bytes")
-            return {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
-    except (*_BROKEN, RuntimeError) as error:
-        found = f"a damaged one ({error})"
+            return {
+                entry.filename.removesuffix(".npy"): _array(_member(archive, entry))
+                for entry in archive.infolist()
+            }
     except zipfile.BadZipFile as error:
         found = "an empty file" if not data else f"one that cannot be unpacked ({error})"
+    except BROKEN as error:
+        found = f"a damaged one ({error})"
     raise damaged(path, "a complete .npz file of numbers", found)
 
 
@@ -77,8 +87,7 @@ def unpacked(data: bytes, names: Collection[str], largest: int) -> dict[str, NDA
         data: the whole file. names: of the arrays. largest: bytes that any of them may take.
 
     Raises:
-        ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, NotImplementedError: it is damaged,
-            encrypted, or one of them is larger or holds no numbers.
+        One of ``BROKEN``: it is damaged, encrypted, or one of them is larger or holds no numbers.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         found = {}
@@ -87,8 +96,20 @@ def unpacked(data: bytes, names: Collection[str], largest: int) -> dict[str, NDA
             if name in names and entry.filename.endswith(".npy"):
                 if entry.file_size > largest + _LARGEST_HEADER:
                     raise ValueError(f"{name} of {entry.file_size} bytes")
-                found[name] = _array(archive.read(entry), "biufcSU")
+                found[name] = _array(_member(archive, entry), "biufcSU")
         return found
+
+
+def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
+    """A member of an archive. It may unfold to more than it says, so no more than that is ever unfolded.
+
+    Raises:
+        One of ``BROKEN``: it is damaged, or packed otherwise than NumPy packs: others unfold without a bound.
+    """
+    if entry.compress_type not in _METHODS:
+        raise ValueError(f"{entry.filename} is packed in a way that NumPy does not use")
+    with archive.open(entry) as packed:
+        return packed.read(entry.file_size)
 
 
 def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:

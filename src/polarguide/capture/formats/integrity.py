@@ -19,7 +19,12 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _TIFF_CODES = {1: "B", 3: "H", 4: "I"}
+_TIFF = (b"II*\0", b"MM\0*")
 _BIG_TIFF = (b"II+\0", b"MM\0+")
+# Marks without a length: one that nobody uses, and restarts.
+_JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
+_MOST_SCANS = 200
+"""Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not."""
 _TIFF_STRIPS = ((273, 279), (324, 325))
 
 
@@ -42,21 +47,23 @@ def find_damage(data: bytes) -> str | None:
     if data.startswith(_PNG_SIGNATURE):
         return _png_damage(data)
     if data.startswith(b"\xff\xd8"):
-        return None if _jpeg_is_complete(data) else f"a JPEG file cut short (it ends after {len(data)} bytes)"
-    if data[:4] in (b"II*\0", b"MM\0*"):
-        return None if _tiff_is_complete(data) else f"a TIFF file cut short (it ends after {len(data)} bytes)"
+        return _jpeg_damage(data)
+    if data[:4] in _TIFF:
+        if not _tiff_is_complete(data):
+            return f"a TIFF file cut short (it ends after {len(data)} bytes)"
+        return None if _tiff_size(data) is not None else "a TIFF file without one plain size"
     if data[:4] in _BIG_TIFF:  # the decoder finds what is cut short
-        return None if declared_size(data) is not None else "a BigTIFF file without a size"
+        return None if declared_size(data) is not None else "a BigTIFF file without one plain size"
     return "a file that is none of these"
 
 
 def declared_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header of an intact PNG, JPEG or TIFF file, or None."""
+    """Width and height in the header of a PNG, JPEG or TIFF file; None where decoders might see others, or none."""
     if data.startswith(_PNG_SIGNATURE):
-        return struct.unpack_from(">II", data, 16) if len(data) >= 24 else None
+        return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
-    if data[:4] in (b"II*\0", b"MM\0*"):
+    if data[:4] in _TIFF:
         return _tiff_size(data)
     if data[:4] in _BIG_TIFF:
         return _big_tiff_size(data)
@@ -78,6 +85,9 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
         if data[at + 1] == 0xFF:  # fill byte
             at += 1
+            continue
+        if data[at + 1] in _JPEG_ALONE:
+            at += 2
             continue
         end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         yield data[at + 1], data[at + 4 : end]
@@ -112,11 +122,18 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    found = {}
-    for tag, kind, _, at in tiff_entries(data):
-        if tag in (256, 257) and kind in (3, 4):
-            (found[tag],) = struct.unpack_from(tiff_order(data) + _TIFF_CODES[kind], data, at)
-    return (found[256], found[257]) if len(found) == 2 else None
+    """The same of a TIFF file; None where a side has another type than usual or stands there twice."""
+    try:
+        sides = [entry for entry in tiff_entries(data) if entry[0] in (256, 257)]
+        if sorted(tag for tag, *_ in sides) != [256, 257] or any(kind not in (3, 4) for _, kind, *_ in sides):
+            return None
+        order = tiff_order(data)
+        found = {
+            tag: struct.unpack_from(order + _TIFF_CODES[kind], data, at)[0] for tag, kind, _, at in sides
+        }
+    except struct.error:
+        return None
+    return found[256], found[257]
 
 
 def _big_tiff_size(data: bytes) -> tuple[int, int] | None:
@@ -127,7 +144,9 @@ def _big_tiff_size(data: bytes) -> tuple[int, int] | None:
         (count,) = struct.unpack_from(order + "Q", data, start)
         for entry in range(start + 8, start + 8 + 20 * min(count, 4096), 20):
             tag, kind = struct.unpack_from(order + "HH", data, entry)
-            if tag in (256, 257) and kind in (3, 4, 16):
+            if tag in (256, 257) and (tag in found or kind not in (3, 4, 16)):
+                return None
+            if tag in (256, 257):
                 (found[tag],) = struct.unpack_from(order + {**_TIFF_CODES, 16: "Q"}[kind], data, entry + 12)
     except (struct.error, OverflowError):
         return None
@@ -136,6 +155,8 @@ def _big_tiff_size(data: bytes) -> tuple[int, int] | None:
 
 def _png_damage(data: bytes) -> str | None:
     """Walk the chunks of a PNG file and check their checksums."""
+    if declared_size(data) is None and len(data) >= 24:
+        return "a PNG file that does not begin with its size"
     for kind, at, end in png_chunks(data):
         if end > len(data):
             break
@@ -147,25 +168,39 @@ def _png_damage(data: bytes) -> str | None:
     return f"a PNG file cut short (it ends after {len(data)} bytes)"
 
 
-def _jpeg_is_complete(data: bytes) -> bool:
+def _jpeg_damage(data: bytes) -> str | None:
     """Walk the segments of a JPEG file to its end-of-image mark."""
-    at = 2
+    scans = _jpeg_scans(data)
+    if scans is None:
+        return f"a JPEG file cut short (it ends after {len(data)} bytes)"
+    if scans > _MOST_SCANS:
+        return f"a JPEG file of {scans} scans"
+    return None if _jpeg_size(data) is not None else "a JPEG file without a size"
+
+
+def _jpeg_scans(data: bytes) -> int | None:
+    """How many scans a JPEG file has; None if it has no end."""
+    at, scans = 2, 0
     while at + 4 <= len(data):
         if data[at] != 0xFF:
-            return False
+            return None
         kind = data[at + 1]
         if kind == 0xD9:
-            return True
+            return scans
         if kind == 0xFF:  # fill byte
             at += 1
             continue
+        if kind in _JPEG_ALONE:
+            at += 2
+            continue
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if kind == 0xDA:
+            scans += 1
             mark = _JPEG_SCAN_END.search(data, at)
             if mark is None:
-                return False
+                return None
             at = mark.start()
-    return data[at : at + 2] == b"\xff\xd9"
+    return scans if data[at : at + 2] == b"\xff\xd9" else None
 
 
 def _tiff_is_complete(data: bytes) -> bool:

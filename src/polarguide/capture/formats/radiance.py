@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from polarguide.capture.formats.integrity import damaged
 from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
 from polarguide.errors import PolarguideError, optional_import
 
-_HDR_SIZE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
+_HDR_SIZE = re.compile(rb"[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
+_EXR_MAGIC, _EXR_PARTS = b"\x76\x2f\x31\x01", 0x1000
 
 
 def read_radiance(path: Path) -> NDArray[np.float32]:
@@ -52,7 +54,8 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
 def _read_hdr(path: Path) -> NDArray[Any]:
     data = read_file(path)
     found = "an empty file" if not data else "a file that is none"
-    size = _HDR_SIZE.search(data[:4096])
+    # The size stands behind the first empty line; before it, anything may look like one.
+    size = _HDR_SIZE.match(data, data.find(b"\n\n", 0, 4096) + 2)
     pixels = None
     if data.startswith(b"#?") and size is not None:
         height, width = int(size[1]), int(size[2])
@@ -81,8 +84,9 @@ def _read_exr(path: Path, wanted: tuple[str, ...] | None = None) -> NDArray[Any]
     openexr = optional_import("OpenEXR", str(path), install="'polarguide[exr]'")
     found = "an empty file" if not data else "one that is damaged, cut short or something else"
     pixels = None
-    if data.startswith(b"\x76\x2f\x31\x01"):
+    if data.startswith(_EXR_MAGIC):
         try:
+            _require_exr_size(data)
             pixels = _exr_channels(path, openexr, wanted)
         except Exception as error:  # the binding raises whatever C++ threw
             found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
@@ -99,6 +103,32 @@ def read_exr_channels(path: Path, groups: Sequence[Sequence[str]]) -> list[NDArr
         PolarguideError: the file cannot be read, is damaged or lacks a channel, or the package OpenEXR is missing.
     """
     return [_read_exr(path, tuple(names)) for names in groups]
+
+
+def _require_exr_size(data: bytes) -> None:
+    """Look at the windows in the headers of an OpenEXR file before the package takes memory for them.
+
+    Raises:
+        ValueError, struct.error: one is larger than any picture, or there is none.
+    """
+    (version,) = struct.unpack_from("<I", data, 4)
+    at, found = 8, False
+    while data[at : at + 1] not in (b"\0", b""):
+        while data[at : at + 1] not in (b"\0", b""):
+            name = data.index(b"\0", at)
+            kind = data.index(b"\0", name + 1)
+            (size,) = struct.unpack_from("<I", data, kind + 1)
+            if data[at:name] == b"dataWindow":
+                left, top, right, bottom = struct.unpack_from("<4i", data, kind + 5)
+                width, height, found = right - left + 1, bottom - top + 1, True
+                if min(width, height) < 1 or width * height > LARGEST_PIXELS:
+                    raise ValueError(f"{width}x{height} pixels")
+            at = kind + 5 + size
+        at += 1
+        if not version & _EXR_PARTS:
+            break
+    if not found:
+        raise ValueError("no size")
 
 
 def _exr_channels(path: Path, package: Any, wanted: tuple[str, ...] | None) -> NDArray[Any] | None:
