@@ -45,7 +45,8 @@ def flip(
     if not counts.any():
         return None, "no pixel counts"
     encoded = [
-        torch.where(counts[..., None], shown(picture), 0.0).float().contiguous().numpy() for picture in (true, pred)
+        torch.where(counts[..., None], shown(picture), 0.0).float().contiguous().numpy()
+        for picture in (true, pred)
     ]
     errors, _, _ = package.evaluate(
         *encoded, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": PIXELS_PER_DEGREE}
