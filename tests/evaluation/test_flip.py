@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import convolve
-from skimage.color import lab2xyz, rgb2lab, rgb2xyz, xyz2lab
+from skimage.color import rgb2lab, rgb2xyz, xyz2lab
 
 from polarguide.color import shown
 from polarguide.evaluation import flip
@@ -14,7 +14,7 @@ from polarguide.evaluation.flip import PIXELS_PER_DEGREE
 
 pytest.importorskip("flip_evaluator")
 
-# Andersson et al. 2020, table 1 (contrast sensitivity of the three opponent channels: sums of two Gaussians), section 4.
+# Andersson et al. 2020: contrast sensitivity of the three opponent channels, sums of two Gaussians; features; colors.
 SENSITIVITY = ((1, 0.0047, 0, 1e-5), (1, 0.0053, 0, 1e-5), (34.1, 0.04, 13.5, 0.025))
 FEATURE_WIDTH, FEATURE_POWER = 0.082, 0.5
 COLOR_POWER, COLOR_SPLIT, SPLIT_VALUE = 0.7, 0.4, 0.95

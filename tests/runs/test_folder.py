@@ -258,20 +258,19 @@ def test_a_finished_run_keeps_no_state_of_the_optimizer(
 
     def names(run: Path) -> set[str]:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
-            return {part for key in file.keys() for part in key.split(".")}
+            keys = list(file.keys())
+        return {part for key in keys for part in key.split(".")}
 
     for keep in (False, True):
         out = tmp_path / str(keep)
         session = SessionOptions(keep_optimizer=keep, checkpoint_every=2)
+        stop = iter((False, False, True)).__next__
         with pytest.raises(TrainingStopped):
-            asked = iter((False, False, True))
             polarguide.train(
-                demo_scene, out, settings=settings, reading=reading, session=session, should_stop=lambda: next(asked)
+                demo_scene, out, settings=settings, reading=reading, session=session, should_stop=stop
             )
         assert "adam" in names(out)
-        polarguide.train(
-            demo_scene, out, settings=settings, reading=reading, session=session, resume=True
-        )
+        polarguide.train(demo_scene, out, settings=settings, reading=reading, session=session, resume=True)
         assert ("adam" in names(out)) == keep
     # It is as good as before for all that is done with it, and a further resume of what is finished does nothing.
     pictures = [polarguide.open_run(tmp_path / str(keep)).render("v000")["final"] for keep in (False, True)]
@@ -287,7 +286,11 @@ def test_more_steps_than_a_training_was_begun_with(demo_scene: Path, trained: Pa
     shutil.copytree(trained, tmp_path / "run")
     with pytest.raises(PolarguideError, match=r"\(steps\): expected 40, .*found 50\. .*into a new folder"):
         polarguide.train(
-            demo_scene, tmp_path / "run", settings=TrainSettings(50), reading=SceneOptions(downscale=4), resume=True
+            demo_scene,
+            tmp_path / "run",
+            settings=TrainSettings(50),
+            reading=SceneOptions(downscale=4),
+            resume=True,
         )
 
 

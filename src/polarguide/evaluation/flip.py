@@ -1,7 +1,7 @@
 """FLIP (Andersson et al. 2020): how different two pictures look when one takes the other's place on a display.
 
-Unlike LPIPS it needs no weights, only the package flip-evaluator, which has no wheels for some platforms. Without it the
-metric is None, with a reason that says so.
+Unlike LPIPS it needs no weights, only the package flip-evaluator, which has no wheels for some platforms. Without it
+the metric is None, with a reason that says so.
 """
 
 from __future__ import annotations
