@@ -147,12 +147,15 @@ class SessionOptions(VisitorOptions, ComputeOptions):
 
     Attributes:
         checkpoint_every: Steps between two checkpoints: a kill loses at most as many.
+        keep_optimizer: Keep the optimizer's state in the last checkpoint, which then is four times as large. Rendering,
+            scores and exports do without; only code of yours that trains on from it would want it.
         viewer: Look on in a browser while it trains (afterwards: polarguide view).
         viewer_host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
         viewer_port: To listen at; the next free one is taken if it is in use.
     """
 
     checkpoint_every: int = 500
+    keep_optimizer: bool = False
     viewer: bool = False
     viewer_host: str = LOOPBACK[0]
     viewer_port: int = 8080

@@ -18,6 +18,8 @@ from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_pict
 from polarguide.capture import load_scene
 from polarguide.capture.formats.integrity import find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
+from polarguide.capture.view import FULL_CODE
+from polarguide.capture.write import intensity_codes, rounding_of
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
 
@@ -74,6 +76,23 @@ def test_gray_pictures_become_three_equal_channels(capture: TinyCapture, bits: i
     torch.testing.assert_close(
         view.intensities(), gray.expand(-1, -1, -1, 3), atol=0.51 / (2**bits - 1), rtol=0
     )
+
+
+@pytest.mark.parametrize(("bits", "rounding"), [(8, 64), (10, 16), (12, 4), (14, 1), (16, 1)])
+def test_codes_are_rounded_to_less_than_a_fifth_of_a_step(bits: int, rounding: int) -> None:
+    step = FULL_CODE / (2**bits - 1)
+    assert rounding_of(step) == rounding
+    values = np.random.default_rng(1).random((4, 40, 50, 3), np.float32)
+    values[0, 0, :2] = 1.0
+    invalid = np.zeros((40, 50), bool)
+    invalid[0, 0] = True
+    codes = intensity_codes(values, invalid, rounding).astype(int)
+    kept = ~invalid
+    assert np.abs(codes - values * FULL_CODE)[:, kept].max() <= max(rounding / 2, 1) + 0.01
+    assert rounding == 1 or rounding / 2 < step / 5
+    assert not (codes[codes < FULL_CODE - 1] % rounding).any()
+    assert codes[:, kept].max() < FULL_CODE
+    assert (codes[0, 0, 0] == FULL_CODE).all()
 
 
 @pytest.mark.parametrize("bits", [8, 16])

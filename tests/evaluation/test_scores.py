@@ -289,13 +289,19 @@ def test_a_record_is_read_from_its_run(tmp_path, views):
 
 def test_shown_metrics_are_those_of_the_tables(views):
     means = scores.summarize(views) | {"fps": 12.5, "gaussians": 1000, "normal_within_11": 0.25}
+    means |= {"train_seconds_reason": "the log is gone", "depth_error_median_percent": None}
     lines = table.shown_metrics(means)
-    assert [label for label, _ in lines] == [m.label for m in table.METRICS if m.shown == "tables"]
+    hidden = table.absent_metrics(means)
+    assert hidden == ["depth error", "mesh F-score 1 %"]
+    assert [label for label, _ in lines] == [
+        m.label for m in table.METRICS if m.shown == "tables" and m.label not in hidden
+    ]
     shown = dict(lines)
     assert shown["PSNR"] == f"{means['psnr']:.3f} dB"
     assert shown["normals within 11.25 deg"] == "0.250"
-    assert (shown["Gaussians"], shown["training"]) == ("1,000", "n/a")
+    assert (shown["Gaussians"], shown["training"]) == ("1,000", "n/a (the log is gone)")
     assert shown["LPIPS"] == (f"n/a ({means['lpips_reason']})" if means["lpips"] is None else shown["LPIPS"])
+    assert shown["FLIP"] == f"{means['flip']:.3f}"
     only_scores = dict(table.shown_metrics(means | {"ssim": None}, scores_only=True))
     assert not {"SSIM", "Gaussians", "FPS", "specular PSNR aligned"} & set(only_scores)
     assert only_scores["PSNR"] == shown["PSNR"]

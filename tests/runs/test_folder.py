@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 import polarguide
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.files import atomic
-from polarguide.options import SceneOptions
+from polarguide.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import (
     CHECKPOINT,
@@ -29,6 +30,7 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
+from polarguide.runs.train import TrainingStopped
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import TrainSettings, first_state
@@ -247,6 +249,49 @@ def test_a_second_training_into_a_run_is_refused(demo_scene: Path, tmp_path: Pat
     with writing_to(tmp_path / "old"), pytest.raises(PolarguideError, match="another training at work"):
         polarguide.train(demo_scene, tmp_path / "old", settings=settings, reading=reading, resume=True)
     assert (tmp_path / "old" / CHECKPOINT).read_bytes() == before
+
+
+def test_a_finished_run_keeps_no_state_of_the_optimizer(
+    demo_scene: Path, tmp_path: Path, state: TrainingState
+) -> None:
+    reading, settings = SceneOptions(downscale=4), TrainSettings(3)
+
+    def names(run: Path) -> set[str]:
+        with safe_open(run / CHECKPOINT, framework="pt") as file:
+            keys = list(file.keys())
+        return {part for key in keys for part in key.split(".")}
+
+    for keep in (False, True):
+        out = tmp_path / str(keep)
+        session = SessionOptions(keep_optimizer=keep, checkpoint_every=2)
+        stop = iter((False, False, True)).__next__
+        with pytest.raises(TrainingStopped):
+            polarguide.train(
+                demo_scene, out, settings=settings, reading=reading, session=session, should_stop=stop
+            )
+        assert "adam" in names(out)
+        polarguide.train(demo_scene, out, settings=settings, reading=reading, session=session, resume=True)
+        assert ("adam" in names(out)) == keep
+    # It is as good as before for all that is done with it, and a further resume of what is finished does nothing.
+    pictures = [polarguide.open_run(tmp_path / str(keep)).render("v000")["final"] for keep in (False, True)]
+    assert bool((pictures[0] == pictures[1]).all())
+    before = (tmp_path / "False" / CHECKPOINT).read_bytes()
+    polarguide.train(demo_scene, tmp_path / "False", settings=settings, reading=reading, resume=True)
+    assert (tmp_path / "False" / CHECKPOINT).read_bytes() == before
+    save_checkpoint(tmp_path, replace(state, frozen=state.gaussians.snapshot()), optimizer=False)
+    assert not {"adam", "frozen"} & names(tmp_path)
+
+
+def test_more_steps_than_a_training_was_begun_with(demo_scene: Path, trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    with pytest.raises(PolarguideError, match=r"\(steps\): expected 40, .*found 50\. .*into a new folder"):
+        polarguide.train(
+            demo_scene,
+            tmp_path / "run",
+            settings=TrainSettings(50),
+            reading=SceneOptions(downscale=4),
+            resume=True,
+        )
 
 
 def test_a_checkpoint_has_the_rights_of_other_files(tmp_path: Path, state: TrainingState) -> None:

@@ -31,6 +31,8 @@ def evaluate(
         f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
     )
     console.print(_table(record, title))
+    if absent := importlib.import_module("polarguide.evaluation.table").absent_metrics(record):
+        console.print(f"no ground truth, or no such layer, for: {', '.join(absent)}")
     if record["objects"]:
         console.print(_errors(record))
     sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE

@@ -29,6 +29,7 @@ from polarguide.system import peak_memory_mib
 from polarguide.training.stopwatch import Stopwatch
 
 MINIMUM_SECONDS = 1.5
+NOT_ALONE = "other work ran on the machine meanwhile"
 
 
 def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT) -> dict[str, Any]:
@@ -60,13 +61,16 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
         mesh = mesh_scores(run.cameras, lambda camera: run.model.render(camera, depth=True), tests)
     objects, materials = by_object.records()
     seconds, alone = RunLog(run.folder).elapsed()
+    fps = _speed(run, normals=False) if speed else None
     return write_metrics(
         run.folder / METRICS_FILE,
         views=views,
         run={
-            "fps": _speed(run, normals=False) if speed else None,
+            "fps": fps,
+            "fps_reason": None if fps is not None else NOT_ALONE if speed else "not asked for",
             "fps_layers": _speed(run, depth=True) if speed else None,
             "train_seconds": seconds if alone and seconds > 0 else None,
+            "train_seconds_reason": None if alone and seconds > 0 else "no log of it" if alone else NOT_ALONE,
             "gaussians": len(run.model),
             "steps": run.steps,
             "peak_memory_mib": memory,

@@ -36,10 +36,17 @@ def _fields(metrics: tuple[Metric, ...]) -> list[tuple[str, Any]]:
     return [
         (m.key, Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None if m.unit == "dB" else float | None)
         for m in metrics
+        if m.key not in _LATER
     ]
 
 
-_REASONS = [("lpips_reason", str | None, None), ("stokes_error_reason", str | None, None)]
+_LATER = ("flip",)
+"""Metrics that records of earlier versions lack: these are read as if they had no value."""
+_REASONS: list[tuple[str, Any, Any]] = [
+    *((key, float | None, None) for key in _LATER),
+    *((f"{key}_reason", str | None, None) for key in ("lpips", "flip", "stokes_error")),
+]
+_RUN_REASONS = [(f"{key}_reason", str | None, None) for key in ("fps", "train_seconds")]
 _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
 
 
@@ -65,6 +72,7 @@ _RUN = msgspec.defstruct(
         ("views", _VIEWS),
         ("provenance", Provenance),
         *_REASONS,
+        *_RUN_REASONS,
         *(
             (name, dict[str, ObjectErrors], msgspec.field(default_factory=dict))
             for name in ("objects", "materials")
@@ -77,7 +85,7 @@ def write_metrics(
     path: str | Path,
     *,
     views: Mapping[str, ViewScores],
-    run: Mapping[str, float | int | None],
+    run: Mapping[str, float | int | str | None],
     provenance: Mapping[str, Any],
     objects: Mapping[str, Any] | None = None,
     materials: Mapping[str, Any] | None = None,
@@ -90,7 +98,7 @@ def write_metrics(
     Args:
         path: the file; its folder must exist.
         views: the scores by view name, at least one.
-        run: values of ``RUN_METRICS`` by key; one that is left out is null.
+        run: values of ``RUN_METRICS`` by key, null where left out, and ``fps_reason`` and ``train_seconds_reason``.
         provenance: the keys of ``Provenance``, and others as you like.
         objects, materials: errors by object and by class of material, as of ``ErrorsByObject.records``.
 

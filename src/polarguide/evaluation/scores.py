@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from polarguide.evaluation.flip import flip
 from polarguide.evaluation.lpips import lpips
 from polarguide.evaluation.maps import ErrorsByObject
 from polarguide.evaluation.metrics import decibels
@@ -21,7 +22,8 @@ _NO_POLARIZATION = "hardly any polarization was measured where it counts"
 ViewScores = dict[str, float | str | None]
 """The scores of one view by key. None where one is not defined: no ground truth, no such layer, no pixel that counts.
 
-``lpips_reason`` says why ``lpips`` is None, ``stokes_error_reason`` why ``stokes_error`` is. ``nonfinite_pixels`` is
+``lpips_reason`` says why ``lpips`` is None, ``flip_reason`` why ``flip`` is, ``stokes_error_reason`` why
+``stokes_error`` is. ``nonfinite_pixels`` is
 there when the rendered layers held NaN or infinity, and counts the pixels; they were scored as black, and their normals
 as 90 degrees off.
 """
@@ -37,7 +39,8 @@ def score_view(
 ) -> ViewScores:
     """Score one rendered view, on the device where it was rendered, which is waited for once.
 
-    (LPIPS, where its network is at hand, waits by itself: torchmetrics checks the pictures' values.)
+    (LPIPS, where its network is at hand, waits by itself: torchmetrics checks the pictures' values. FLIP is computed on
+    the CPU.)
 
     Args:
         target: what it is compared with, on the same device.
@@ -67,6 +70,7 @@ def score_view(
     final = layers["final"]
     assert final is not None
     distance, reason = lpips(final, target.photograph, target.valid.mask)
+    flipped, flip_reason = flip(final, target.photograph, target.valid.mask)
     if by_object is not None:
         by_object.add(target, layers)
     measures = {m.key: m.measure(target, layers) for m in VIEW_METRICS if m.measure is not None}
@@ -78,7 +82,9 @@ def score_view(
         if metric.unit == "dB":
             value = min(decibels(value), HIGHEST_PSNR)
         scores[metric.key] = _number(value)
-    scores |= {"lpips": distance, "lpips_reason": reason}
+    scores |= {"lpips": distance, "lpips_reason": reason, "flip": flipped}
+    if flip_reason is not None:
+        scores["flip_reason"] = flip_reason
     if scores["stokes_error"] is None:
         scores["stokes_error_reason"] = _NO_LAYERS if stokes is None else _NO_POLARIZATION
     if lost_pixels:
@@ -94,8 +100,8 @@ def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | Non
 
     Returns:
         The keys of ``VIEW_METRICS``, each the mean over the views where it is a number, None where it is in no
-        view; ``lpips_reason``, the reason of the first view without LPIPS, else None; and ``stokes_error_reason``
-        where no view has a ``stokes_error``.
+        view; ``lpips_reason``, the reason of the first view without LPIPS, else None; ``flip_reason`` and
+        ``stokes_error_reason`` where no view has such a value.
     """
     means: dict[str, float | str | None] = {}
     for metric in VIEW_METRICS:
@@ -103,9 +109,10 @@ def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | Non
         means[metric.key] = math.fsum(values) / len(values) if values else None
     reasons = (scores.get("lpips_reason") for scores in per_view.values())
     means["lpips_reason"] = next((reason for reason in reasons if reason), None)
-    if means["stokes_error"] is None:
-        reasons = (scores.get("stokes_error_reason") for scores in per_view.values())
-        means["stokes_error_reason"] = next((reason for reason in reasons if reason), None)
+    for key in ("flip", "stokes_error"):
+        if means[key] is None:
+            reasons = (scores.get(f"{key}_reason") for scores in per_view.values())
+            means[f"{key}_reason"] = next((reason for reason in reasons if reason), None)
     return means
 
 

@@ -42,7 +42,7 @@ class Metric:
         digits: decimal places in tables.
         better: which direction is better; None: neither, and nothing is set in bold.
         of: whether each view has a value, and a run their mean, or only the run.
-        measure: its value on a view; None where it is not a single tensor (LPIPS), or not of a view.
+        measure: its value on a view; None where it is not a single tensor (LPIPS, FLIP), or not of a view.
         shown: "tables": console, Markdown, LaTeX and the report have it; "files": only CSV and ``results.json``;
             "record": only ``metrics.json``.
         timed: whether it counts only when measured alone; such a value may be absent without a fault.
@@ -128,6 +128,7 @@ METRICS: tuple[Metric, ...] = (
         "ssim", "SSIM", "", 3, "higher", measure=_compared(ssim, "final", "photograph", "valid", "windows")
     ),
     Metric("lpips", "LPIPS", "", 3, "lower"),
+    Metric("flip", "FLIP", "", 3, "lower"),
     Metric("normal_mae_deg", "normal error", "deg", 1, "lower", measure=_normal(normal_mae_deg)),
     Metric(
         "normal_within_11",
@@ -253,8 +254,8 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
         scores_only: leave out what belongs to the run alone (times, counts) and what has no value.
 
     Returns:
-        Labels and values with their units, in the order of the table; "n/a", with the reason where one is recorded,
-        for a metric without a value.
+        Labels and values with their units, in the order of the table; "n/a" and why for a metric without a value. One
+        that has no reason recorded, for want of ground truth or of a layer, is left out: see ``absent_metrics``.
     """
     lines = []
     for metric in METRICS:
@@ -262,6 +263,17 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
         if metric.shown != "tables" or (scores_only and (metric.of == "run" or value is None)):
             continue
         reason = record.get(f"{metric.key}_reason")
-        absent = f"n/a ({reason})" if reason else "n/a"
-        lines.append((metric.label, absent if value is None else metric.text(value)))
+        if value is not None or reason:
+            lines.append((metric.label, f"n/a ({reason})" if value is None else metric.text(value)))
     return lines
+
+
+def absent_metrics(record: Mapping[str, Any]) -> list[str]:
+    """Labels of what ``shown_metrics`` leaves out: no value, and no reason beside missing ground truth or layers."""
+    return [
+        metric.label
+        for metric in METRICS
+        if metric.shown == "tables"
+        and record.get(metric.key) is None
+        and not record.get(f"{metric.key}_reason")
+    ]

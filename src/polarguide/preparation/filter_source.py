@@ -22,8 +22,10 @@ from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
+from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.memory import require_memory, stated_size
 from polarguide.capture.view import ANGLES
+from polarguide.capture.write import rounding_of
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
@@ -102,7 +104,22 @@ class FilterSource(Source):
             # One scale for all shots, with room for the largest gain that is corrected.
             scale = math.sqrt(1.0 - LARGEST_IMBALANCE) if asked.gains == "auto" else 1.0
             notes += [UNIDENTIFIED] if asked.gains == "auto" else []
-        return {"transfer": transfer, "scale": scale / asked.calibration.peak, "notes": notes}
+        scale /= asked.calibration.peak
+        return {
+            "transfer": transfer,
+            "scale": scale,
+            "rounding": self._rounding(transfer, scale),
+            "notes": notes,
+        }
+
+    def _rounding(self, transfer: str, scale: float) -> int:
+        """What codes are rounded to: by the smallest step of 8-bit values, none for 16 bits."""
+        stored = read_shots(self._files[self.views[0]], self._white).pictures
+        if self._settings.precision == "full" or stored.dtype != np.uint8:
+            return 1
+        gains = self._settings.calibration.gains
+        smallest = scale / (max(gains) if gains is not None else 1.0 / math.sqrt(1.0 - LARGEST_IMBALANCE))
+        return rounding_of(smallest * float(linear_codes(np.array([0, 1], np.uint8), transfer)[1]))
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the four shots: validity, transfer, shifts, gains, the sense of the angles, then the turn."""

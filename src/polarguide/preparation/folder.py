@@ -169,7 +169,8 @@ class SceneFolder:
         mask: NDArray[np.bool_] | None = None,
     ) -> None:
         """Write the pictures of a view, then note it."""
-        sizes = write_view(self.root, view, intensity_codes(intensities, invalid), invalid, mask)
+        codes = intensity_codes(intensities, invalid, (self.measured or {}).get("rounding", 1))
+        sizes = write_view(self.root, view, codes, invalid, mask)
         self.views[view] = {**record, "files": sizes}
         self.save()
 

@@ -21,7 +21,8 @@ from polarguide.capture.sensor.packing import PACKINGS
 from polarguide.capture.sensor.pattern import SENSORS, sensor_pattern, tiled
 from polarguide.capture.sensor.radiometry import Levels, estimate_levels, unusable_samples
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
-from polarguide.capture.view import ANGLES
+from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.write import rounding_of
 from polarguide.errors import PolarguideError
 from polarguide.preparation.mosaic_samples import block_intensities, gray_world, sample_blocks
 from polarguide.preparation.settings import PrepareSettings, white_gains
@@ -141,6 +142,7 @@ class MosaicSource(Source):
             "analyzers": None if self._analyzers is None else self._analyzers.record(),
             "white_balance": list(white),
             "scale": 1.0 / max(1.0, peak),
+            "rounding": self._rounding(levels, min(white) / max(gains) / max(1.0, peak)),
             "notes": notes,
         }
 
@@ -176,6 +178,12 @@ class MosaicSource(Source):
             },
             mask=None if self._dataset is None else resized_mask(self._dataset, view, (height, width)),
         )
+
+    def _rounding(self, levels: Levels, factor: float) -> int:
+        """What codes are rounded to, with the smallest factor that a sample is multiplied by."""
+        if self._settings.precision == "full" or levels.gamma != 1.0:
+            return 1
+        return rounding_of(FULL_CODE * factor / ((1 << levels.bits) - 1))
 
     def _container(self, path: Path, values: NDArray[Any]) -> int:
         """Bits that a pixel takes in the file."""

@@ -23,12 +23,12 @@ ORIGINS = ("auto", "dataset", "sfm", "none")
 """What poses can be instead of a path."""
 _MOSAIC_ONLY = (
     "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
-    "saturation", "white_balance", "demosaic", "interpolation", "register", "analyzers",
+    "saturation", "white_balance", "demosaic", "interpolation", "register", "analyzers", "precision",
 )  # fmt: skip
 _OPTIONS = {
     "mosaic": _MOSAIC_ONLY,
     "pisr": _MOSAIC_ONLY,
-    "filter": ("transfer", "align", "white_balance"),
+    "filter": ("transfer", "align", "white_balance", "precision"),
     "gnerp": ("transfer",),
 }
 """Options that mean something for some formats only."""
@@ -62,6 +62,8 @@ class PrepareSettings:
             go first.
         calibration: gains, order, sense and zero of the angles.
         analyzers: calibration of the sensor that polarguide calibrate wrote; takes the place of gains.
+        precision: source rounds the intensities to less than a fifth of a step of the camera's values, full to 16 bits,
+            in larger files.
         poses: sfm, dataset, none, or the path of a COLMAP model, transforms.json (nerfstudio), cameras.xml (Metashape)
             or cameras.npz (IDR); auto takes those of a dataset, else sfm.
         matching: Pairs that SfM compares: all, or neighbors in the order of their names.
@@ -92,6 +94,7 @@ class PrepareSettings:
     gains: Literal["auto", "none"] = "auto"
     calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
     analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
+    precision: Literal["source", "full"] = "source"
     poses: str = "auto"
     matching: Literal["exhaustive", "sequential"] = "exhaustive"
     sfm_pictures: Literal["photograph", "minimum"] = "photograph"

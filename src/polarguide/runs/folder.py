@@ -1,7 +1,7 @@
 """A run folder: the configuration, atomically written checkpoints, the log, and the exported PLY.
 
 RUN/run.json            what was asked for (scene, recipe, settings), plain JSON
-RUN/checkpoint.safetensors   everything training needs to go on, and all that rendering needs
+RUN/checkpoint.safetensors   everything training needs to go on; at the end, all that rendering needs
 RUN/log.jsonl           one line per logged step
 RUN/point_cloud.ply     for other viewers, at the end
 """
@@ -40,6 +40,8 @@ CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
 LOCK = ".lock"
 PLY = "point_cloud.ply"
+FOR_STEPS = {"adam", "frozen"}
+"""Parts of the names of tensors that only further steps read."""
 
 
 @dataclass(frozen=True)
@@ -125,16 +127,24 @@ def _series(version: str) -> str:
     return ".".join(version.split(".")[:2])
 
 
-def save_checkpoint(run: Path, state: TrainingState) -> None:
+def save_checkpoint(run: Path, state: TrainingState, *, optimizer: bool = True) -> None:
     """Write the state so that a kill at any moment leaves either the old checkpoint or the new one.
+
+    Args:
+        run: its folder. state: what to write.
+        optimizer: with all that further steps need; without, Adam's moments and the frozen Gaussians are left out,
+            which nothing but a step reads.
 
     Raises:
         PolarguideError: it cannot be written; the old one stays.
     """
+    tensors = state.tensors()
+    if not optimizer:
+        tensors = {name: values for name, values in tensors.items() if not FOR_STEPS & set(name.split("."))}
     with atomic(run / CHECKPOINT) as path:
         try:
             # One entry: safetensors writes several in any order, and the same state should be the same bytes.
-            save_file(state.tensors(), path, metadata={"polarguide": f"{__version__}, step {state.step}"})
+            save_file(tensors, path, metadata={"polarguide": f"{__version__}, step {state.step}"})
         except SafetensorError as error:  # in place of an OSError, as on a full disk
             raise OSError(str(error)) from None
 

@@ -121,7 +121,7 @@ def train(
                     if problem := _unsuitable(out, resume):  # another training has begun meanwhile
                         raise problem
                 configuration.save(out)
-            _Loop(trainer, out, session.checkpoint_every, reporter, should_stop, look).run()
+            _Loop(trainer, out, session, reporter, should_stop, look).run()
         model = GaussianModel(trainer.state, trainer.shading, backend)
         if leads:
             centers = torch.stack([view.camera.center for view in loaded.views])
@@ -136,12 +136,12 @@ class _Loop:
         self,
         trainer: Trainer,
         out: Path,
-        checkpoint_every: int,
+        session: SessionOptions,
         reporter: Reporter,
         should_stop: Ends,
         look: Look | None,
     ) -> None:
-        self._trainer, self._out, self._every = trainer, out, checkpoint_every
+        self._trainer, self._out, self._session = trainer, out, session
         self._reporter, self._should_stop, self._look = reporter, should_stop, look
         self._log = RunLog(out) if trainer.ranks.rank == 0 else None
         if self._log is not None:
@@ -173,7 +173,7 @@ class _Loop:
             if (ranks.world == 1 or trainer.state.step % LOG_EVERY == 0) and ranks.any(self._should_stop()):
                 return True
             meter.take(trainer.step())
-            if trainer.state.step % self._every == 0:
+            if trainer.state.step % self._session.checkpoint_every == 0:
                 with self._stopwatch.paused():
                     meter.read()
                     self._save()
@@ -186,7 +186,9 @@ class _Loop:
         """A checkpoint of what all ranks have seen, by rank 0."""
         self._trainer.exchange_statistics()
         if self._trainer.ranks.rank == 0:
-            save_checkpoint(self._out, self._trainer.state)
+            state = self._trainer.state
+            goes_on = state.step < self._trainer.settings.steps
+            save_checkpoint(self._out, state, optimizer=goes_on or self._session.keep_optimizer)
 
 
 class _Meter:
@@ -299,6 +301,14 @@ def _check_slots(state: TrainingState, settings: TrainSettings, out: Path) -> No
 
 
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
+    if old.settings != new.settings and replace(old.settings, steps=new.settings.steps) == new.settings:
+        raise PolarguideError(
+            f"{out}/{CONFIGURATION} (steps)",
+            expected=f"{old.settings.steps}, as this training was begun",
+            found=str(new.settings.steps),
+            remedy="The stages of a training are shares of its steps, so that it cannot be made longer or shorter: "
+            f"give --steps {old.settings.steps}, or train with --steps {new.settings.steps} into a new folder.",
+        )
     for field in ("scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer"):
         a, b = getattr(old, field), getattr(new, field)
         if a != b:
