@@ -33,6 +33,7 @@ ROOMS = (
     "raster",
     "shading",
     "visualization",
+    "shots",
     "training",
     "recipes",
     "runs",
