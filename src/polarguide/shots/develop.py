@@ -100,17 +100,16 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
         good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
         noise = estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
     mode, way = options.demosaic, options.interpolation
-    picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way)
+    picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
     lost = picture.invalid
     blacks = np.zeros(lost.shape, bool)
     if black.any():
         blacks = demosaic(linear, black, pattern, mode=mode, interpolation=way).invalid
     shape = lost.shape
-    channels = 1 if pattern.colors is None else 3
     assert options.sensor is not None
     x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
     return Developed(
-        intensities=oriented(picture.intensities[..., :channels], options.calibration),
+        intensities=oriented(picture.intensities, options.calibration),
         dark=blacks,
         saturated=lost,
         masked=np.zeros(shape, bool),
@@ -198,9 +197,9 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
 def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
     assert shot.root is not None
     layout = find_layout(shot.root)
-    select_views(layout, [shot.name])
+    select_views(layout, [shot.view])
     transfer = "srgb" if options.transfer == "srgb" else "linear"
-    data = read_view(layout, shot.name, factor=1, transfer=transfer)
+    data = read_view(layout, shot.view, factor=1, transfer=transfer)
     largest = int(np.iinfo(data.peak.dtype).max)
     scale = checks.full_scale(data.histogram, largest)
     intensities = oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration)

@@ -31,12 +31,14 @@ class ExposureSet:
         kind: mosaic (one file), filter (one file an angle) or scene (a view of a scene folder).
         files: by angle; a mosaic's under 0. Angles may be missing: ``read_shot`` says so.
         root: folder of the scene; else None.
+        view: its name in the scene.
     """
 
     name: str
     kind: Kind
     files: dict[int, Path]
     root: Path | None = None
+    view: str = ""
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -107,7 +109,7 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
     folders = angle_folders(root)
     if (root / "polar").is_dir() or (len(folders) == len(ANGLES) and (root / "sparse").is_dir()):
         layout = find_layout(root)
-        return [ExposureSet(name, "scene", layout.pictures[name], root) for name in layout.names]
+        return [ExposureSet(name, "scene", layout.pictures[name], root, name) for name in layout.names]
     if options.sensor is not None and not folders:
         files = index_files(root, RAW_SUFFIXES)
         dark = None if options.dark_frame is None else os.path.realpath(options.dark_frame)

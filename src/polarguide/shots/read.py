@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -51,6 +51,13 @@ def read_shot(
     return _maps(shot, developed, options)
 
 
+def tiles(height: int, width: int) -> Iterator[slice]:
+    """Rows of a picture to work on at a time; each starts with a whole superpixel."""
+    rows = max(1, _TILE // width // 4) * 4
+    for top in range(0, height, rows):
+        yield slice(top, min(top + rows, height))
+
+
 @torch.no_grad()
 def _maps(shot: ExposureSet, developed: Developed, options: ShotOptions) -> ShotMaps:
     _, height, width, _ = developed.intensities.shape
@@ -59,16 +66,15 @@ def _maps(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Shot
     reason = torch.zeros((height, width), dtype=torch.uint8)
     factors = torch.from_numpy(np.ascontiguousarray(developed.factors))
     period = factors.shape[1]
-    rows = max(1, _TILE // width // period) * period
     floor, slope = developed.noise.floor, developed.noise.slope
-    for top in range(0, height, rows):
-        part = slice(top, min(top + rows, height))
+    pattern: torch.Tensor | None = None
+    for part in tiles(height, width):
         samples = torch.from_numpy(developed.intensities[:, part])
         gray = samples[..., 0] if samples.shape[-1] == 1 else samples.mean(dim=-1)
         count = gray.shape[1]
-        repeat = (1, -(-count // period), -(-width // period))
-        weights = factors.repeat(repeat)[:, :count, :width]
-        variances = gray.clamp(min=0).mul_(slope).add_(floor).mul_(weights)
+        if pattern is None:
+            pattern = factors.repeat(1, -(-count // period), -(-width // period))[..., :width].contiguous()
+        variances = gray.clamp(min=0).mul_(slope).add_(floor).mul_(pattern[:, :count])
         stokes[:, part] = s = optics.stokes(gray)
         dolp[part] = degree = optics.dolp(s)
         aolp[part] = optics.aolp(s)
