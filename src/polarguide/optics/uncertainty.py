@@ -17,6 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide.optics._arrays import for_arrays
 from polarguide.optics._numerics import check_leading
 
 UNIFORM_SPREAD = math.pi / math.sqrt(12.0)
@@ -37,6 +38,7 @@ class Uncertainty(NamedTuple):
     debiased: Tensor
 
 
+@for_arrays
 def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
     """Standard deviations of DoLP and AoLP, and the DoLP debiased.
 

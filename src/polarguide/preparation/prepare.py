@@ -155,9 +155,9 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
             if known is not None and poses is not None:
                 warp = poses.warp(view, msgspec.convert(known["geometry"], Geometry)).record()
             if not folder.has(view, warp):
-                fault, found = _write_view(folder, pictures, view, poses)
-                faults += fault
-                notes += found
+                more_faults, more_notes = _write_view(folder, pictures, view, poses)
+                faults += more_faults
+                notes += more_notes
             advance(count)
     for fault in faults[:_NOTES]:
         reporter.warn(fault)

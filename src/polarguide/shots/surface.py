@@ -85,7 +85,7 @@ def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) 
     """
     if intrinsics is not None:
         return parse_intrinsics(intrinsics, size)
-    if shot.root is None or not any((shot.root / name).exists() for name in ("sparse",)):
+    if shot.root is None or not (shot.root / "sparse").exists():
         return None
     model = read_model(shot.root)
     if shot.view not in model.names:
@@ -109,7 +109,9 @@ def surface_maps(maps: ShotMaps, camera: Camera | None = None, refractive_index:
     channels, height, width = maps.intensities.shape[3], *maps.reason.shape
     zeniths = torch.empty((3, height, width))
     normal = torch.empty((height, width, 3))
-    layers = [torch.empty((height, width, channels)) for _ in range(4)]
+    paper_specular, paper_diffuse, specular, diffuse = (
+        torch.empty((height, width, channels)) for _ in range(4)
+    )
     conditioned = torch.empty((height, width), dtype=torch.bool)
     stokes, dolp, aolp = (torch.from_numpy(a) for a in (maps.stokes, maps.dolp, maps.aolp))
     for part in tiles(height, width):
@@ -119,19 +121,20 @@ def surface_maps(maps: ShotMaps, camera: Camera | None = None, refractive_index:
         zeniths[:, part] = zenith
         paper = optics.paper_separation(s, zenith[0], refractive_index)
         exact = optics.exact_separation(s, chosen, rays, refractive_index)
-        for layer, found in zip(
-            layers, (paper.specular, paper.diffuse, exact.specular, exact.diffuse), strict=True
-        ):
-            layer[part] = found
+        paper_specular[part], paper_diffuse[part] = paper.specular, paper.diffuse
+        specular[part], diffuse[part] = exact.specular, exact.diffuse
         conditioned[part] = exact.conditioned
         usable = torch.from_numpy(maps.usable[part])
         normal[part] = chosen * usable[..., None]
     above = dolp > optics.diffuse_dolp_limit(refractive_index)
     zeniths[0][above] = math.nan
     return SurfaceMaps(
-        zeniths.numpy(),
-        normal.numpy(),
-        *(layer.numpy() for layer in layers),
+        zeniths=zeniths.numpy(),
+        normal=normal.numpy(),
+        specular_paper=paper_specular.numpy(),
+        diffuse_paper=paper_diffuse.numpy(),
+        specular_exact=specular.numpy(),
+        diffuse_exact=diffuse.numpy(),
         conditioned=conditioned.numpy(),
         refractive_index=refractive_index,
         perspective=camera is not None,
