@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,7 @@ from polarguide.shots.read import read_shot
 from polarguide.shots.surface import SurfaceMaps, camera_of, surface_maps
 from polarguide.visualization import figures
 
-MapFormat = Literal["png", "exr", "npy", "page"]
-FORMATS: tuple[MapFormat, ...] = ("png", "exr", "npy", "page")
+FORMATS = ("png", "exr", "npy", "page")
 UNITS_FILE = "maps.json"
 
 
@@ -48,7 +47,7 @@ def write_shots(
     out: str | os.PathLike[str],
     options: ShotOptions | None = None,
     *,
-    formats: Collection[MapFormat] = FORMATS,
+    formats: Collection[str] = FORMATS,
     intrinsics: str | None = None,
     refractive_index: float = 1.5,
     reporter: Reporter = SILENT,
@@ -110,7 +109,7 @@ def write_shots(
 
 
 def write_maps(
-    maps: ShotMaps, surface: SurfaceMaps, folder: Path, formats: Collection[MapFormat] = FORMATS
+    maps: ShotMaps, surface: SurfaceMaps, folder: Path, formats: Collection[str] = FORMATS
 ) -> Path:
     """Write the maps of one shot into a folder; returns the folder.
 
