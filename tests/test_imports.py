@@ -35,6 +35,7 @@ ROOMS = (
     "shading",
     "visualization",
     "sensor_calibration",
+    "shots",
     "training",
     "recipes",
     "runs",

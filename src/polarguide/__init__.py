@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from polarguide.preparation.settings import PrepareSettings
     from polarguide.progress import Reporter
     from polarguide.sensor_calibration.settings import CalibrateSettings
+    from polarguide.shots import ShotMaps, ShotOptions, SurfaceMaps, find_shots, read_shot, surface_maps
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
 
@@ -41,6 +42,7 @@ _NAMES = {
     "preparation.settings": ("PrepareSettings",),
     "progress": ("Reporter",),
     "sensor_calibration.settings": ("CalibrateSettings",),
+    "shots": ("ShotMaps", "ShotOptions", "SurfaceMaps", "find_shots", "read_shot", "surface_maps"),
     "training.recipe": ("Recipe",),
     "training.settings": ("TrainSettings",),
 }
@@ -61,12 +63,16 @@ __all__ = [
     "Scene",
     "SceneOptions",
     "SessionOptions",
+    "ShotMaps",
+    "ShotOptions",
+    "SurfaceMaps",
     "TrainSettings",
     "__version__",
     "ablate",
     "calibrate",
     "compare",
     "demo_scene",
+    "find_shots",
     "inspect",
     "load_scene",
     "open_run",
@@ -74,6 +80,8 @@ __all__ = [
     "prepare",
     "priors",
     "read_analyzers",
+    "read_shot",
+    "surface_maps",
     "train",
 ]
 

@@ -189,7 +189,8 @@ def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDAr
     sign = -1 if calibration.sense == "cw" else 1
     turn = calibration.zero if calibration.permutes else 0.0
     targets = [int(sign * angle + turn) % 180 for angle in calibration.order]
-    placed = intensities[[targets.index(angle) for angle in ANGLES]]
+    places = [targets.index(angle) for angle in ANGLES]
+    placed = intensities if places == [0, 1, 2, 3] else intensities[places]
     if calibration.permutes:
         return placed
     s0, s1, s2 = stokes_of_four(placed)

@@ -37,15 +37,18 @@ from polarguide.optics.separation import (
     predicted_stokes,
 )
 from polarguide.optics.stokes import aolp, dolp, intensity, luminance, photograph, stokes
+from polarguide.optics.uncertainty import UNIFORM_SPREAD, Uncertainty, polarization_uncertainty
 from polarguide.polarizer import ANGLES
 
 __all__ = [
     "ANGLES",
+    "UNIFORM_SPREAD",
     "Candidates",
     "ChromaticNormals",
     "Disambiguated",
     "PhysicalCandidates",
     "Separation",
+    "Uncertainty",
     "aolp",
     "azimuth",
     "brewster",
@@ -69,6 +72,7 @@ __all__ = [
     "photograph",
     "physical_candidates",
     "polarization_mask",
+    "polarization_uncertainty",
     "predicted_stokes",
     "reflectances",
     "reflectances_from_cosine",

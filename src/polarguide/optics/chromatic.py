@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide.optics._arrays import for_arrays
 from polarguide.optics._numerics import check_leading, check_refractive_index, safe_atan2, window_mean
 from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith
 from polarguide.optics.stokes import dolp, luminance
@@ -41,6 +42,7 @@ class ChromaticNormals(NamedTuple):
     decided: Tensor
 
 
+@for_arrays
 def chromatic_normals(
     stokes: Tensor,
     refractive_index: float = 1.5,

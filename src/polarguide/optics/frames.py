@@ -11,10 +11,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from polarguide.optics._arrays import for_arrays
 from polarguide.optics._numerics import safe_atan2
 from polarguide.vectors import dot
 
 
+@for_arrays
 def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:
     """Image right and image up, carried from the optical axis to each ray by the smallest rotation.
 
@@ -36,6 +38,7 @@ def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:
     return x_ref, up_ref
 
 
+@for_arrays
 def azimuth(vectors: Tensor, rays: Tensor) -> Tensor:
     """Azimuth of a vector about the ray: ``atan2(v . up_ref, v . x_ref)``.
 
@@ -50,6 +53,7 @@ def azimuth(vectors: Tensor, rays: Tensor) -> Tensor:
     return safe_atan2(dot(vectors, up_ref), dot(vectors, x_ref))
 
 
+@for_arrays
 def zenith(normals: Tensor, rays: Tensor) -> Tensor:
     """Angle between a normal and the direction back to the camera, ``-ray``.
 
@@ -66,6 +70,7 @@ def zenith(normals: Tensor, rays: Tensor) -> Tensor:
     return safe_atan2(across, -along)
 
 
+@for_arrays
 def normal_from_angles(zenith: Tensor, azimuth: Tensor, rays: Tensor) -> Tensor:
     """Unit normal with a given zenith and azimuth about the ray.
 

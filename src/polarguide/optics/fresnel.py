@@ -15,6 +15,7 @@ import math
 import torch
 from torch import Tensor
 
+from polarguide.optics._arrays import for_arrays
 from polarguide.optics._numerics import check_refractive_index, safe_sqrt
 
 
@@ -30,6 +31,7 @@ def _refracted(c: Tensor, refractive_index: float | Tensor) -> tuple[Tensor, Ten
     return torch.sqrt(n2 - 1 + c * c), n2 * c
 
 
+@for_arrays
 def reflectances_from_cosine(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
     """Power reflectances from the cosine of the angle of incidence (Fresnel's equations).
 
@@ -50,6 +52,7 @@ def reflectances_from_cosine(cosine: Tensor, refractive_index: float | Tensor = 
     return ((c - t) / (c + t)) ** 2, ((p - t) / (p + t)) ** 2
 
 
+@for_arrays
 def reflectances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
     """Power reflectances perpendicular (s) and parallel (p) to the plane of incidence (Fresnel's equations).
 
@@ -68,6 +71,7 @@ def reflectances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tupl
     return reflectances_from_cosine(_cosine(zenith), refractive_index)
 
 
+@for_arrays
 def transmittances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
     """Power transmittances (Ts, Tp) through the surface, ``4 c t / (c + t)^2`` and
     ``4 n^2 c t / (n^2 c + t)^2``.
@@ -89,6 +93,7 @@ def transmittances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tu
     return 4 * c * t / (c + t) ** 2, 4 * p * t / (p + t) ** 2
 
 
+@for_arrays
 def dolp_slopes(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
     """Degrees of polarization of both lobes divided by ``sin^2(zenith)``, from the cosine of the zenith.
 
@@ -117,6 +122,7 @@ def dolp_slopes(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple
     return specular, slope / (2 - sine2 * slope)
 
 
+@for_arrays
 def specular_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
     """Degree of polarization of specularly reflected light, ``(Rs - Rp) / (Rs + Rp)``.
 
@@ -136,6 +142,7 @@ def specular_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Ten
     return dolp_slopes(_cosine(zenith), refractive_index)[0] * torch.sin(zenith.clamp(0, math.pi / 2)) ** 2
 
 
+@for_arrays
 def diffuse_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
     """Degree of polarization of light that leaves from below the surface, ``(Tp - Ts) / (Tp + Ts)``.
 
@@ -155,6 +162,7 @@ def diffuse_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tens
     return dolp_slopes(_cosine(zenith), refractive_index)[1] * torch.sin(zenith.clamp(0, math.pi / 2)) ** 2
 
 
+@for_arrays
 def brewster(refractive_index: float | Tensor = 1.5) -> Tensor:
     """Brewster's angle ``atan(n)`` in radians, where Rp = 0.
 
@@ -169,6 +177,7 @@ def brewster(refractive_index: float | Tensor = 1.5) -> Tensor:
     return torch.atan(refractive_index)
 
 
+@for_arrays
 def diffuse_dolp_limit(refractive_index: float | Tensor = 1.5) -> float | Tensor:
     """Largest degree of polarization that diffuse light reaches (at grazing): ``(n^2 - 1) / (n^2 + 1)``.
 
@@ -182,6 +191,7 @@ def diffuse_dolp_limit(refractive_index: float | Tensor = 1.5) -> float | Tensor
     return (n2 - 1) / (n2 + 1)
 
 
+@for_arrays
 def diffuse_zenith(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
     """Zenith at which diffuse light has this degree of polarization: the exact inverse of ``diffuse_dolp``.
 
@@ -206,6 +216,7 @@ def diffuse_zenith(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> Tens
     return angle.clamp(max=math.pi / 2)
 
 
+@for_arrays
 def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
     """The two zeniths at which specular light has this degree of polarization: inverses of ``specular_dolp``.
 

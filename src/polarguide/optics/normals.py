@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide.optics._arrays import for_arrays
 from polarguide.optics._numerics import check_leading, safe_normalize, safe_sqrt, window_mean
 from polarguide.optics.frames import normal_from_angles
 from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
@@ -64,6 +65,7 @@ class Disambiguated(NamedTuple):
     cosine: Tensor
 
 
+@for_arrays
 def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5) -> Candidates:
     """Four candidate normals as in PolarGuide-GSDR: n, -n, R n, -R n.
 
@@ -88,6 +90,7 @@ def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Ten
     return Candidates(torch.stack((normal, -normal, rotated, -rotated), dim=-2), polar, turn)
 
 
+@for_arrays
 def physical_candidates(
     stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5
 ) -> PhysicalCandidates:
@@ -117,6 +120,7 @@ def physical_candidates(
     return PhysicalCandidates(normals, possible & (stokes[0] > 0)[..., None], specular)
 
 
+@for_arrays
 def disambiguate(
     candidates: Candidates | PhysicalCandidates | Tensor,
     guide: Tensor,
@@ -168,6 +172,7 @@ def disambiguate(
     return Disambiguated(normal, choice, cosine)
 
 
+@for_arrays
 def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
     """Standard deviation of the degree of polarization d under independent noise on the four intensities.
 
@@ -190,6 +195,7 @@ def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
     return torch.where(s0 > 0, spread / torch.where(s0 > 0, s0, torch.ones_like(s0)), spread * math.inf)
 
 
+@for_arrays
 def intensity_noise(intensities: Tensor, window: int = 15) -> Tensor:
     """Standard deviation of the noise of one of the four intensities, read from the pictures themselves.
 
@@ -216,6 +222,7 @@ def intensity_noise(intensities: Tensor, window: int = 15) -> Tensor:
     return safe_sqrt(square - mean**2) / 2
 
 
+@for_arrays
 def polarization_mask(
     stokes: Tensor,
     *,

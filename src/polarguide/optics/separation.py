@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide.optics._arrays import for_arrays
 from polarguide.optics._numerics import check_leading, safe_normalize
 from polarguide.optics.frames import lens_frame
 from polarguide.optics.fresnel import dolp_slopes, reflectances, transmittances
@@ -38,6 +39,7 @@ def _components(normals: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return -dot(unit, rays), dot(unit, x_ref), dot(unit, up_ref)
 
 
+@for_arrays
 def exact_separation(
     stokes: Tensor,
     normals: Tensor,
@@ -85,6 +87,7 @@ def exact_separation(
     return Separation(specular, s0 - specular, (contrast >= minimum_contrast) & (cosine > 0))
 
 
+@for_arrays
 def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Separation:
     """The reflection cue of PolarGuide-GSDR, averaged over the four polarizer angles.
 
@@ -113,6 +116,7 @@ def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | T
     return Separation(specular, diffuse, torch.ones_like(zenith, dtype=torch.bool))
 
 
+@for_arrays
 def paper_intensities(
     stokes: Tensor,
     zenith: Tensor,
@@ -151,6 +155,7 @@ def paper_intensities(
     return specular, diffuse
 
 
+@for_arrays
 def predicted_stokes(
     specular: Tensor, diffuse: Tensor, normals: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5
 ) -> Tensor:

@@ -12,10 +12,12 @@ import math
 import torch
 from torch import Tensor
 
+from polarguide.optics._arrays import for_arrays
 from polarguide.optics._numerics import check_leading, safe_atan2, safe_sqrt
 from polarguide.polarizer import malus, stokes_of_four
 
 
+@for_arrays
 def stokes(intensities: Tensor) -> Tensor:
     """Stokes vector of four images taken behind a polarizer at 0, 45, 90 and 135 degrees.
 
@@ -35,6 +37,7 @@ def stokes(intensities: Tensor) -> Tensor:
     return torch.stack(stokes_of_four(intensities.unbind(0)))
 
 
+@for_arrays
 def intensity(stokes: Tensor, angle: float | Tensor) -> Tensor:
     """Intensity behind an ideal polarizer: Malus's law, ``(S0 + S1 cos 2a + S2 sin 2a) / 2``.
 
@@ -49,6 +52,7 @@ def intensity(stokes: Tensor, angle: float | Tensor) -> Tensor:
     return malus(stokes.unbind(0), torch.as_tensor(angle, dtype=stokes.dtype, device=stokes.device))
 
 
+@for_arrays
 def dolp(stokes: Tensor) -> Tensor:
     """Degree of linear polarization, ``sqrt(S1^2 + S2^2) / S0``.
 
@@ -70,6 +74,7 @@ def dolp(stokes: Tensor) -> Tensor:
     return torch.where(live, degree, torch.zeros_like(degree))
 
 
+@for_arrays
 def aolp(stokes: Tensor) -> Tensor:
     """Angle of linear polarization, ``atan2(S2, S1) / 2``: the direction of the electric field.
 
@@ -88,6 +93,7 @@ def aolp(stokes: Tensor) -> Tensor:
     return torch.where(angle >= math.pi, angle - math.pi, angle)
 
 
+@for_arrays
 def photograph(stokes: Tensor) -> Tensor:
     """The picture without a polarizer on the exposure scale of the four images: their mean, ``S0 / 2``.
 
@@ -101,6 +107,7 @@ def photograph(stokes: Tensor) -> Tensor:
     return stokes[0] / 2
 
 
+@for_arrays
 def luminance(stokes: Tensor) -> Tensor:
     """Stokes vector of the color channels taken together: their plain mean.
 

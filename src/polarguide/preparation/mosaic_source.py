@@ -15,15 +15,15 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.layout import index_files
 from polarguide.capture.sensor.analyzers import read_analyzers, spread_to_cells
-from polarguide.capture.sensor.color_filters import SIDE, color_filters
+from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
-from polarguide.capture.sensor.packing import PACKINGS
-from polarguide.capture.sensor.pattern import SENSORS, sensor_pattern, tiled
+from polarguide.capture.sensor.pattern import tiled
 from polarguide.capture.sensor.radiometry import Levels, estimate_levels, unusable_samples
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
+from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.write import rounding_of
 from polarguide.errors import PolarguideError
+from polarguide.preparation.mosaic_files import MosaicFiles
 from polarguide.preparation.mosaic_samples import block_intensities, gray_world, sample_blocks
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
@@ -31,7 +31,6 @@ from polarguide.progress import Advance
 
 CALIBRATED_IMBALANCE = 0.01
 """Of the pair sums of a calibrated sensor; more is a sign of another camera's calibration."""
-_SMALLEST = 16
 
 
 class MosaicSource(Source):
@@ -51,15 +50,8 @@ class MosaicSource(Source):
         self.kind = "mosaic" if dataset is None else dataset.name
         self.cameras = None if dataset is None else dataset.cameras
         self._dataset = dataset
-        if settings.sensor is None:
-            raise PolarguideError(
-                "--sensor",
-                expected=f"the sensor of raw mosaics: {', '.join(SENSORS)}",
-                found="none",
-                remedy="Name it; color (MYR) and monochrome (MZR) sensors have different patterns.",
-            )
+        self._mosaics = MosaicFiles(settings)
         self._settings = settings
-        self._raw = RawFormat(settings.width, settings.height, settings.packing)
         self._dark_path = settings.dark_frame
         files = index_files(root, RAW_SUFFIXES)
         if self._dark_path is not None:
@@ -73,9 +65,7 @@ class MosaicSource(Source):
         self._analyzers = None if settings.analyzers is None else read_analyzers(settings.analyzers)
         if self._analyzers is not None:
             self._analyzers.require_sensor(settings.sensor, settings.analyzers)
-        pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
-        self._crop = pattern.cell_corner()
-        self._pattern = pattern.shifted(*self._crop)
+        self._crop, self._pattern = self._mosaics.crop, self._mosaics.pattern
         self._corner = (settings.offset_x + self._crop[0], settings.offset_y + self._crop[1])
         self._white = white_gains(settings.white_balance)
         if self._pattern.colors is None and settings.white_balance != "none":
@@ -93,16 +83,16 @@ class MosaicSource(Source):
         samples: list[NDArray[Any]] = []
         blocks: list[NDArray[Any]] = []
         for count, path in enumerate(self._files.values(), 1):
-            values = read_mosaic(path, self._raw)
+            values = self._mosaics.read(path)
             shape = shape or (values.shape, values.dtype)
             self._require_alike(path, values, shape)
             if self._analyzers is not None and count == 1:
                 offset = (self._settings.offset_x, self._settings.offset_y)
                 self._analyzers.require_region(offset, values.shape[::-1], self._settings.analyzers)
-            container = self._container(path, values)
+            container = self._mosaics.container(path, values)
             largest, used = max(largest, int(values.max())), used | int(np.bitwise_or.reduce(values, None))
-            samples.append(sample_blocks(self._cut(values), 2 * self._pattern.period))
-            blocks.append(sample_blocks(self._cut(values), SIDE))
+            samples.append(sample_blocks(self._mosaics.cut(values), 2 * self._pattern.period))
+            blocks.append(sample_blocks(self._mosaics.cut(values), SIDE))
             advance(count)
         assert shape is not None
         asked = self._settings
@@ -112,8 +102,8 @@ class MosaicSource(Source):
         if self._dataset is not None:
             levels = replace(levels, gamma=self._dataset.gamma)
         else:
-            self._require_kind(np.concatenate(blocks), levels)
-        dark = self._dark(shape[0])
+            self._mosaics.require_kind(np.concatenate(blocks), levels)
+        dark = self._mosaics.dark(shape[0])
         floor = None if dark is None else sample_blocks(dark, 2 * self._pattern.period)
         width, height = ((shape[0][axis] - self._crop[1 - axis]) // 2 * 2 for axis in (1, 0))
         matrices, brighter = None, 1.0
@@ -149,9 +139,9 @@ class MosaicSource(Source):
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read one mosaic: validity, levels, gains, then demosaicing, then the sense of the angles."""
         path = self._files[view]
-        stored = read_mosaic(path, self._raw)
-        dark = self._dark(stored.shape)
-        values = self._cut(stored)
+        stored = self._mosaics.read(path)
+        dark = self._mosaics.dark(stored.shape)
+        values = self._mosaics.cut(stored)
         levels = Levels(**measured["levels"])
         saturated, black = unusable_samples(values, levels, dark)
         bad, linear = saturated | black, levels.linear(values, dark)
@@ -185,11 +175,6 @@ class MosaicSource(Source):
             return 1
         return rounding_of(FULL_CODE * factor / ((1 << levels.bits) - 1))
 
-    def _container(self, path: Path, values: NDArray[Any]) -> int:
-        """Bits that a pixel takes in the file."""
-        packing = self._settings.packing if path.suffix.lower() == ".raw" else None
-        return values.dtype.itemsize * 8 if packing is None else PACKINGS[packing][2]
-
     def _require_alike(self, path: Path, values: NDArray[Any], first: tuple[Any, Any]) -> None:
         if (values.shape, values.dtype) != first:
             (height, width), kind = first
@@ -199,46 +184,6 @@ class MosaicSource(Source):
                 found=f"{values.shape[1]}x{values.shape[0]} of {values.dtype}",
                 remedy="Prepare captures of different size or depth one by one.",
             )
-        if min(values.shape) < _SMALLEST:
-            raise PolarguideError(
-                path,
-                expected=f"a mosaic of at least {_SMALLEST}x{_SMALLEST} pixels",
-                found=f"{values.shape[1]}x{values.shape[0]}",
-                remedy="Give the whole picture of the sensor.",
-            )
-
-    def _require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
-        """Refuse mosaics of the other kind of sensor: nothing later would tell."""
-        found = color_filters(blocks, levels.saturation, levels.black)
-        color = self._pattern.colors is not None
-        if found is None or (found == "color") == color:
-            return
-        other = next(name for name, colored in SENSORS.items() if colored != color)
-        raise PolarguideError(
-            "--sensor",
-            expected=f"mosaics of {self._settings.sensor}, a {'color' if color else 'monochrome'} sensor",
-            found="no sign of color filters" if color else "the Bayer pattern of color filters",
-            remedy=f"Use --sensor {other}, or that of your camera with this pattern.",
-        )
-
-    def _cut(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Crop to whole cells."""
-        values = values[self._crop[1] :, self._crop[0] :]
-        return np.ascontiguousarray(values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2])
-
-    def _dark(self, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
-        """The dark frame, cut like the mosaics."""
-        if self._dark_path is None:
-            return None
-        dark = read_mosaic(self._dark_path, self._raw)
-        if dark.shape != shape:
-            raise PolarguideError(
-                self._dark_path,
-                expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
-                found=f"{dark.shape[1]}x{dark.shape[0]}",
-                remedy="Take it with the same region and settings, the lens covered.",
-            )
-        return self._cut(dark).astype(np.float32)
 
     def _gains(self, ratio: float | None) -> tuple[tuple[float, float, float, float], list[str]]:
         """Gains of the angles, and notes about them."""

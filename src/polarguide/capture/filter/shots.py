@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,20 +61,35 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
     folders = angle_folders(root)
     if folders:
         return pictures_of_folders(root, folders, SHOT_SUFFIXES)
-    shots: dict[str, dict[int, Path]] = {}
     files = index_files(root, SHOT_SUFFIXES)
-    bare = {int(match["angle"]): path for stem, path in files.items() if (match := _BARE.fullmatch(stem))}
-    if len(bare) == len(files) == len(ANGLES):
-        return {root.resolve().name: dict(sorted(bare.items()))}
-    for stem, path in files.items():
-        match = _SUFFIX.fullmatch(stem)
-        if match is None:
+    return group_shots(list(files.values()))
+
+
+def group_shots(files: Sequence[Path]) -> dict[str, dict[int, Path]]:
+    """View -> angle -> file, by the names of files; those without an angle in their name are left out.
+
+    Files named like the angles alone are one view, called like their folder, where a folder has nothing else among
+    the files.
+
+    Raises:
+        PolarguideError: two files have the same view and angle.
+    """
+    shots: dict[str, dict[int, Path]] = {}
+    for folder in dict.fromkeys(path.parent for path in files):
+        inside = [path for path in files if path.parent == folder]
+        bare = {int(match["angle"]): path for path in inside if (match := _BARE.fullmatch(path.stem))}
+        if len(bare) == len(inside) == len(ANGLES):
+            shots[folder.resolve().name] = dict(sorted(bare.items()))
             continue
-        view = match["view"]
-        of_view, angle = shots.setdefault(view, {}), int(match["angle"])
-        if angle in of_view:
-            raise ambiguous(root, f"one picture of {view} at {angle} degrees", of_view[angle], path)
-        of_view[angle] = path
+        for path in inside:
+            match = _SUFFIX.fullmatch(path.stem)
+            if match is None:
+                continue
+            view = match["view"]
+            of_view, angle = shots.setdefault(view, {}), int(match["angle"])
+            if angle in of_view:
+                raise ambiguous(folder, f"one picture of {view} at {angle} degrees", of_view[angle], path)
+            of_view[angle] = path
     return shots
 
 

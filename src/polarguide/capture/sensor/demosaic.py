@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from polarguide.capture.sensor.interpolate import (
     GUIDED_RADIUS,
     bilinear,
+    bilinear_cell,
     guided_color,
     guided_polarization,
     used_by_bilinear,
@@ -39,7 +40,14 @@ class DemosaicedPicture:
 
 
 def demosaic(
-    values: Array, bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True
+    values: Array,
+    bad: Mask,
+    pattern: Pattern,
+    *,
+    mode: str,
+    interpolation: str,
+    registered: bool = True,
+    colored: bool = True,
 ) -> DemosaicedPicture:
     """Demosaic one mosaic.
 
@@ -59,21 +67,27 @@ def demosaic(
         mode: a key of ``DEMOSAIC_MODES``.
         interpolation: ``bilinear`` or ``guided``; ``quarter`` and a monochrome ``half`` interpolate no colors.
         registered: whether ``half`` brings the four angles to one place.
+        colored: whether a monochrome sensor gives three equal channels; else it gives one.
 
     Returns:
-        The picture, of size ``H // s`` x ``W // s`` for s = 2, 4 or 1 (what fills no cell is cut). A
-        monochrome sensor gives three equal channels.
+        The picture, of size ``H // s`` x ``W // s`` for s = 2, 4 or 1 (what fills no cell is cut).
     """
     step = 4 if mode == "quarter" else 2
     height, width = values.shape[0] // step * step, values.shape[1] // step * step
     values, bad = values[:height, :width], bad[:height, :width]
     if mode == "quarter":
-        return _superpixels(values, bad, pattern)
-    cells = _cells(values, bad, pattern, interpolation)
-    if mode == "full":
-        return _full(cells, pattern, interpolation)
-    plain = _half_size(cells, pattern)
-    return _registered(plain, _full(cells, pattern, interpolation), interpolation) if registered else plain
+        found = _superpixels(values, bad, pattern)
+    else:
+        cells = _cells(values, bad, pattern, interpolation)
+        if mode == "full":
+            found = _full(cells, pattern, interpolation)
+        else:
+            found = _half_size(cells, pattern)
+            if registered:
+                found = _registered(found, _full(cells, pattern, interpolation), interpolation)
+    if colored and found.intensities.shape[-1] == 1:
+        return DemosaicedPicture(np.repeat(found.intensities, 3, axis=-1), found.invalid)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,29 +122,31 @@ def _half_size(cells: _Cells, pattern: Pattern) -> DemosaicedPicture:
     """Half size: the samples of a cell, by angle."""
     angles = {int(pattern.angles[place]): place for place in cells.colors}
     stack = np.stack([cells.colors[angles[angle]] for angle in ANGLES])
-    return DemosaicedPicture(_with_three_channels(stack), np.any(list(cells.bad.values()), axis=0))
+    return DemosaicedPicture(stack, np.any(list(cells.bad.values()), axis=0))
 
 
 def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> DemosaicedPicture:
     """Full size: each channel is the mosaic of a monochrome polarization sensor."""
     height, width, channels = cells.colors[0, 0].shape
-    mosaic = np.empty((2 * height, 2 * width, channels), np.float32)
+    mosaic = np.empty((channels, 2 * height, 2 * width), np.float32)
     bad = np.empty((2 * height, 2 * width), bool)
     for (row, column), colors in cells.colors.items():
-        mosaic[row::2, column::2], bad[row::2, column::2] = colors, cells.bad[row, column]
-    places = tiled(pattern.angles[:2, :2], bad.shape)
-    planes = []
-    for channel in range(channels):
-        plane = np.ascontiguousarray(mosaic[..., channel])
+        mosaic[:, row::2, column::2], bad[row::2, column::2] = (
+            colors.transpose(2, 0, 1),
+            cells.bad[row, column],
+        )
+    at = {int(pattern.angles[place]): place for place in cells.colors}
+    # A plane of every angle and channel in turn; the channels come last only as they are looked at.
+    planes = np.empty((len(ANGLES), channels, 2 * height, 2 * width), np.float32)
+    for channel, plane in enumerate(mosaic):
         if interpolation == "bilinear":
-            planes.append(np.stack([bilinear(plane, places == angle) for angle in ANGLES]))
+            for index, angle in enumerate(ANGLES):
+                planes[index, channel] = bilinear_cell(plane, *at[angle])
         else:
-            planes.append(guided_polarization(plane, places))
-    if interpolation == "bilinear":
-        invalid = np.any([used_by_bilinear(bad, places == angle) for angle in ANGLES], axis=0)
-    else:
-        invalid = _dilated(bad, GUIDED_RADIUS)
-    return DemosaicedPicture(_with_three_channels(np.stack(planes, axis=-1)), np.asarray(invalid))
+            planes[:, channel] = guided_polarization(plane, tiled(pattern.angles[:2, :2], bad.shape))
+    # Around every pixel the 3x3 pixels hold what is used of all angles.
+    invalid = _dilated(bad, 1 if interpolation == "bilinear" else GUIDED_RADIUS)
+    return DemosaicedPicture(np.moveaxis(planes, 1, -1), invalid)
 
 
 def _registered(plain: DemosaicedPicture, full: DemosaicedPicture, interpolation: str) -> DemosaicedPicture:
@@ -157,15 +173,11 @@ def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> DemosaicedPictur
             chosen = angles == angle if colors is None else (angles == angle) & (colors == channel)
             samples = [blocks[:, row, :, column] for row, column in np.argwhere(chosen)]
             picture[index, ..., channel] = np.mean(samples, axis=0, dtype=np.float32)
-    return DemosaicedPicture(
-        _with_three_channels(picture), np.asarray(bad.reshape(rows, 4, columns, 4).any(axis=(1, 3)))
-    )
-
-
-def _with_three_channels(picture: Array) -> Array:
-    return np.repeat(picture, 3, axis=-1) if picture.shape[-1] == 1 else picture
+    return DemosaicedPicture(picture, np.asarray(bad.reshape(rows, 4, columns, 4).any(axis=(1, 3))))
 
 
 def _dilated(mask: Mask, radius: int) -> Mask:
+    if not mask.any():
+        return mask
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)

@@ -22,6 +22,7 @@ GUIDED_RADIUS = 3
 """Pixels around a sample that its value reaches in either guided interpolation: 2 for the guide, 1 beyond."""
 
 _TENT = np.outer([1, 2, 1], [1, 2, 1]).astype(np.float32)
+_HALVES = np.array([0.5, 1, 0.5], np.float32)
 _SOFT = np.float32(1e-2)
 _SOFT_SQUARE = np.float32(1e-4)
 
@@ -42,7 +43,21 @@ def bilinear(values: Array, known: Mask) -> Array:
 
 def used_by_bilinear(bad: Mask, known: Mask) -> Mask:
     """Where ``bilinear`` uses a bad sample."""
+    if not bad.any():
+        return np.zeros_like(bad)
     return np.where(known, bad, _filtered((bad & known).astype(np.float32)) > 0)
+
+
+def bilinear_cell(mosaic: Array, row: int, column: int) -> Array:
+    """``bilinear`` of the samples at rows ``row``, ``row + 2``, ... and columns ``column``, ``column + 2``, ...
+
+    Args:
+        mosaic: [H, W], H and W even. row, column: 0 or 1.
+    """
+    spread = np.zeros_like(mosaic)
+    spread[row::2, column::2] = mosaic[row::2, column::2]
+    # Reflected about the outermost pixel the lattice goes on, and the weights add up to 1 everywhere.
+    return np.asarray(cv2.sepFilter2D(spread, -1, _HALVES, _HALVES, borderType=cv2.BORDER_REFLECT_101))
 
 
 def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:

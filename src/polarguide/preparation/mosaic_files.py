@@ -1,0 +1,102 @@
+"""Raw mosaics of one sensor: reading them, cutting them to whole cells, their dark frame and their kind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.sensor.color_filters import color_filters
+from polarguide.capture.sensor.packing import PACKINGS
+from polarguide.capture.sensor.pattern import SENSORS, sensor_pattern
+from polarguide.capture.sensor.radiometry import Levels
+from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic
+from polarguide.errors import PolarguideError
+from polarguide.preparation.settings import PrepareSettings
+
+SMALLEST = 16
+"""Pixels of the shorter side of a mosaic."""
+
+
+class MosaicFiles:
+    """How the mosaics of one sensor are read.
+
+    Attributes:
+        pattern: of the top-left pixel that is left after ``cut``.
+        crop: columns and rows that ``cut`` takes off.
+    """
+
+    def __init__(self, settings: PrepareSettings) -> None:
+        """Take sensor, region, packing and dark frame from the settings.
+
+        Raises:
+            PolarguideError: the sensor is not named.
+        """
+        if settings.sensor is None:
+            raise PolarguideError(
+                "--sensor",
+                expected=f"the sensor of raw mosaics: {', '.join(SENSORS)}",
+                found="none",
+                remedy="Name it; color (MYR) and monochrome (MZR) sensors have different patterns.",
+            )
+        self._settings = settings
+        self._raw = RawFormat(settings.width, settings.height, settings.packing)
+        pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
+        self.crop = pattern.cell_corner()
+        self.pattern = pattern.shifted(*self.crop)
+
+    def read(self, path: Path) -> NDArray[Any]:
+        """The stored values of a whole mosaic, [H, W].
+
+        Raises:
+            PolarguideError: the file cannot be read, or is too small.
+        """
+        values = read_mosaic(path, self._raw)
+        if min(values.shape) < SMALLEST:
+            raise PolarguideError(
+                path,
+                expected=f"a mosaic of at least {SMALLEST}x{SMALLEST} pixels",
+                found=f"{values.shape[1]}x{values.shape[0]}",
+                remedy="Give the whole picture of the sensor.",
+            )
+        return values
+
+    def container(self, path: Path, values: NDArray[Any]) -> int:
+        """Bits that a pixel takes in the file."""
+        packing = self._settings.packing if path.suffix.lower() == ".raw" else None
+        return values.dtype.itemsize * 8 if packing is None else PACKINGS[packing][2]
+
+    def require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
+        """Refuse mosaics of the other kind of sensor: nothing later would tell."""
+        found = color_filters(blocks, levels.saturation, levels.black)
+        color = self.pattern.colors is not None
+        if found is None or (found == "color") == color:
+            return
+        other = next(name for name, colored in SENSORS.items() if colored != color)
+        raise PolarguideError(
+            "--sensor",
+            expected=f"mosaics of {self._settings.sensor}, a {'color' if color else 'monochrome'} sensor",
+            found="no sign of color filters" if color else "the Bayer pattern of color filters",
+            remedy=f"Use --sensor {other}, or that of your camera with this pattern.",
+        )
+
+    def cut(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Crop to whole cells."""
+        values = values[self.crop[1] :, self.crop[0] :]
+        return np.ascontiguousarray(values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2])
+
+    def dark(self, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+        """The dark frame, cut like the mosaics."""
+        if self._settings.dark_frame is None:
+            return None
+        dark = read_mosaic(self._settings.dark_frame, self._raw)
+        if dark.shape != shape:
+            raise PolarguideError(
+                self._settings.dark_frame,
+                expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
+                found=f"{dark.shape[1]}x{dark.shape[0]}",
+                remedy="Take it with the same region and settings, the lens covered.",
+            )
+        return self.cut(dark).astype(np.float32)

@@ -1,0 +1,236 @@
+"""From the files of a shot to linear intensities at four angles, and what is wrong with each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture import checks
+from polarguide.capture.calibration import UNIT_GAINS, Calibration, balancing_gains, oriented, pair_ratio
+from polarguide.capture.filter.align import align_shots, estimate_shifts
+from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
+from polarguide.capture.filter.shots import read_shots, require_four_shots
+from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
+from polarguide.capture.layout import find_layout, select_views
+from polarguide.capture.sensor.color_filters import SIDE
+from polarguide.capture.sensor.demosaic import demosaic
+from polarguide.capture.sensor.pattern import SENSOR_SIZE, tiled
+from polarguide.capture.sensor.radiometry import estimate_levels, unusable_samples
+from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.view_reader import read_view
+from polarguide.errors import PolarguideError
+from polarguide.preparation.mosaic_files import MosaicFiles
+from polarguide.preparation.mosaic_samples import block_intensities, sample_blocks
+from polarguide.shots.exposures import ExposureSet
+from polarguide.shots.maps import Map, NoiseModel
+from polarguide.shots.noise import estimated_noise, given_noise, interpolation_factors
+from polarguide.shots.options import ShotOptions
+
+Mask = NDArray[np.bool_]
+_LARGE_IMBALANCE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Developed:
+    """Intensities of a shot before anything is derived from them.
+
+    Attributes:
+        intensities: [4, H, W, C] float32, linear; noise about black may be negative.
+        dark, saturated, masked: [H, W].
+        noise: of a sample. factors: variance of an intensity (of the luminance) as a multiple of a sample's,
+            [4, p, p] over a period of pixels.
+        pair_ratio, notes: as in ``ShotMaps``.
+    """
+
+    intensities: Map
+    dark: Mask
+    saturated: Mask
+    masked: Mask
+    noise: NoiseModel
+    factors: Map
+    pair_ratio: float | None
+    notes: tuple[str, ...]
+
+
+def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
+    """Read the files of a shot.
+
+    Raises:
+        PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
+    """
+    if shot.kind == "mosaic":
+        return _mosaic(shot, options)
+    return _filter(shot, options) if shot.kind == "filter" else _scene_view(shot, options)
+
+
+def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
+    path, files = shot.files[0], MosaicFiles(options.preparation())
+    stored, pattern = files.read(path), files.pattern
+    _require_on_sensor(path, stored.shape, options)
+    dark = files.dark(stored.shape)
+    values = files.cut(stored)
+    container = files.container(path, stored)
+    levels = estimate_levels(
+        int(stored.max()),
+        int(np.bitwise_or.reduce(stored, None)),
+        container,
+        bits=options.bits,
+        black=options.black_level,
+        saturation=options.saturation,
+    )
+    files.require_kind(sample_blocks(values, SIDE), levels)
+    notes = []
+    if options.bits is None and container == 16:
+        notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
+    side = 2 * pattern.period
+    floor = None if dark is None else sample_blocks(dark, side)
+    angles, _, usable = block_intensities([sample_blocks(values, side)], levels, floor, pattern)
+    ratio = pair_ratio(angles, usable)
+    gains, said = _gains(ratio, options)
+    saturated, black = unusable_samples(values, levels, dark)
+    linear = levels.linear(values, dark)
+    if gains != UNIT_GAINS:
+        of_angle = dict(zip(ANGLES, gains, strict=True))
+        linear *= tiled(np.vectorize(lambda a: np.float32(1 / of_angle[a]))(pattern.angles), linear.shape)
+    lsb = 1 / (levels.white - levels.black)
+    cells = {int(pattern.angles[r, c]): linear[r::2, c::2] for r, c in np.ndindex(2, 2)}
+    noise = given_noise(options, lsb)
+    if noise is None:
+        bad = saturated | black
+        good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
+        noise = estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
+    mode, way = options.demosaic, options.interpolation
+    picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
+    lost = picture.invalid
+    blacks = np.zeros(lost.shape, bool)
+    if black.any():
+        blacks = demosaic(linear, black, pattern, mode=mode, interpolation=way).invalid
+    shape = lost.shape
+    assert options.sensor is not None
+    x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
+    return Developed(
+        intensities=oriented(picture.intensities, options.calibration),
+        dark=blacks,
+        saturated=lost,
+        masked=np.zeros(shape, bool),
+        noise=noise,
+        factors=_placed(interpolation_factors(options.sensor, x, y, mode), options.calibration),
+        pair_ratio=ratio,
+        notes=(*notes, *said),
+    )
+
+
+def _require_on_sensor(path: Path, shape: tuple[int, ...], options: ShotOptions) -> None:
+    """Refuse what is larger than the sensor: another one, or no mosaic."""
+    most = tuple(n - o for n, o in zip(SENSOR_SIZE, (options.offset_x, options.offset_y), strict=True))
+    if shape[1] > most[0] or shape[0] > most[1]:
+        raise PolarguideError(
+            path,
+            expected=f"at most {most[0]}x{most[1]} pixels of {options.sensor}",
+            found=f"{shape[1]}x{shape[0]}",
+            remedy="Check --sensor, --offset-x and --offset-y; prepare reads larger sensors of the same pattern.",
+        )
+
+
+def _placed(factors: Map, calibration: Calibration) -> Map:
+    """The factors by true angle."""
+    if calibration.permutes:
+        return oriented(factors, calibration)
+    return np.broadcast_to(factors.mean(axis=0), factors.shape)
+
+
+def _gains(
+    ratio: float | None, options: ShotOptions
+) -> tuple[tuple[float, float, float, float], tuple[str, ...]]:
+    """Gains of the four pictures, and what to say of them."""
+    if options.calibration.gains is not None:
+        return options.calibration.gains, ()
+    if ratio is None:
+        return UNIT_GAINS, ()
+    said = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
+    found = balancing_gains(ratio)
+    if found is None:
+        return UNIT_GAINS, (f"{said}: the angles or the encoding are probably wrong.",)
+    if options.gains == "auto":
+        return found, (f"{said}; corrected.",)
+    if abs(ratio - 1) > _LARGE_IMBALANCE:
+        return UNIT_GAINS, (f"{said}; not corrected (--gains auto does, a calibration does better).",)
+    return UNIT_GAINS, ()
+
+
+def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
+    require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
+    shots = read_shots(shot.files)
+    notes: list[str] = []
+    transfer: str = options.transfer
+    if transfer == "auto":
+        suffix = shot.files[0].suffix.lower()
+        decision = decide_transfer([shots], jpeg=suffix in (".jpg", ".jpeg"))
+        transfer = decision.transfer
+        notes.append(f"Transfer {decision.reason}.")
+    linear = linear_intensities(shots.pictures, transfer)
+    lsb = 1 / float(np.iinfo(shots.pictures.dtype).max)
+    clipped, dark = shots.clipped, shots.dark
+    if options.align:
+        shifts = estimate_shifts(linear)
+        linear, clipped = align_shots(linear, clipped, shifts)
+        moved = [
+            f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})"
+            for angle, shift in zip(ANGLES, shifts, strict=True)
+            if shift.corrected
+        ]
+        notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
+    saturated = np.asarray(clipped.any(axis=0))
+    gray = linear.mean(axis=3)
+    ratio = pair_ratio(gray, ~(saturated | dark))
+    gains, said = _gains(ratio, options)
+    if gains != UNIT_GAINS:
+        linear = linear / np.asarray(gains, np.float32)[:, None, None, None]
+        gray = linear.mean(axis=3)
+    noise = given_noise(options, lsb)
+    factor = 1.0 if noise is None else 1 / 3
+    noise = noise or estimated_noise(gray, ~(saturated | dark), lsb / 3**0.5)
+    turned = np.stack(
+        [apply_orientation(p, shots.orientation) for p in oriented(linear, options.calibration)]
+    )
+    upright = oriented(turned, orientation_calibration(shots.orientation))
+    return Developed(
+        intensities=np.ascontiguousarray(upright),
+        dark=np.ascontiguousarray(apply_orientation(dark, shots.orientation)),
+        saturated=np.ascontiguousarray(apply_orientation(saturated, shots.orientation)),
+        masked=np.zeros(upright.shape[1:3], bool),
+        noise=noise,
+        factors=np.full((4, 1, 1), factor, np.float32),
+        pair_ratio=ratio,
+        notes=(*notes, *said),
+    )
+
+
+def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
+    assert shot.root is not None
+    layout = find_layout(shot.root)
+    select_views(layout, [shot.view])
+    transfer = "srgb" if options.transfer == "srgb" else "linear"
+    data = read_view(layout, shot.view, factor=1, transfer=transfer)
+    largest = int(np.iinfo(data.peak.dtype).max)
+    scale = checks.full_scale(data.histogram, largest)
+    intensities = oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration)
+    saturated = np.zeros(data.black.shape, bool) if scale is None else np.asarray(data.peak >= scale)
+    masked = data.invalid if data.mask is None else data.invalid | ~data.mask
+    gray = intensities.mean(axis=3)
+    good = ~(saturated | data.black | data.invalid)
+    lsb = 1 / largest
+    noise = given_noise(options, lsb) or estimated_noise(gray, good, lsb)
+    return Developed(
+        intensities=intensities,
+        dark=data.black,
+        saturated=saturated,
+        masked=np.asarray(masked),
+        noise=noise,
+        factors=np.ones((4, 1, 1), np.float32),
+        pair_ratio=pair_ratio(gray, good),
+        notes=(),
+    )

@@ -1,0 +1,79 @@
+"""How shots are read. Nothing here imports torch or OpenCV."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from msgspec import Meta
+
+from polarguide.capture.calibration import Calibration, checked
+from polarguide.preparation.settings import PrepareSettings
+from polarguide.records import check_options
+
+_NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
+_Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
+
+
+@dataclass(frozen=True)
+class ShotOptions:
+    """How the files of a shot become intensities, and from when on a pixel counts.
+
+    Attributes:
+        sensor: Sensor of raw mosaics: MYR are color, MZR is monochrome. Without it files are shots through a filter.
+        packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
+        width: Width of .raw files in pixels; others must have it, too.
+        height: Height of .raw files in pixels.
+        bits: Bits of a sensor value in 16-bit files; without it 12 if no value exceeds 4095, else 16.
+        offset_x: Column of the sensor at which the region of interest starts.
+        offset_y: Row of the sensor at which it starts.
+        black_level: Stored value without light.
+        dark_frame: Picture with the lens covered, subtracted in place of the black level.
+        saturation: Stored value from which the sensor saturates; without it full scale.
+        demosaic: full, half or quarter resolution of the sensor.
+        interpolation: How half and full fill in colors and angles.
+        transfer: Encoding of filter shots; auto by the curvature of the response.
+        align: Estimate and correct small shifts between the four shots of a filter.
+        gains: none takes the angles as they are, auto corrects what the light of each shot tells of their gains.
+        calibration: gains, order, sense and zero of the angles.
+        full_well: Electrons of a sample at full scale, for its noise; without it the noise is estimated from each shot.
+        read_noise: Electrons of noise without light; goes with the full well.
+        snr: DoLP in units of its standard deviation from which on an angle counts.
+    """
+
+    sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
+    packing: Literal["10p", "12p", "12packed"] | None = None
+    width: _Positive | None = None
+    height: _Positive | None = None
+    bits: Annotated[int, Meta(ge=8, le=16)] | None = None
+    offset_x: _NotNegative = 0
+    offset_y: _NotNegative = 0
+    black_level: Annotated[float, Meta(ge=0)] = 0.0
+    dark_frame: Path | None = None
+    saturation: _Positive | None = None
+    demosaic: Literal["half", "quarter", "full"] = "full"
+    interpolation: Literal["bilinear", "guided"] = "bilinear"
+    transfer: Literal["auto", "linear", "srgb"] = "auto"
+    align: bool = True
+    gains: Literal["auto", "none"] = "none"
+    calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
+    full_well: Annotated[float, Meta(ge=10, le=1e9)] | None = None
+    read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    snr: Annotated[float, Meta(ge=0, le=1000)] = 3.0
+
+    def checked(self) -> ShotOptions:
+        """The options themselves.
+
+        Raises:
+            PolarguideError: a value is out of range.
+        """
+        check_options(self)
+        checked(self.calibration, "calibration")
+        return self
+
+    def preparation(self) -> PrepareSettings:
+        """The same as settings of ``prepare``, whose readers are used."""
+        known = {f.name for f in fields(PrepareSettings)}
+        return PrepareSettings(**{f.name: getattr(self, f.name) for f in fields(self) if f.name in known})
