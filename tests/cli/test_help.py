@@ -17,6 +17,7 @@ from polarguide.cli.app import VERBS, function_of, options_of, run
 ELSEWHERE = {
     *((verb, name) for verb in ("compare", "ablate") for name in ("seed", "views_per_step")),
     ("prepare", "calibration"),
+    ("measure", "calibration"),
 }
 HEAVY = ("torch", "scipy", "pycolmap", "cv2", "viser")
 
