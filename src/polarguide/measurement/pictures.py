@@ -123,14 +123,14 @@ def _short(name: str, most: int = 24) -> str:
 
 
 def diverging(values: Map, most: float) -> Picture:
-    """Blue at ``-most`` through white at 0 to red at ``most``, gray where there is no number; uint8 RGB [H, W, 3]."""
+    """Blue at ``-most``, light at 0, red at ``most``, gray where there is no number; uint8 RGB [H, W, 3]."""
     known = np.isfinite(values)
     place = np.clip(np.where(known, values, 0) / most, -1, 1)
     ramp = np.abs(place)
     picture = np.empty((*values.shape, 3), np.float32)
-    picture[..., 0] = np.where(place > 0, 255 - 77 * ramp, 255 - 222 * ramp)
-    picture[..., 1] = np.where(place > 0, 255 - 231 * ramp, 255 - 153 * ramp)
-    picture[..., 2] = np.where(place > 0, 255 - 212 * ramp, 255 - 83 * ramp)
+    picture[..., 0] = np.where(place > 0, 240 - 62 * ramp, 240 - 207 * ramp)
+    picture[..., 1] = np.where(place > 0, 240 - 216 * ramp, 240 - 138 * ramp)
+    picture[..., 2] = np.where(place > 0, 240 - 197 * ramp, 240 - 68 * ramp)
     picture[~known] = _NOT_COMPARED
     return np.rint(picture).astype(np.uint8)
 
