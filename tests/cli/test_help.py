@@ -18,6 +18,7 @@ ELSEWHERE = {
     *((verb, name) for verb in ("compare", "ablate") for name in ("seed", "views_per_step")),
     ("prepare", "calibration"),
     ("prepare", "analyzers"),
+    ("measure", "calibration"),
 }
 HEAVY = ("torch", "scipy", "pycolmap", "cv2", "viser")
 

@@ -29,6 +29,7 @@ VERBS = {
     "share": "share",
     "export": "export",
     "priors": "priors",
+    "measure": "measure",
     "compare": "compare",
     "ablate": "ablate",
     "synth": "synth",
@@ -61,7 +62,7 @@ def options_of(function: Callable[..., Any]) -> list[str]:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input)."""
+    """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input, or what the verb says)."""
     errors = Console(stderr=True, highlight=False, soft_wrap=True)
     if list(arguments) == ["--version"]:
         print(f"polarguide {__version__}")
@@ -69,7 +70,7 @@ def run(arguments: Sequence[str]) -> int:
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
     try:
         with warnings_printed():
-            _call(verb, arguments)
+            status = _call(verb, arguments)
     except PolarguideError as error:
         errors.print("[bold red]error:[/] ", end="")
         errors.print(printable(_as_flag(error, verb)), markup=False)
@@ -87,13 +88,14 @@ def run(arguments: Sequence[str]) -> int:
         )
         errors.print(printable(f"{said} Check the name, the rights, and the room on the disk."), markup=False)
         return 2
-    return 0
+    return status
 
 
-def _call(verb: str | None, arguments: Sequence[str]) -> None:
+def _call(verb: str | None, arguments: Sequence[str]) -> int:
+    """Call a verb; returns the exit status that it gives, 0 where it gives none."""
     if verb is not None:
-        tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=arguments[1:])
-        return
+        found = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=arguments[1:])
+        return found if isinstance(found, int) else 0
     if arguments and not arguments[0].startswith("-"):
         raise PolarguideError(
             arguments[0],
@@ -105,6 +107,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> None:
     tyro.extras.subcommand_cli_from_dict(
         verbs, prog="polarguide", description=DESCRIPTION, args=arguments, sort_subcommands=False
     )
+    return 0
 
 
 def _near(word: str) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Iterator
 
 from polarguide.evaluation.table import COLUMNS
@@ -13,6 +11,7 @@ from polarguide.experiments.part_tables import PART_METRICS, material_section, o
 from polarguide.experiments.results import Results
 from polarguide.experiments.shown import MINUS, Label, Section, ShownCell
 from polarguide.experiments.tables import scores_section
+from polarguide.spreadsheet import csv_lines
 
 _LATEX = {
     "\\": r"\textbackslash{}",
@@ -129,13 +128,13 @@ def csv_text(results: Results) -> str:
         cells = [row["cells"].get(column.key, NO_VALUE) for column in COLUMNS]
         values = (value for cell in cells for value in (cell["mean"], cell["spread"]))
         rows.append([row["scene"] or "", row["recipe"], row["finished"], *values])
-    return _csv(["scene", "recipe", "runs", *pairs], rows)
+    return csv_lines([["scene", "recipe", "runs", *pairs], *rows])
 
 
 def differences_csv(results: Results) -> str | None:
     """All paired differences in full precision (``scene`` empty: over scenes); None where there are none."""
     rows = [[d.get(field) for field in _DIFFERENCE_FIELDS] for d in results["differences"]]
-    return _csv(_DIFFERENCE_FIELDS, rows) if rows else None
+    return csv_lines([_DIFFERENCE_FIELDS, *rows]) if rows else None
 
 
 def parts_csv(results: Results) -> str | None:
@@ -152,7 +151,7 @@ def parts_csv(results: Results) -> str | None:
             [*place, seeds[0]["material"], seeds[0]["pixels"], seeds[0]["views"], len(seeds), *values]
         )
     head = ["scene", "recipe", "part", "name", "material", "pixels", "views", "runs", *pairs]
-    return _csv(head, rows) if rows else None
+    return csv_lines([head, *rows]) if rows else None
 
 
 def _parts(results: Results) -> Iterator[tuple[str, str, str, str, PartScores]]:
@@ -161,18 +160,3 @@ def _parts(results: Results) -> Iterator[tuple[str, str, str, str, PartScores]]:
             yield run["scene"], run["recipe"], "object", name, scores
         for name, scores in run["materials"].items():
             yield run["scene"], run["recipe"], "material", name, scores
-
-
-def _csv(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Rows of values; names that begin as formulas do get an apostrophe in front."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows([_plain(value) for value in row] for row in rows)
-    return file.getvalue()
-
-
-def _plain(value: object) -> object:
-    """A value that spreadsheets do not take for a formula: names of scenes come from folders."""
-    formula = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
-    return f"'{value}" if formula else value

@@ -1,0 +1,103 @@
+"""``polarguide measure``."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from polarguide.cli.console import console, use_threads
+from polarguide.cli.progress import ConsoleReporter
+from polarguide.errors import PolarguideError
+from polarguide.measurement.options import MeasureOptions, WatchOptions
+from polarguide.options import ThreadOptions
+from polarguide.preparation.settings import CalibrationOptions
+from polarguide.shots.options import ShotOptions
+from polarguide.system import StopSignals, signals_as_interrupts
+
+
+def measure(
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH ...")] = (),
+    /,
+    *,
+    out: Path,
+    options: Annotated[MeasureOptions, tyro.conf.arg(name="")],
+    watching: Annotated[WatchOptions, tyro.conf.arg(name="")],
+    reading: Annotated[ShotOptions, tyro.conf.arg(name="")],
+    angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
+    compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
+) -> int:
+    """A table of many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.
+
+    Writes table.csv (a line per region), table.jsonl (a line per shot), and pictures of shots beyond their limits.
+    The same command goes on where it stopped: what is in the table is not measured again. The exit status is 3 if a
+    shot is beyond a limit, else 2 if one could not be read. docs/how-to/inspection-line.md shows the whole way.
+
+    Args:
+        paths: Raw mosaics, shots of four files, scenes, or folders of them.
+        out: Folder of the table.
+    """
+    use_threads(compute.threads)
+    if bool(paths) == (watching.watch is not None):
+        raise PolarguideError(
+            "--watch",
+            expected="shots to measure, or a folder to watch",
+            found="both" if paths else "neither",
+            remedy="Give files and folders for one pass, or --watch FOLDER.",
+        )
+    reading = replace(reading, calibration=angles.read())
+    said = _Lines()
+    if watching.watch is None:
+        line = importlib.import_module("polarguide.measurement.line")
+        with signals_as_interrupts():
+            outcome = line.measure_shots(paths, out, options, reading, heard=said, reporter=ConsoleReporter())
+    else:
+        said.all = True
+        watch = importlib.import_module("polarguide.measurement.watch")
+        with StopSignals() as should_stop:
+            outcome = watch.watch_folder(
+                watching.watch, out, options, reading, watching,
+                should_stop=should_stop, heard=said, reporter=ConsoleReporter(),
+            )  # fmt: skip
+    _print_outcome(outcome)
+    status: int = outcome.exit_status
+    return status
+
+
+class _Lines:
+    """Shots as lines, those that could not be read on stderr; ``all``: also those with nothing against them."""
+
+    all = False
+
+    def __init__(self) -> None:
+        self._errors = Console(stderr=True, highlight=False, soft_wrap=True)
+
+    def __call__(self, entry: Any) -> None:
+        if entry.status == "unread":
+            self._errors.print("[bold red]error:[/] ", end="")
+            self._errors.print(entry.why, markup=False)
+        elif entry.status == "beyond":
+            console.print("[bold red]beyond:[/] ", end="")
+            faults = (f"{row['region']} {row['why']}" for row in entry.regions if row["why"])
+            console.print(f"{entry.shot}: {'; '.join(faults)}", markup=False)
+        elif self.all:
+            console.print(f"{entry.status}: {entry.shot}", markup=False)
+
+
+def _print_outcome(outcome: Any) -> None:
+    counts = outcome.counts
+    shots = ", ".join(
+        f"{counts[status]} {status}"
+        for status in ("measured", "within", "beyond", "unread")
+        if counts[status]
+    )
+    before = f" ({outcome.earlier} of them earlier)" if outcome.earlier else ""
+    console.print(f"shots: {shots or 'none'}{before}", markup=False)
+    if outcome.waiting:
+        console.print(f"not complete, and not measured: {', '.join(outcome.waiting)}", markup=False)
+    pictures = f"   pictures: {outcome.folder}/beyond" if counts["beyond"] else ""
+    console.print(f"table: {outcome.folder}/table.csv, .jsonl{pictures}", markup=False)

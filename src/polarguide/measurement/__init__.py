@@ -1,0 +1,1 @@
+"""Inspection lines: figures of regions of many shots, their limits, and a golden part to compare with."""

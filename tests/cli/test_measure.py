@@ -1,0 +1,142 @@
+"""``polarguide measure``: its exit status, its lines, and what it writes."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from camera_files import write_mosaics
+
+from polarguide.cli.app import run
+from polarguide.measurement.pictures import diverging
+
+SENSOR = ("--sensor", "IMX250MZR", "--bits", "12", "--threads", "1")
+
+
+@pytest.fixture
+def shots(tmp_path: Path) -> Path:
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    write_mosaics(folder, 3, color=False, bits=12)
+    return folder
+
+
+def measure(*arguments: object) -> int:
+    return run(["measure", *(str(argument) for argument in (*arguments, *SENSOR))])
+
+
+def rows_of(out: Path) -> list[dict[str, str]]:
+    with open(out / "table.csv", newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_folder_with_a_bad_file(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (shots / "v001.png").write_bytes(b"no picture")
+    out = tmp_path / "out"
+    assert measure(shots, "--out", out) == 2
+    printed = capsys.readouterr()
+    (line,) = printed.err.splitlines()
+    assert line.startswith(f"error: {shots / 'v001.png'}: expected a complete PNG, JPEG or TIFF file")
+    assert "shots: 2 measured, 1 unread" in printed.out
+    assert [(row["shot"], row["status"]) for row in rows_of(out)] == [
+        ("v000", "measured"), ("v001", "unread"), ("v002", "measured"),
+    ]  # fmt: skip
+    assert measure(shots, "--out", out) == 2
+    assert "(3 of them earlier)" in capsys.readouterr().out
+    assert len(rows_of(out)) == 3
+
+
+def test_limits_and_the_picture_of_what_is_beyond(
+    shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits, out = tmp_path / "limits.json", tmp_path / "out"
+    # S0 falls by a tenth from shot to shot: the last is beyond, in one of two regions.
+    options = ("--out", out, "--roi", "left=0,0,20,48", "--roi", "40,8,16,16", "--limits", limits)
+    limits.write_text(json.dumps({"limits": {"saturated": {"max": 0}}}))
+    assert measure(shots, *options) == 0
+    middle = [float(row["s0_mean"]) for row in rows_of(out) if row["region"] == "left"]
+    assert middle[0] > middle[1] > middle[2]
+    bound = (middle[1] + middle[2]) / 2
+    limits.write_text(json.dumps({"regions": {"left": {"s0_mean": {"min": bound}}}}))
+    assert measure(shots, *options) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert measure(shots, *options, "--overwrite") == 3
+    assert "beyond: v002: left s0_mean" in capsys.readouterr().out
+    assert [(row["shot"], row["region"], row["status"]) for row in rows_of(out)] == [
+        ("v000", "left", "within"), ("v000", "roi2", "measured"),
+        ("v001", "left", "within"), ("v001", "roi2", "measured"),
+        ("v002", "left", "beyond"), ("v002", "roi2", "measured"),
+    ]  # fmt: skip
+    assert [path.name for path in (out / "beyond").iterdir()] == ["v002.png"]
+    picture = cv2.imread(str(out / "beyond" / "v002.png"))[..., ::-1].astype(int)
+    assert picture.shape[1] == 640
+    red = (picture[..., 0] > 200) & (picture[..., 1] < 80)
+    green = (picture[..., 1] > 180) & (picture[..., 0] < 80)
+    assert red[100, :4].any()  # ten times as large: the left edge of "left"
+    assert green[80:240, 400:402].any()  # and of the other
+
+
+def test_a_golden_part(shots: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert measure(shots, "--out", out, "--reference", shots / "v000.png") == 0
+    rows = rows_of(out)
+    assert float(rows[0]["s0_difference_rms"]) == float(rows[0]["aolp_difference_p99"]) == 0
+    # The same light, a tenth darker: of the polarization, only rounding differs.
+    assert float(rows[1]["s0_difference"]) == pytest.approx(-0.1 * float(rows[0]["s0_mean"]), rel=0.01)
+    assert float(rows[1]["dolp_difference_p99"]) < 0.003
+    assert abs(float(rows[1]["aolp_difference"])) < 0.1
+    assert sorted(path.name for path in (out / "differences").iterdir()) == [
+        "v000.png",
+        "v001.png",
+        "v002.png",
+    ]
+
+
+def test_a_reference_of_another_size(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "small.png"), np.full((32, 32), 900, np.uint16))
+    assert measure(shots / "v000.png", "--out", tmp_path / "out", "--reference", tmp_path / "small.png") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "expected 32x32 pixels like the reference small, found 64x48" in line
+
+
+def test_colors_of_differences() -> None:
+    picture = diverging(np.array([[-1.0, -0.5, 0.0, 0.5, 1.0, 9.0, np.nan]], np.float32), 1.0)[0].astype(int)
+    assert picture[0, 2] > picture[0, 0]
+    assert picture[4, 0] > picture[4, 2]
+    assert len(set(picture[2])) == 1
+    assert (picture[4] == picture[5]).all()
+    assert len(set(picture[6])) == 1
+    assert picture[6, 0] < picture[2, 0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--roi", "1,2,3"), "--roi: expected x,y,width,height"),
+        (("--roi", "a=0,0,1,1", "--roi", "a=0,0,2,2"), "a twice"),
+        (("--roi", "60,40,10,10"), "the region roi1 within 64x48 pixels"),
+        (("--threshold", "2"), "--threshold: expected 0 to 1"),
+        (("--limits", "none.json"), "none.json: expected a readable file"),
+        (("--reference", "none.png"), "none.png: expected a file or folder of shots"),
+        (("--watch", "."), "--watch: expected shots to measure, or a folder to watch"),
+        (("--settle", "-1"), "--settle"),
+    ],
+)
+def test_one_line_for_a_mistake(
+    arguments: tuple[str, ...], said: str, shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert measure(shots / "v000.png", "--out", tmp_path / "out", *arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert said in line
+
+
+def test_nothing_to_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert measure("--out", tmp_path / "out") == 2
+    assert "found neither" in capsys.readouterr().err
+    assert measure("--watch", tmp_path / "none", "--out", tmp_path / "out") == 2
+    assert "expected a folder to watch" in capsys.readouterr().err

@@ -1,0 +1,119 @@
+"""The table on disk: torn at any byte, it loses no line and doubles none."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from polarguide.errors import PolarguideError
+from polarguide.measurement.fields import FORMAT, KEYS
+from polarguide.measurement.table import CSV, LINES, Entry, FileStamp, Table
+
+SETTINGS = {"threshold": 0.05}
+
+
+def entry(number: int, name: str = "shot", status: str = "measured") -> Entry:
+    figures = ({"region": "all", "status": status, "s0_mean": 0.5 + number},) if status != "unread" else ()
+    files = (FileStamp(f"/in/{name}{number}.png", 10, 10**18 + number),)
+    return Entry(FORMAT, f"{name}{number}", files, status, "", (), figures)  # type: ignore[arg-type]
+
+
+def write(folder: Path, entries: list[Entry], **options: bool) -> None:
+    with Table(folder, SETTINGS, **options) as table:
+        for one in entries:
+            if table.status_of(one.files) is None:
+                table.add(one)
+
+
+def test_torn_at_any_byte_it_is_mended(tmp_path: Path) -> None:
+    entries = [entry(n) for n in range(3)]
+    write(tmp_path, entries)
+    lines, rows = (tmp_path / LINES).read_bytes(), (tmp_path / CSV).read_bytes()
+    assert len(lines.splitlines()) == 3
+    assert len(rows.splitlines()) == 4
+    second = lines.index(b"\n") + 1
+    for cut in (0, 1, second - 1, second, second + 1, second + 90, len(lines) - 1, len(lines)):
+        for torn in (0, len(rows) // 2, len(rows) - 1, len(rows)):
+            (tmp_path / LINES).write_bytes(lines[:cut])
+            (tmp_path / CSV).write_bytes(rows[:torn])
+            with Table(tmp_path, SETTINGS) as table:
+                done = [table.status_of(one.files) is not None for one in entries]
+            assert sum(done) == lines[:cut].count(b"\n")
+            write(tmp_path, entries)
+            assert (tmp_path / LINES).read_bytes() == lines
+            assert (tmp_path / CSV).read_bytes() == rows
+
+
+def test_the_line_is_on_disk_before_the_row_is_written(tmp_path: Path, monkeypatch) -> None:
+    with Table(tmp_path, SETTINGS) as table:
+        header = (tmp_path / CSV).stat().st_size
+        seen = []
+
+        def fsync(number: int) -> None:
+            seen.append(((tmp_path / LINES).stat().st_size > 0, (tmp_path / CSV).stat().st_size > header))
+
+        monkeypatch.setattr("os.fsync", fsync)
+        table.add(entry(0))
+    assert seen == [(True, False), (True, True)]
+
+
+def test_what_cannot_be_written_leaves_no_half_line(tmp_path: Path, monkeypatch) -> None:
+    with Table(tmp_path, SETTINGS) as table:
+        table.add(entry(0))
+        before = (tmp_path / LINES).read_bytes()
+
+        def full(number: int) -> None:
+            raise OSError(28, "No space left on device")
+
+        with monkeypatch.context() as patch:
+            patch.setattr("os.fsync", full)
+            with pytest.raises(PolarguideError, match="No space left"):
+                table.add(entry(1))
+        assert (tmp_path / LINES).read_bytes() == before
+        assert table.status_of(entry(1).files) is None
+
+
+def test_damage_in_the_middle_is_told(tmp_path: Path) -> None:
+    write(tmp_path, [entry(0), entry(1)])
+    lines = (tmp_path / LINES).read_bytes()
+    (tmp_path / LINES).write_bytes(b"x" + lines)
+    with pytest.raises(PolarguideError, match=r"line 1\): expected a JSON file"):
+        Table(tmp_path, SETTINGS)
+    assert (tmp_path / LINES).read_bytes() == b"x" + lines
+
+
+def test_one_table_has_one_set_of_options(tmp_path: Path) -> None:
+    write(tmp_path, [entry(0)])
+    lines = (tmp_path / LINES).read_bytes()
+    with pytest.raises(PolarguideError, match=r"threshold\): expected 0.05, found 0.1"):
+        Table(tmp_path, {"threshold": 0.1})
+    assert (tmp_path / LINES).read_bytes() == lines
+    Table(tmp_path, {"threshold": 0.1}, overwrite=True).close()
+    assert (tmp_path / LINES).read_bytes() == b""
+
+
+def test_a_table_of_nothing_but_failures_is_begun_anew(tmp_path: Path) -> None:
+    write(tmp_path, [entry(0, status="unread")])
+    Table(tmp_path, {"threshold": 0.1}).close()
+    assert (tmp_path / LINES).read_bytes() == b""
+
+
+def test_two_do_not_write_one_table(tmp_path: Path) -> None:
+    with Table(tmp_path, SETTINGS), pytest.raises(PolarguideError, match="another polarguide measure"):
+        Table(tmp_path, SETTINGS)
+    Table(tmp_path, SETTINGS).close()
+
+
+def test_names_are_no_formulas_and_need_not_be_unicode(tmp_path: Path) -> None:
+    write(tmp_path, [entry(0, "=1+1"), entry(1, "a\udcff"), entry(2, 'b,"c\nd')])
+    with open(tmp_path / CSV, newline="", encoding="utf-8") as file:
+        head, *rows = csv.reader(file)
+    assert head == list(KEYS)
+    assert [row[0] for row in rows] == ["'=1+10", "a\\udcff1", 'b,"c\nd2']
+    shots = [json.loads(line)["shot"] for line in (tmp_path / LINES).read_bytes().splitlines()]
+    assert shots == ["=1+10", "a\udcff1", 'b,"c\nd2']
+    write(tmp_path, [entry(0, "=1+1"), entry(1, "a\udcff"), entry(2, 'b,"c\nd')])
+    assert (tmp_path / LINES).read_bytes().count(b"\n") == 3
