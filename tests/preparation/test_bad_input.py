@@ -186,9 +186,9 @@ COLMAP: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "a picture of no size": ("cameras.bin", patched(16, "<QQ", 0, 0), "a camera of 0x0 pixels"),
     "another camera": ("images.bin", patched(72, "<I", 9), "COLMAP|refuses"),
     "an unknown model": ("cameras.bin", patched(12, "<i", 99), "refuses"),
-    "a nan pose": ("images.bin", patched(12, "<d", float("nan")), "finite pose"),
-    "an infinite place": ("images.bin", patched(44, "<d", float("inf")), "finite pose"),
-    "a zero quaternion": ("images.bin", patched(12, "<d", 0.0), "finite pose"),
+    "a nan pose": ("images.bin", patched(12, "<d", float("nan")), "expected a pose and a lens of numbers up to"),
+    "an infinite place": ("images.bin", patched(44, "<d", float("inf")), "expected a pose and a lens of numbers up to"),
+    "a zero quaternion": ("images.bin", patched(12, "<d", 0.0), "expected a pose and a lens of numbers up to"),
     "a negative focal length": ("cameras.bin", patched(32, "<dd", -80, -80), "positive focal"),
     "no cameras": ("cameras.bin", lambda path: path.unlink(), "expected a COLMAP model .*neither there"),
     "no images": ("images.bin", lambda path: path.unlink(), "images.bin: expected this file of the COLMAP model"),
@@ -213,8 +213,8 @@ TEXT: dict[str, tuple[str, str, str]] = {
         "images.txt", "1 1 0 0 0 0 0 2 1 a/v000.png\n\n2 1 0 0 0 0 0 2 1 b/v000.jpg\n\n", "one image called v000"
     ),
     "strangers": ("images.txt", "1 1 0 0 0 0 0 2 1 other.png\n\n", "expected images named like the views"),
-    "a nan pose": ("images.txt", "1 nan 0 0 0 0 0 2 1 v000.png\n\n", "finite pose|refuses"),
-    "an infinite place": ("images.txt", "1 1 0 0 0 inf 0 2 1 v000.png\n\n", "finite pose|refuses"),
+    "a nan pose": ("images.txt", "1 nan 0 0 0 0 0 2 1 v000.png\n\n", "expected a pose and a lens of|refuses"),
+    "an infinite place": ("images.txt", "1 1 0 0 0 inf 0 2 1 v000.png\n\n", "expected a pose and a lens of|refuses"),
 }  # fmt: skip
 
 

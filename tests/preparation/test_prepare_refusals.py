@@ -173,9 +173,9 @@ def test_filter_shots(tmp_path: Path, case: str) -> None:
             "1 1 0 0 0 0 0 2 1 v000.png",
             "expected the size of the pictures, 32x24",
         ),
-        ("PINHOLE 64 48 80 82 32 24", "1 nan 0 0 0 0 0 2 1 v000.png", "finite pose|refuses"),
-        ("PINHOLE 64 48 80 82 32 24", "1 1 0 0 0 nan 0 2 1 v000.png", "finite pose|refuses"),
-        ("PINHOLE 64 48 nan 82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", "finite pose|refuses|COLMAP"),
+        ("PINHOLE 64 48 80 82 32 24", "1 nan 0 0 0 0 0 2 1 v000.png", "expected a pose and a lens of|refuses"),
+        ("PINHOLE 64 48 80 82 32 24", "1 1 0 0 0 nan 0 2 1 v000.png", "expected a pose and a lens of|refuses"),
+        ("PINHOLE 64 48 nan 82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", "expected a pose and a lens of|refuses|COLMAP"),
         ("PINHOLE 64 48 -80 -82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", "positive focal"),
     ],
 )
