@@ -10,7 +10,16 @@ from pathlib import Path
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, atomic_folder, make_folder, read_file, write_text, write_whole, writing
+from polarguide.files import (
+    atomic,
+    atomic_folder,
+    holds_files,
+    make_folder,
+    read_file,
+    write_text,
+    write_whole,
+    writing,
+)
 
 
 def test_a_file_is_replaced(tmp_path: Path) -> None:
@@ -123,3 +132,11 @@ def test_a_folder_that_cannot_be_copied_is_one_reason(
     with pytest.raises(PolarguideError) as caught, writing(tmp_path / "new"):
         shutil.copytree(tmp_path / "old", tmp_path / "new")
     assert caught.value.found == "[Errno 28] No space left on device"
+
+
+def test_what_a_killed_process_left_is_no_content(tmp_path: Path) -> None:
+    assert not holds_files(tmp_path)
+    (tmp_path / ".scene.json.4711.tmp").write_text("{")
+    assert not holds_files(tmp_path)
+    (tmp_path / ".mine.tmp").write_text("")
+    assert holds_files(tmp_path)
