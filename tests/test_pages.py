@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import polarguide
+from polarguide.visualization.embedded import content_policy
 
 PAGES = sorted(Path(polarguide.__file__).parent.rglob("*.html"))
 
@@ -17,12 +18,16 @@ def test_there_are_pages() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_page_asks_for_nothing(page: Path) -> None:
-    (policy,) = re.findall(
-        r'http-equiv="Content-Security-Policy"\s+content="([^"]*)"', page.read_text("utf-8")
-    )
-    rules = dict(rule.strip().partition(" ")[::2] for rule in policy.split(";") if rule.strip())
+def test_a_page_has_the_policy_before_anything_else(page: Path) -> None:
+    text = page.read_text("utf-8")
+    policy = text.index('<meta http-equiv="Content-Security-Policy" content="$policy">')
+    assert not re.search(r"<(script|style|link|body|img)", text[:policy])
+
+
+@pytest.mark.parametrize("script", ["", "let x = 1;"])
+def test_the_policy_asks_for_nothing(script: str) -> None:
+    rules = dict(rule.strip().partition(" ")[::2] for rule in content_policy(script).split(";"))
     assert rules["default-src"] == "'none'"
-    assert not re.search(r"https?:|\*", policy), "nothing comes from elsewhere"
-    assert "'unsafe-eval'" not in policy
-    assert "'unsafe-inline'" not in rules.get("script-src", "")
+    assert rules["base-uri"] == rules["form-action"] == "'none'"
+    assert re.fullmatch(r"'sha256-[A-Za-z0-9+/]{43}='" if script else "", rules.get("script-src", ""))
+    assert not re.search(r"https?:|\*|unsafe-eval", content_policy(script)), "nothing comes from elsewhere"

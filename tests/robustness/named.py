@@ -64,7 +64,7 @@ def scenes() -> Iterator[Case]:
         "an ior": [{"material": {"ior": "1.5"}}],
     }
     for name, value in wrong.items():
-        yield says(f"objects {name}", types(value), EVAL, r"error: scene/scene\.json \(objects.*expected ")
+        yield says(f"objects {name}", types(value), READ, r"error: scene/scene\.json \(objects.*expected ")
     pictures = {
         "gray": "warning: 1 of 9 views have gray pictures among others in color",
         "black": "warning: 1 of 9 views have pictures that are black throughout",
