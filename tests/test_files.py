@@ -13,6 +13,7 @@ from polarguide.errors import PolarguideError
 from polarguide.files import (
     atomic,
     atomic_folder,
+    holds_files,
     make_folder,
     read_file,
     require_inside,
@@ -169,3 +170,11 @@ def test_files_larger_than_they_may_be(tmp_path: Path) -> None:
         read_file(tmp_path / "sparse")
     with pytest.raises(PolarguideError, match="more than 1 MiB"):
         read_file(tmp_path / "sparse", largest=1 << 20)
+
+
+def test_what_a_killed_process_left_is_no_content(tmp_path: Path) -> None:
+    assert not holds_files(tmp_path)
+    (tmp_path / ".scene.json.4711.tmp").write_text("{")
+    assert not holds_files(tmp_path)
+    (tmp_path / ".mine.tmp").write_text("")
+    assert holds_files(tmp_path)

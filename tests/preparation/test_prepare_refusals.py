@@ -173,9 +173,21 @@ def test_filter_shots(tmp_path: Path, case: str) -> None:
             "1 1 0 0 0 0 0 2 1 v000.png",
             "expected the size of the pictures, 32x24",
         ),
-        ("PINHOLE 64 48 80 82 32 24", "1 nan 0 0 0 0 0 2 1 v000.png", "expected a pose and a lens of|refuses"),
-        ("PINHOLE 64 48 80 82 32 24", "1 1 0 0 0 nan 0 2 1 v000.png", "expected a pose and a lens of|refuses"),
-        ("PINHOLE 64 48 nan 82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", "expected a pose and a lens of|refuses|COLMAP"),
+        (
+            "PINHOLE 64 48 80 82 32 24",
+            "1 nan 0 0 0 0 0 2 1 v000.png",
+            "expected a pose and a lens of|refuses",
+        ),
+        (
+            "PINHOLE 64 48 80 82 32 24",
+            "1 1 0 0 0 nan 0 2 1 v000.png",
+            "expected a pose and a lens of|refuses",
+        ),
+        (
+            "PINHOLE 64 48 nan 82 32 24",
+            "1 1 0 0 0 0 0 2 1 v000.png",
+            "expected a pose and a lens of|refuses|COLMAP",
+        ),
         ("PINHOLE 64 48 -80 -82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", "positive focal"),
     ],
 )
@@ -210,6 +222,23 @@ def test_a_full_disk_and_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert done.views == list(NAMES)
     assert first.stat().st_mtime_ns == before
     assert not prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC).new
+
+
+def test_a_preparation_that_could_not_write_at_all_is_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Folders fit on a disk that takes no file: they are nobody's other files the next time."""
+    write_mosaics(tmp_path / "in", 3)
+
+    def full(source: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(files.os, "replace", full)
+    assert "No space left on device" in refused(tmp_path / "in", tmp_path / "out", MOSAIC)
+    monkeypatch.undo()
+    (tmp_path / "out" / ".prepare.json.4711.tmp").write_text("{")  # of one that was killed at this moment
+    assert prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC).views == list(NAMES)
+    assert not list(tmp_path.rglob("*.tmp"))
 
 
 def test_a_stopped_preparation_gives_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ further seeds of the random ones.
 
 from __future__ import annotations
 
+import importlib
 import random
 import resource
 from collections.abc import Callable, Iterator
@@ -124,17 +125,21 @@ def scene_cases() -> Iterator[Case]:
 
 def _binary(name: str, how: str) -> Callable[[Path, random.Random], None]:
     def change(folder: Path, rng: random.Random) -> None:
-        import pycolmap
-
-        sparse = folder / "scene" / "sparse" / "0"
-        model = pycolmap.Reconstruction()
-        model.read_text(str(sparse))
-        model.write_binary(str(sparse))
-        for path in sparse.glob("*.txt"):
-            path.unlink()
-        spoil.bytes_of(sparse / f"{name}.bin", rng, how)
+        binary_model(folder)
+        spoil.bytes_of(folder / "scene/sparse/0" / f"{name}.bin", rng, how)
 
     return change
+
+
+def binary_model(folder: Path) -> None:
+    """Write the scene's model in COLMAP's other format."""
+    pycolmap = importlib.import_module("pycolmap")
+    sparse = folder / "scene" / "sparse" / "0"
+    model = pycolmap.Reconstruction()
+    model.read_text(str(sparse))
+    model.write_binary(str(sparse))
+    for path in sparse.glob("*.txt"):
+        path.unlink()
 
 
 def _whole_scene_cases() -> Iterator[Case]:

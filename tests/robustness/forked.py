@@ -39,6 +39,7 @@ class Case:
         name: what is spoiled, and how. seed: of its random choices.
         make: see ``Make``.
         accepted: why it may pass without a word; empty: it may not.
+        says: a regular expression of what it has to print; empty: anything.
         check: raises where what was written is not as it should be; called with the folder, after the command.
     """
 
@@ -47,6 +48,7 @@ class Case:
     make: Make
     accepted: str = ""
     check: Callable[[Path], None] | None = None
+    says: str = ""
 
 
 @dataclass(frozen=True)
@@ -177,4 +179,6 @@ def _outcome(case: Case, folder: Path, status: int, usage: object, canary: str, 
         kind = "warning"
     else:
         kind = "accepted" if case.accepted else "silent"
+    if kind in ("error", "warning", "accepted") and not re.search(case.says, said, re.DOTALL):
+        kind = "unclear"
     return Outcome(case, kind, said[-1500:], seconds, mebibytes)

@@ -6,6 +6,7 @@ python tests/robustness/fuzz.py [--seeds N] [--first SEED] [--only TEXT]
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import tempfile
 from collections import Counter
@@ -17,6 +18,7 @@ from warm import warm_up  # it puts the helpers on the path
 from base import make_base  # isort: skip
 from corpus import corpus  # isort: skip
 from forked import Outcome, outcomes  # isort: skip
+from named import named_cases  # isort: skip
 
 
 def run(seeds: int = 1, first: int = 0, only: str = "", at_once: int = 2) -> Iterator[Outcome]:
@@ -25,7 +27,8 @@ def run(seeds: int = 1, first: int = 0, only: str = "", at_once: int = 2) -> Ite
     with tempfile.TemporaryDirectory() as folder:
         base, work = Path(folder) / "base", Path(folder) / "work"
         make_base(base)
-        yield from outcomes((c for c in corpus(first, seeds) if only in c.name), base, work, at_once)
+        cases = itertools.chain(corpus(first, seeds), named_cases())
+        yield from outcomes((c for c in cases if only in c.name), base, work, at_once)
 
 
 def main() -> int:

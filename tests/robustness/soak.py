@@ -1,7 +1,7 @@
 # ruff: noqa: E501
 """``make soak``: commands are killed at random moments and repeated until they end; then their files are compared.
 
-python tests/robustness/soak.py [--kills N] [--seed SEED]
+python tests/robustness/soak.py [--kills N] [--seed SEED] [--without TEXT]
 
 Trainings of every recipe, preparations, exports, pages and comparisons. The killed command runs in a fork of this process,
 so that the moments fall into its work and not into its start. What it ends with has to have the same bytes as that of a command
@@ -104,12 +104,12 @@ def digests(out: Path) -> dict[str, str]:
     }
 
 
-def soak(kills: int, seed: int) -> Counter[str]:
+def soak(kills: int, seed: int, without: str = "") -> Counter[str]:
     """Kill; returns how many kills of each kind, and of faults."""
     rng = random.Random(seed)
     counts: Counter[str] = Counter()
     expected: dict[str, tuple[dict[str, str], float]] = {}
-    names = list(COMMANDS)
+    names = [name for name in COMMANDS if not without or without not in name]
     while sum(count for name, count in counts.items() if name in COMMANDS) < kills:
         name = names[counts.total() % len(names)] if counts.total() < len(names) else rng.choice(names)
         command = COMMANDS[name]
@@ -159,12 +159,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--without", default="", help="leave out commands of this name; compare takes longest"
+    )
     asked = parser.parse_args()
     warm_up()
     with tempfile.TemporaryDirectory() as folder:
         make_base(Path(folder) / "base")
         os.chdir(Path(folder) / "base")
-        counts = soak(asked.kills, asked.seed)
+        counts = soak(asked.kills, asked.seed, asked.without)
     print(f"{counts.total() - counts['fault']} kills, {counts['fault']} faults: {dict(counts)}")
     return int(counts["fault"] > 0)
 
