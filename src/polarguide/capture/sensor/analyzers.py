@@ -380,7 +380,7 @@ def is_analyzer_file(path: Path) -> bool:
             start = file.read(64)
     except OSError:
         return False
-    return path.suffix.lower() == SUFFIX or start[8:9] == b"{"
+    return path.suffix.lower() == SUFFIX or (start[8:9] == b"{" and not start[:8].isspace())
 
 
 def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
