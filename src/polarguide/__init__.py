@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polarguide import optics
-    from polarguide.api import Run, demo_scene, inspect, open_run, prepare, priors, train
+    from polarguide.api import Run, demo_scene, inspect, open_run, prepare, present, priors, train
     from polarguide.capture import Scene, load_scene
     from polarguide.errors import PolarguideError, PolarguideWarning
     from polarguide.experiments.ablate import ablate
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _NAMES = {
-    "api": ("Run", "demo_scene", "inspect", "open_run", "prepare", "priors", "train"),
+    "api": ("Run", "demo_scene", "inspect", "open_run", "prepare", "present", "priors", "train"),
     "capture": ("Scene", "load_scene"),
     "errors": ("PolarguideError", "PolarguideWarning"),
     "experiments.ablate": ("ablate",),
@@ -65,6 +65,7 @@ __all__ = [
     "open_run",
     "optics",
     "prepare",
+    "present",
     "priors",
     "train",
 ]

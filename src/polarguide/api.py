@@ -25,6 +25,7 @@ from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.rendering import film, pictures, relight
+from polarguide.rendering import present as presenting
 from polarguide.rendering.priors import write_priors
 from polarguide.runs import train as training
 from polarguide.runs.opened import OpenedRun
@@ -63,6 +64,7 @@ class Run(OpenedRun):
 
 
 open_run = Run.open
+present = presenting.present
 prepare = prepare_scene
 priors = write_priors
 
