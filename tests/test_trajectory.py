@@ -42,6 +42,28 @@ def test_the_frame_of_cameras_around_a_point() -> None:
     assert frame.distance == pytest.approx(4.0)
 
 
+def test_up_is_level_s_normal_though_all_cameras_look_down_from_one_side() -> None:
+    """Their pictures' upward directions lean away from the side that they stand on."""
+    cameras = []
+    for degrees in range(-40, 41, 10):
+        turn = scene_frame(around()).turn(degrees)
+        side = turn @ torch.linalg.cross(UP, torch.tensor([0.0, 0, 1], dtype=torch.float64))
+        rotation, translation = look_at(CENTER + 4 * (side + UP), CENTER, UP)
+        cameras.append(replace(LENS, rotation=rotation, translation=translation))
+    found = scene_frame(cameras).up
+    assert angle_between(found, UP) < 0.1
+    mean = -torch.stack([camera.rotation[1] for camera in cameras]).mean(dim=0)
+    assert angle_between(mean, UP) > 30
+    on_end = [
+        replace(
+            c, rotation=torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], dtype=torch.float64) @ c.rotation
+        )
+        for c in cameras
+    ]
+    mean = -torch.stack([camera.rotation[1] for camera in on_end]).mean(dim=0)
+    assert angle_between(scene_frame(on_end).up, mean) < 1e-3, "held on end, the rows do not tell"
+
+
 def test_one_camera_and_parallel_ones_have_a_frame() -> None:
     for cameras in (
         [LENS],

@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polarguide import optics
-    from polarguide.api import Run, calibrate, demo_scene, inspect, open_run, prepare, priors, train
+    from polarguide.api import (
+        Run,
+        calibrate,
+        demo_scene,
+        inspect,
+        open_run,
+        prepare,
+        present,
+        priors,
+        train,
+    )
     from polarguide.capture import Scene, load_scene
     from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
     from polarguide.errors import PolarguideError, PolarguideWarning
@@ -30,7 +40,17 @@ if TYPE_CHECKING:
     __version__: str
 
 _NAMES = {
-    "api": ("Run", "calibrate", "demo_scene", "inspect", "open_run", "prepare", "priors", "train"),
+    "api": (
+        "Run",
+        "calibrate",
+        "demo_scene",
+        "inspect",
+        "open_run",
+        "prepare",
+        "present",
+        "priors",
+        "train",
+    ),
     "capture": ("Scene", "load_scene"),
     "capture.sensor.analyzers": ("AnalyzerCalibration", "read_analyzers"),
     "errors": ("PolarguideError", "PolarguideWarning"),
@@ -78,6 +98,7 @@ __all__ = [
     "open_run",
     "optics",
     "prepare",
+    "present",
     "priors",
     "read_analyzers",
     "read_shot",

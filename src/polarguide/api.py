@@ -27,6 +27,7 @@ from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.rendering import film, pictures, relight
+from polarguide.rendering import present as presenting
 from polarguide.rendering.pictures import select_views
 from polarguide.rendering.priors import write_priors
 from polarguide.runs import train as training
@@ -71,6 +72,7 @@ class Run(OpenedRun):
 
 open_run = Run.open
 calibrate = calibrate_sensor
+present = presenting.present
 prepare = prepare_scene
 
 

@@ -17,6 +17,7 @@ from random_runs import KINDS, random_state, ring
 from polarguide.export.records import harmonics_steps, records
 from polarguide.export.share import BAKED, baked_page, share_page
 from polarguide.gaussians.harmonics import evaluate_sh
+from polarguide.presentation import Presentation
 from polarguide.runs.point_cloud import gaussian_colors
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import PLAIN
@@ -181,3 +182,26 @@ def test_harmonics_keep_to_half_a_step() -> None:
     error = np.abs(steps * scale[:, None].astype(np.float32) - rest.flatten(1).numpy())
     assert (error <= 0.51 * scale[:, None].astype(np.float32) + 0.06 * np.abs(rest.flatten(1).numpy())).all()
     assert np.isfinite(scale.astype(np.float32)).all()
+
+
+def test_credit_scale_and_white_are_in_the_page_as_text() -> None:
+    state, shading = random_state("3dgs-dr")
+    presentation = Presentation(
+        white_balance=(0.5, 1.0, 2.0), up_axis=(0.0, 0.0, 3.0), meters_per_unit=0.25,
+        author=EVIL, license=EVIL, provenance=EVIL,
+    )  # fmt: skip
+    arguments = (state.gaussians, state.light, shading, ring())
+    plain = Reader(share_page(*arguments, first="v1", title="t"))
+    text = share_page(*arguments, first="v1", title="t", presentation=presentation)
+    found = Reader(text)
+    assert EVIL not in text
+    assert set(found.tags) == set(plain.tags)
+    assert not any(key.startswith("on") for key, _ in found.attributes)
+    assert [value for key, value in found.attributes if value == EVIL] == [EVIL] * 3  # what machines read
+    scene = json.loads(found.scripts["scene"])
+    assert (scene["white"], scene["metersPerUnit"], scene["up"]) == ([0.5, 1.0, 2.0], 0.25, [0.0, 0.0, 1.0])
+    assert (json.loads(plain.scripts["scene"])["white"], "credit" in plain.scripts["scene"]) == (
+        [1, 1, 1],
+        False,
+    )
+    assert 'class="credit"' not in share_page(*arguments, first="v1", title="t")

@@ -21,6 +21,7 @@ from random_runs import KINDS, random_state, ring
 from polarguide.camera import Camera
 from polarguide.export.share import share_page
 from polarguide.files import write_text
+from polarguide.presentation import Presentation
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.gbuffer import render
 from polarguide.visualization.layers import layer_picture
@@ -306,3 +307,60 @@ def test_the_screen_shows_what_pictures_gives(fresh: Opened) -> None:
     numbers = {key: record[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
     seen = Camera(**numbers, rotation=camera.rotation, translation=camera.translation)
     assert psnr(fresh.shot(), ours("polarguide-stokes", "final", seen)) > LEAST
+
+
+def test_a_presented_page_shows_white_scale_and_credit_and_turns_about_its_axis(
+    browser: Any, tmp_path: Path
+) -> None:
+    state, shading = random_state("polarguide-stokes")
+    gains, axis = (0.4, 1.0, 1.6), np.array([0.36, -0.8, 0.48])
+    presentation = Presentation(
+        white_balance=gains, up_axis=(0.36, -0.8, 0.48), meters_per_unit=0.1, author="A & B", license="CC0"
+    )
+    path = tmp_path / "page.html"
+    text = share_page(
+        state.gaussians, state.light, shading, ring(), first="v0", title="t", presentation=presentation
+    )
+    write_text(path, text)
+    opened = Opened(browser, path)
+    camera = ring()["v0"]
+    with torch.no_grad():
+        result = render(state.gaussians, camera, rasterize_cpu, shading=shading, light=state.light)
+    expected = layer_picture(result, "final", camera, gains=torch.tensor(gains))
+    assert psnr(opened.pictures("v0", ["final"])[0], expected) > LEAST
+    plain = ours("polarguide-stokes", "normal", camera)
+    assert psnr(opened.pictures("v0", ["normal"])[0], plain) > LEAST
+    opened.page.keyboard.press("w")
+    unbalanced = opened.pictures("v0", ["final"])[0]
+    assert psnr(unbalanced, ours("polarguide-stokes", "final", camera)) > LEAST
+    assert not opened.page.is_checked("#white")
+    opened.page.click("#white")
+
+    assert opened.page.inner_text(".credit") == "© A & B, CC0"
+    pixels, words = opened.page.evaluate(
+        "[document.getElementById('scale').offsetWidth, document.getElementById('scale').textContent]"
+    )
+    number, unit = words.split()
+    units = float(number) * {"cm": 0.01, "mm": 0.001, "m": 1.0}[unit] / 0.1
+    pivot, eye, size = opened.page.evaluate(
+        "[polarguide.navigation.pivot, polarguide.navigation.eye, "
+        "[polarguide.canvas.clientWidth, polarguide.canvas.clientHeight]]"
+    )
+    shown = opened.page.evaluate(f"polarguide.navigation.camera({size[0]}, {size[1]}).fx")
+    apart = float(np.linalg.norm(np.subtract(pivot, eye)))
+    assert abs(pixels - units / apart * shown) < 1.5
+    assert 0.09 * size[0] < pixels <= 0.25 * size[0] + 1
+
+    height = float(np.dot(eye, axis))
+    for _ in range(5):
+        opened.page.keyboard.press("ArrowRight")
+    turned = opened.look()["eye"]
+    assert np.linalg.norm(np.subtract(turned, eye)) > 0.5
+    assert abs(float(np.dot(turned, axis)) - height) < 1e-6
+    opened.page.set_viewport_size({"width": 390, "height": 844})
+    opened.settled()
+    box, stage = (opened.page.locator(name).bounding_box() for name in ("#scale", "#stage"))
+    assert stage["x"] <= box["x"]
+    assert box["x"] + box["width"] <= stage["x"] + stage["width"]
+    assert not opened.complaints
+    opened.page.close()

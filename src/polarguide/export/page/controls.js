@@ -33,7 +33,7 @@ function listen(canvas, navigation, moved, press) {
   // The whole page listens, so that keys work without a click first; controls keep the keys that move them.
   window.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.altKey || event.metaKey || event.defaultPrevented) return;
-    if (event.target.matches?.("input, select, textarea") && event.key !== "Escape") return;
+    if (event.target.matches?.("input:not([type=checkbox]), select, textarea") && event.key !== "Escape") return;
     const [x, y] = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key] || [0, 0];
     if (x || y) event.shiftKey ? navigation.pan(-x / 20, -y / 20) : navigation.orbit(x / 12, y / 12);
     else if (event.key === "+" || event.key === "=") navigation.zoom(1 / 1.1);
