@@ -87,7 +87,10 @@ def _check(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) ->
             found=f"{array.dtype} from {array.min()} to {array.max()}",
             remedy="Write the numbers of the objects, and 0 where there is none.",
         )
-    broken = array.size - int(np.count_nonzero(np.abs(array) <= _LARGEST))  # NaN is not
+    if array.dtype.kind != "f":
+        return
+    most = min(_LARGEST, float(np.finfo(array.dtype).max))
+    broken = array.size - int(np.count_nonzero(np.abs(array) <= most))  # NaN is not
     if broken:
         raise PolarguideError(
             f"{path} ({name})",
