@@ -1016,7 +1016,7 @@ def _environment_cases() -> Iterator[Case]:
         yield _case(f"environment {name}", change, lit(file))
 
 
-# Folders to write, and those of comparisons and benches.
+# Folders to write, and those of benches; comparisons start processes, and are in tests/experiments/test_jobs.py.
 
 
 def folder_cases() -> Iterator[Case]:
@@ -1036,46 +1036,6 @@ def folder_cases() -> Iterator[Case]:
         "cpu",
     ]
 
-    def begun(spoiler: Change) -> Change:
-        """A comparison whose runs' folders are known beforehand."""
-
-        def change(folder: Path) -> None:
-            from polarguide.experiments.compare import Comparison, plan_runs, scene_entries
-            from polarguide.experiments.options import CompareOptions
-            from polarguide.recipes import recipe_named
-            from polarguide.training.settings import TrainSettings
-
-            asked = Comparison((Path("scene"),), (recipe_named("3dgs"),), TrainSettings(steps=1, views_per_step=1),
-                               CompareOptions(threads=1, device="cpu"), Path("new"))  # fmt: skip
-            (run,) = plan_runs(asked, scene_entries(asked))[:1]
-            run.folder.mkdir(parents=True)
-            spoiler(run.folder)
-
-        return change
-
-    def far(folder: Path) -> str:
-        return os.path.relpath(folder.resolve().parents[5] / "outside/victim.txt", folder.resolve())
-
-    for name, spoiler in {
-        "a deep log": lambda f: (f / "log.jsonl").write_text("[" * 4000),
-        "a log of words": lambda f: (f / "log.jsonl").write_text(
-            '{"step": "x", "psnr": "y", "gaussians": "z"}\n'
-        ),
-        "a log of infinities": lambda f: (f / "log.jsonl").write_text(
-            '{"step": 1e400, "psnr": 1, "gaussians": 2}\n'
-        ),
-        "a log that is a pipe": lambda f: os.mkfifo(f / "log.jsonl"),
-        "an error file that is a link": lambda f: (f / "stderr.txt").symlink_to(far(f)),
-        "an error file that is a pipe": lambda f: os.mkfifo(f / "stderr.txt"),
-        "a note that is a link": lambda f: (f / "beside_others.txt").symlink_to(far(f)),
-        "a run.json that is none": lambda f: (f / "run.json").write_text("[]"),
-    }.items():
-        yield _case(
-            f"comparison with {name}",
-            begun(spoiler),
-            [*compare, "--jobs", "2", "--seeds", "1"],
-            "the run is begun anew",
-        )
     for name, change in {
         "a file": _bytes("new", b""),
         "a device": _link("new", "/dev/null"),
