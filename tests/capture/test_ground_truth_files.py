@@ -58,7 +58,7 @@ def test_another_type(capture: TinyCapture) -> None:
     fails(capture, "gt/v000.npz (depth)", "found <U4 of shape [10, 12]")
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
 def test_values_that_are_not_finite(capture: TinyCapture, value: float) -> None:
     specular = np.zeros((HEIGHT, WIDTH, 3))
     specular[1, 2:4] = value

@@ -199,3 +199,22 @@ def test_lines_that_are_none(tmp_path: Path, text: str) -> None:
 def test_a_log_that_is_a_pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "log.jsonl")
     assert last_row(tmp_path / "log.jsonl") is None
+
+
+@pytest.mark.parametrize("name", ["stderr.txt", "log.jsonl"])
+def test_nothing_is_written_through_a_link(job: Callable[..., Job], tmp_path: Path, name: str) -> None:
+    made, victim = job("a", "eval"), tmp_path / "victim"
+    victim.write_text("mine")
+    made.folder.mkdir()
+    (made.folder / name).symlink_to(victim)
+    run_jobs([made], parallel=1, reporter=Watch(), command=COMMAND)
+    assert victim.read_text() == "mine"
+
+
+def test_pipes_in_a_runs_folder_end_nothing(job: Callable[..., Job]) -> None:
+    made = job("a", "eval")
+    made.folder.mkdir()
+    for name in ("stderr.txt", "log.jsonl"):
+        os.mkfifo(made.folder / name)
+    run_jobs([made], parallel=1, reporter=Watch(), command=COMMAND)
+    assert (made.folder / "did").read_text().startswith("eval")

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import spoil
 from base import EVAL, MOSAICS, READ, RESUME, SHOTS, TRAIN
+from corpus_more import more_cases
 from forked import Case
 from options import option_cases
 
@@ -35,6 +36,7 @@ def corpus(first_seed: int = 0, times: int = 1) -> Iterator[Case]:
                 yield replace(case, seed=1000 * seed + case.seed)
     yield from option_cases()
     yield from disk_cases()
+    yield from more_cases(every=times > 1)
 
 
 def case(

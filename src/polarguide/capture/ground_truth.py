@@ -18,6 +18,7 @@ from polarguide.errors import PolarguideError
 _CHANNELS = {"normal": 3, "depth": 0, "mask": 0, "specular": 3, "diffuse": 3, "objid": 0}
 
 _LARGEST_NUMBER = 16  # bytes
+_LARGEST = 1e18  # its square still is a number in single precision
 
 
 def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor: int) -> GroundTruth:
@@ -86,11 +87,14 @@ def _check(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) ->
             found=f"{array.dtype} from {array.min()} to {array.max()}",
             remedy="Write the numbers of the objects, and 0 where there is none.",
         )
-    broken = int(np.count_nonzero(~np.isfinite(array)))
+    if array.dtype.kind != "f":
+        return
+    most = min(_LARGEST, float(np.finfo(array.dtype).max))
+    broken = array.size - int(np.count_nonzero(np.abs(array) <= most))  # NaN is not
     if broken:
         raise PolarguideError(
             f"{path} ({name})",
-            expected="finite numbers",
-            found=f"{broken} of {array.size} values that are NaN or infinite",
+            expected=f"finite numbers up to {_LARGEST:g}",
+            found=f"{broken} of {array.size} values that are NaN, infinite or larger",
             remedy="Write zeros where the value is unknown and exclude those pixels from the mask.",
         )

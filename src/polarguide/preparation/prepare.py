@@ -208,8 +208,8 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
                 faults += found_faults
                 notes += found_notes
             advance(count)
-    for fault in faults[:_NOTES]:
-        reporter.warn(fault)
+    for text in faults[:_NOTES]:
+        reporter.warn(text)
     if len(faults) > _NOTES:
         reporter.warn(f"{len(faults) - _NOTES} more views are black or saturated; {SCENE} has their figures.")
     for note in notes[:_NOTES]:
