@@ -159,8 +159,8 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
                 faults += fault
                 notes += found
             advance(count)
-    for fault in faults[:_NOTES]:
-        reporter.warn(fault)
+    for fault_said in faults[:_NOTES]:
+        reporter.warn(fault_said)
     if len(faults) > _NOTES:
         reporter.warn(f"{len(faults) - _NOTES} more views are black or saturated; {SCENE} has their figures.")
     for note in notes[:_NOTES]:
