@@ -95,7 +95,7 @@ def test_training_is_silent_and_tells_the_reporter(
     assert len(steps) == 12
     assert listener.tracked["training"][0] == 12
     assert "PSNR" in listener.tracked["training"][1]
-    assert listener.tracked["reading demo"][0] == 27
+    assert listener.tracked["reading demo"][0] == 50
     record = run.evaluate()
     validate_metrics(record)
     assert record == run.metrics() == polarguide.open_run(tmp_path / "run").metrics()

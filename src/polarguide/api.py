@@ -238,7 +238,7 @@ def inspect(
 
 @contextmanager
 def demo_scene() -> Iterator[Path]:
-    """The folder of the small scene that ships with the package: glossy objects, 27 views, four angles each.
+    """The folder of the small scene that ships with the package: glossy objects, 50 views, four angles each.
 
     Raises:
         PolarguideError: the package is not whole.

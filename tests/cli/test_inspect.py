@@ -98,7 +98,7 @@ def test_a_capture_with_poses_and_points_alone(demo_scene: Path, tmp_path: Path)
     assert verdicts["angle_order"] == "not verified"  # its few small views leave too few observations
     assert record["angles"]["sources"][0]["usable"] is False
     assert verdicts["coverage"] == "ok"
-    assert record["scene"]["posed_views"] == 27
+    assert record["scene"]["posed_views"] == 50
     assert not (tmp_path / "out" / "short_run").exists()
 
 

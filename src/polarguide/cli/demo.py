@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import polarguide
@@ -13,6 +14,10 @@ from polarguide.options import ComputeOptions, SessionOptions, ThreadOptions
 from polarguide.training.settings import TrainSettings
 
 STEPS = 2000
+FIRST_VIEW = "v022"
+FIRST_LAYERS = ("final", "specular", "diffuse", "normal")
+FINER = 3
+"""How many times finer than the photographs the first picture is."""
 
 
 def demo(
@@ -30,14 +35,31 @@ def demo(
         seed: Seed of every random draw.
     """
     with polarguide.demo_scene() as scene:
-        console.print(f"scene: {scene} (27 views of glossy objects, four polarizer angles each)")
+        console.print(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
         settings = TrainSettings(steps, seed, views_per_step=0)
         session = SessionOptions(threads=machine.threads)
         train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
         evaluate(out, compute=ComputeOptions(machine.threads))
         render(out)
+        picture = _first_picture(out)
+    console.print(f"look at {picture}: {FIRST_VIEW}, which training has not seen, and its layers")
     console.print(
-        f"look at {out / 'render' / 'contact_sheet.png'}: rows are views, columns are layers, each beside the true "
+        f"then at {out / 'render' / 'contact_sheet.png'}: rows are views, columns are layers, each beside the true "
         "one if it is known"
     )
     console.print(f"look around: polarguide view {out}")
+
+
+def _first_picture(out: Path) -> Path:
+    """A test view larger than its photograph, with its layers: what somebody is shown first."""
+    layers = importlib.import_module("polarguide.visualization.layers")
+    figures = importlib.import_module("polarguide.visualization.figures")
+    sheet = importlib.import_module("polarguide.visualization.sheet")
+    run = polarguide.open_run(out)
+    camera = run.scene.view(FIRST_VIEW).camera
+    camera = camera.scaled(FINER, FINER * camera.width, FINER * camera.height)
+    result = run.result(camera).to("cpu")
+    tiles = [layers.layer_picture(result, name, camera) for name in FIRST_LAYERS]
+    path = out / "first_picture.png"
+    figures.write_png(path, sheet.contact_sheet([tiles], [FIRST_VIEW], FIRST_LAYERS))
+    return path

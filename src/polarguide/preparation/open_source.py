@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from polarguide.capture.layout import angle_folders, describe_contents, index_fi
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
-from polarguide.capture.view import listed
+from polarguide.capture.view import ANGLES, listed
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
 from polarguide.preparation.filter_source import FilterSource
@@ -81,8 +82,21 @@ def _unknown_layout(root: Path) -> PolarguideError:
         remedy = f"Raw mosaics: polarguide prepare {source} {out} --sensor IMX250MYR (color) or IMX250MZR. {remedy}"
     if photographs and not mosaics:
         remedy += " Ordinary photographs, one a view, carry no polarization."
+        if len(photographs) % len(ANGLES) == 0:
+            remedy += " docs/how-to/prepare.md sorts shots that are numbered in the order they were taken."
+    inside = None if named else _folder_of_pictures(root)
+    if inside is not None:
+        remedy = f"Give the folder that the pictures are in, such as {inside}. {remedy}"
     expected = "four shots per view, raw mosaics with --sensor, or a published dataset"
     return PolarguideError(root, expected=expected, found=found or "nothing to read", remedy=remedy)
+
+
+def _folder_of_pictures(root: Path) -> Path | None:
+    """The first folder below that holds pictures, for a hint."""
+    for folder, _, names in os.walk(root):
+        if any(name.lower().endswith(SHOT_SUFFIXES + RAW_SUFFIXES) for name in names):
+            return Path(folder)
+    return None
 
 
 def poses_beside(root: Path) -> list[str]:

@@ -55,7 +55,7 @@ def layer_picture(
 def clipping_exposure(values: Tensor) -> float:
     """The factor, 1 or less, with which under 1 % of the pixels of radiance [H, W, 3] exceed 1 in some channel."""
     brightest = values.detach().nan_to_num(0.0, 0.0, 0.0).amax(dim=-1).flatten().sort().values
-    limit = float(brightest[max(0, brightest.numel() - 1 - brightest.numel() // 101)])
+    limit = float(brightest[max(0, brightest.numel() - 1 - brightest.numel() // 128)])
     return min(1.0, 1.0 / limit) if limit > 0 else 1.0
 
 
