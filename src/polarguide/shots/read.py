@@ -48,7 +48,7 @@ def read_shot(
             )
         shot = found[0]
     developed = develop(shot, options)
-    return _maps(shot, developed, options)
+    return maps_of(shot, developed, options)
 
 
 def tiles(height: int, width: int) -> Iterator[slice]:
@@ -59,7 +59,8 @@ def tiles(height: int, width: int) -> Iterator[slice]:
 
 
 @torch.no_grad()
-def _maps(shot: ExposureSet, developed: Developed, options: ShotOptions) -> ShotMaps:
+def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> ShotMaps:
+    """The maps of developed intensities."""
     _, height, width, _ = developed.intensities.shape
     stokes = torch.empty((3, height, width))
     dolp, debiased, aolp, sigma_dolp, sigma_aolp = (torch.empty((height, width)) for _ in range(5))

@@ -1,0 +1,150 @@
+"""The files of a shot: pictures, numbers, units and the page."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import polarguide
+from polarguide.errors import PolarguideError
+from polarguide.shots import ShotMaps, ShotOptions, SurfaceMaps, read_shot, surface_maps, write_shots
+from polarguide.shots.catalog import KINDS
+from polarguide.shots.page_html import PAGE
+from polarguide.shots.pictures import drawn, stretch_of, with_legend
+from tests.helpers.browsers import chromium
+from tests.helpers.heard import Heard
+from tests.shots.test_read import CUP, MONO, PLAIN, light, write_four, write_mosaic
+
+KIND = {kind.key: kind for kind in KINDS}
+
+
+@pytest.fixture(scope="module")
+def read(tmp_path_factory: pytest.TempPathFactory) -> tuple[ShotMaps, SurfaceMaps]:
+    maps = read_shot(write_four(tmp_path_factory.mktemp("four"), CUP), PLAIN)
+    return maps, surface_maps(maps)
+
+
+def test_numbers_and_their_units(tmp_path: Path) -> None:
+    exr = pytest.importorskip("OpenEXR")
+    paths = write_four(tmp_path / "in", CUP)
+    done = write_shots(paths, tmp_path / "out", PLAIN, formats=("npy", "exr"))
+    folder = tmp_path / "out" / "cup"
+    assert done.folders == {"cup": folder}
+    record = json.loads((folder / "maps.json").read_text())
+    assert record["maps"].keys() == KIND.keys()
+    s0, s1, s2 = light()
+    np.testing.assert_allclose(np.load(folder / "DoLP.npy"), np.hypot(s1, s2) / s0, atol=1e-3)
+    assert np.load(folder / "S0.npy").shape == (*s0.shape, 3)
+    for key, kind in KIND.items():
+        array = np.load(folder / f"{key}.npy")
+        with exr.File(str(folder / f"{key}.exr")) as file:
+            assert file.header()["unit"] == kind.unit == record["maps"][key]["unit"]
+            (channel,) = file.channels().values()
+            np.testing.assert_array_equal(np.asarray(channel.pixels), array.astype(np.float32))
+    assert not list(folder.glob("*.png"))
+
+
+def test_pictures_have_a_legend_at_full_size(read: tuple[ShotMaps, SurfaceMaps], tmp_path: Path) -> None:
+    maps, surface = read
+    for kind in KINDS:
+        values = kind.values(maps, surface)
+        stretch = stretch_of(kind, values, maps)
+        plain = drawn(kind, values, maps, stretch)
+        assert plain.shape[:2] == maps.reason.shape
+        whole = with_legend(plain, kind, stretch, maps.name)
+        np.testing.assert_array_equal(whole[: plain.shape[0], : plain.shape[1]], plain)
+        legend = whole[plain.shape[0] :]
+        assert (legend < 128).any()
+
+
+def test_a_weak_polarization_is_stretched_to_be_seen(read: tuple[ShotMaps, SurfaceMaps]) -> None:
+    maps, _ = read
+    weak = (maps.dolp / 50).astype(np.float32)
+    stretch = stretch_of(KIND["DoLP"], weak, maps)
+    assert 0.01 <= stretch.high <= 0.012
+    assert f"0 to {stretch.high:g}" in stretch.text
+    assert drawn(KIND["DoLP"], weak, maps, stretch).max() > 200
+
+
+def test_one_bad_file_does_not_stop_the_others(tmp_path: Path) -> None:
+    for name in "abc":
+        write_mosaic(tmp_path / f"{name}.png")
+    (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:500])
+    heard = Heard()
+    done = write_shots([tmp_path], tmp_path / "out", MONO, formats=("npy",), reporter=heard)
+    assert list(done.folders) == ["a", "c"]
+    assert list(done.faults) == ["b"]
+    assert any("b.png" in text and "cut short" in text for text in heard.said)
+    assert not (tmp_path / "out" / "b").exists()
+
+
+def test_wrong_format(tmp_path: Path) -> None:
+    with pytest.raises(PolarguideError, match="formats: expected some of png, exr, npy, page, found pdf"):
+        write_shots([tmp_path], tmp_path / "out", formats=("pdf",))
+
+
+def test_a_scene_with_poses_keeps_its_pictures_and_gets_maps_on_demand(tmp_path: Path) -> None:
+    with polarguide.demo_scene() as scene:
+        sheet = polarguide.priors(scene, tmp_path, views="v000", formats=["npy"])
+        assert sheet == tmp_path / "contact_sheet.png"
+        assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == ["v000"]
+        assert json.loads((tmp_path / "v000" / "maps.json").read_text())["rays"] == "of a pinhole camera"
+        for given in ({"intrinsics": "1,1,1,1"}, {"shots": ShotOptions(sensor="IMX250MZR")}):
+            with pytest.raises(PolarguideError, match="expected shots, found a scene with poses"):
+                polarguide.priors(scene, tmp_path / "x", **given)  # type: ignore[arg-type]
+
+
+def test_the_page_asks_for_nothing_and_escapes_names(tmp_path: Path) -> None:
+    write_mosaic(tmp_path / "<b>part.png")
+    done = write_shots([tmp_path / "<b>part.png"], tmp_path / "out", MONO, formats=("page",))
+    text = (done.folders["<b>part"] / PAGE).read_text()
+    assert "<b>part" not in text
+    assert "&lt;b&gt;part" in text
+    assert not re.search(r"(?:src|href)\s*=\s*[\"']?(?:https?:|//|file:)", text)
+    assert "default-src 'none'" in text
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
+def test_values_under_the_pointer(tmp_path: Path, width: int, height: int) -> None:
+    write_mosaic(tmp_path / "part.png")
+    folder = write_shots([tmp_path / "part.png"], tmp_path / "out", MONO, formats=("page",)).folders["part"]
+    maps = read_shot(tmp_path / "part.png", MONO)
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": width, "height": height})
+        problems: list[str] = []
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("console", lambda message: problems.append(message.text))
+        page.goto((folder / PAGE).as_uri())
+        page.wait_for_function("planes !== null")
+        box = page.locator("#map").bounding_box()
+        page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"])
+        said = page.inner_text("#values")
+        found = re.search(r"pixel\s*(\d+), (\d+)", said)
+        assert found is not None
+        x, y = int(found[1]), int(found[2])
+        degree = re.search(r"DoLP\s*([\d.]+) ± ([\d.]+)", said)
+        angle = re.search(r"AoLP\s*([\d.]+)°", said)
+        assert degree is not None
+        assert angle is not None
+        assert float(degree[1]) == pytest.approx(maps.dolp[y, x], abs=1e-4)
+        assert float(degree[2]) == pytest.approx(maps.sigma_dolp[y, x], rel=0.1)
+        assert float(angle[1]) == pytest.approx(np.rad2deg(maps.aolp[y, x]), abs=0.1)
+        first = page.get_attribute("#map", "src")
+        page.click("[data-layer='1']")
+        assert page.get_attribute("#map", "src") != first
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert not problems
+        page.close()
+
+
+def test_a_color_shot_is_drawn_in_color(tmp_path: Path) -> None:
+    write_mosaic(tmp_path / "part.png", "IMX250MYR")
+    options = ShotOptions(sensor="IMX250MYR", bits=12)
+    folder = write_shots([tmp_path / "part.png"], tmp_path / "out", options, formats=("png",)).folders["part"]
+    picture = cv2.imread(str(folder / "S0.png"))[:64, :96].astype(int)
+    assert (picture[..., 1] - picture[..., 2]).mean() > 10  # green filters pass more than red ones
