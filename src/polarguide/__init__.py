@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from polarguide.options import SceneOptions, SessionOptions
     from polarguide.preparation.settings import PrepareSettings
     from polarguide.progress import Reporter
+    from polarguide.shots import ShotMaps, ShotOptions, SurfaceMaps, find_shots, read_shot, surface_maps
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
 
@@ -37,6 +38,7 @@ _NAMES = {
     "options": ("SceneOptions", "SessionOptions"),
     "preparation.settings": ("PrepareSettings",),
     "progress": ("Reporter",),
+    "shots": ("ShotMaps", "ShotOptions", "SurfaceMaps", "find_shots", "read_shot", "surface_maps"),
     "training.recipe": ("Recipe",),
     "training.settings": ("TrainSettings",),
 }
@@ -55,17 +57,23 @@ __all__ = [
     "Scene",
     "SceneOptions",
     "SessionOptions",
+    "ShotMaps",
+    "ShotOptions",
+    "SurfaceMaps",
     "TrainSettings",
     "__version__",
     "ablate",
     "compare",
     "demo_scene",
+    "find_shots",
     "inspect",
     "load_scene",
     "open_run",
     "optics",
     "prepare",
     "priors",
+    "read_shot",
+    "surface_maps",
     "train",
 ]
 

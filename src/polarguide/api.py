@@ -5,8 +5,10 @@ Nothing here prints or installs signal handlers: progress and messages go to a `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -25,9 +27,13 @@ from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.rendering import film, pictures, relight
+from polarguide.rendering.pictures import select_views
 from polarguide.rendering.priors import write_priors
 from polarguide.runs import train as training
-from polarguide.runs.opened import OpenedRun
+from polarguide.runs.opened import OpenedRun, read_scene
+from polarguide.shots.exposures import find_shots
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.write import FORMATS, WrittenShots, write_shots
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.viewer import watch
@@ -64,7 +70,6 @@ class Run(OpenedRun):
 
 open_run = Run.open
 prepare = prepare_scene
-priors = write_priors
 
 
 def train(
@@ -111,6 +116,93 @@ def train(
         watch=looking if session.viewer else None,
     )
     return Run.of(opened)
+
+
+def priors(
+    paths: Scene | PathLike | Sequence[PathLike],
+    out: PathLike,
+    *,
+    run: OpenedRun | None = None,
+    views: str = "test",
+    refractive_index: float = 1.5,
+    threshold: float | None = None,
+    reading: SceneOptions = SceneOptions(),
+    shots: ShotOptions | None = None,
+    formats: Sequence[str] | None = None,
+    intrinsics: str | None = None,
+    reporter: Reporter = SILENT,
+) -> Path | WrittenShots:
+    """What polarization says, with poses or without: of one scene with poses, or of shots.
+
+    Of a scene with poses, pictures of some views and a contact sheet (``rendering.priors.write_priors``), and their
+    maps if ``formats`` are given. Of anything else, all maps of every shot (``shots.write.write_shots``).
+
+    Args:
+        paths: a scene, its folder, or files and folders of shots as ``find_shots`` takes them.
+        out: folder to write.
+        run, views, threshold, reading: as ``write_priors`` takes them, for a scene with poses alone.
+        refractive_index: of the surfaces.
+        shots, intrinsics: as ``write_shots`` takes them, for shots alone.
+        formats: of the maps: png, exr, npy, page; None: all of them for shots, none for a scene with poses.
+
+    Returns:
+        The contact sheet of a scene with poses; else what was written.
+
+    Raises:
+        PolarguideError: nothing can be read, or an option is wrong or means nothing here.
+    """
+    many = (
+        [] if isinstance(paths, Scene) else [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    )
+    posed = isinstance(paths, Scene) or (len(many) == 1 and (Path(many[0]) / "sparse").exists())
+    if not posed:
+        for name, given in (("run", run), ("threshold", threshold)):
+            if given is not None:
+                raise PolarguideError(
+                    name,
+                    expected="a scene with poses",
+                    found="shots",
+                    remedy="Leave it out, or name the scene.",
+                )
+        if reading.downscale != 1:
+            raise PolarguideError(
+                "downscale",
+                expected="1 for shots",
+                found=str(reading.downscale),
+                remedy="Use --demosaic quarter.",
+            )
+        return write_shots(
+            many,
+            out,
+            shots,
+            formats=FORMATS if formats is None else formats,
+            intrinsics=intrinsics,
+            refractive_index=refractive_index,
+            reporter=reporter,
+        )
+    if intrinsics is not None or (shots is not None and shots.sensor is not None):
+        raise PolarguideError(
+            "sensor" if intrinsics is None else "intrinsics",
+            expected="shots",
+            found="a scene with poses",
+            remedy="Leave it out: the scene has developed pictures and cameras.",
+        )
+    scene = paths if isinstance(paths, Scene) else read_scene(many[0], reading, reporter)
+    sheet = write_priors(
+        scene,
+        out,
+        run=run,
+        views=views,
+        refractive_index=refractive_index,
+        threshold=0.05 if threshold is None else threshold,
+        reporter=reporter,
+    )
+    if formats:
+        chosen = {view.name for view in select_views(scene, views)}
+        options = replace(shots or ShotOptions(), transfer=reading.transfer)
+        sets = [found for found in find_shots([scene.root], options) if found.view in chosen]
+        write_shots(sets, out, options, formats=formats, refractive_index=refractive_index, reporter=reporter)
+    return sheet
 
 
 def inspect(

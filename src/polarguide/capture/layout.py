@@ -174,14 +174,19 @@ def angle_folders(root: Path) -> dict[int, Path]:
     """Folders named like a polarizer angle (I-00, I_45, 090, pol135, ...)."""
     folders: dict[int, Path] = {}
     for path in sorted(root.iterdir()):
-        match = _ANGLE_FOLDER.fullmatch(path.name)
-        if match is None or not path.is_dir() or int(match["angle"]) not in ANGLES:
+        angle = angle_of_folder(path)
+        if angle is None or not path.is_dir():
             continue
-        angle = int(match["angle"])
         if angle in folders:
             raise ambiguous(root, f"one folder for {angle} degrees", folders[angle], path)
         folders[angle] = path
     return dict(sorted(folders.items()))
+
+
+def angle_of_folder(path: Path) -> int | None:
+    """The polarizer angle that a folder is named after; None if it is none."""
+    match = _ANGLE_FOLDER.fullmatch(path.name)
+    return int(match["angle"]) if match is not None and int(match["angle"]) in ANGLES else None
 
 
 def index_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:

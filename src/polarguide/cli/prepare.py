@@ -43,3 +43,6 @@ def prepare(
         console.print(f"next: polarguide train {done.folder} --out runs/{done.folder.name}", markup=False)
     else:
         console.print("it has no poses: repeat the command with --poses sfm or --poses PATH", markup=False)
+        console.print(
+            f"each view alone: polarguide priors {done.folder} --out {done.folder.name}-priors", markup=False
+        )

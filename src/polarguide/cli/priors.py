@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,47 +11,83 @@ import tyro
 import polarguide
 from polarguide.cli.console import console, use_threads
 from polarguide.cli.progress import ConsoleReporter
+from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions, ThreadOptions
+from polarguide.preparation.settings import CalibrationOptions
+from polarguide.shots.options import ShotOptions
 
 
 def priors(
-    scene: Annotated[Path, tyro.conf.Positional],
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     /,
     *,
     out: Path,
+    formats: str | None = None,
+    intrinsics: str | None = None,
+    refractive_index: float = 1.5,
     run: Path | None = None,
     views: str = "test",
-    refractive_index: float = 1.5,
-    threshold: float = 0.05,
-    reading: SceneOptions = SceneOptions(),
-    machine: ThreadOptions = ThreadOptions(),
+    threshold: float | None = None,
+    downscale: int = 1,
+    memory: float = 0.0,
+    shots: Annotated[ShotOptions, tyro.conf.arg(name="")],
+    angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
+    machine: Annotated[ThreadOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """Pictures of what polarization says about a scene, before or after training.
+    """What polarization says about a shot, many shots or a scene: pictures, numbers and a page.
 
-    S0, DoLP, AoLP, zenith, both separations, polarization normals, those that color differences tell (gray where they
-    decide nothing), and the mask of usable pixels. The exact separation
-    needs normals: those of a trained run with --run, else the polarization normals themselves, with their ambiguity
-    resolved only by the surface facing the camera (a rough guess, and named so in the file).
+    S0, DoLP and AoLP with their standard deviations, both separations, polarization normals with the zeniths of their
+    candidates, and the pixels that say nothing. A shot is a raw mosaic (with --sensor), four files of a rotating filter
+    (names or folders with 0, 45, 90, 135), or a view of a scene without poses; folders may hold many. The exact
+    separation needs normals: those of a trained run with --run, else the polarization normals themselves, with their
+    ambiguity resolved only by the surface facing the camera (a rough guess, and named so). docs/how-to/one-shot.md
+    says more.
 
     Args:
-        scene: Scene folder.
-        out: Folder to write.
-        run: A run trained on this scene (at the same --downscale), whose normals resolve the ambiguity.
-        views: test, train, all, or names separated by commas.
+        paths: Mosaics, shots, folders of them, or a scene folder.
+        out: Folder to write: a folder for each shot in it; pictures and a contact sheet for a scene with poses.
+        formats: Of the maps: some of png,exr,npy,page. Without it all for shots, none for a scene with poses.
+        intrinsics: fx,fy,cx,cy of the developed pictures, for normals; without them the rays are taken to be parallel.
         refractive_index: Of the surfaces.
-        threshold: DoLP above which a pixel's normal is used.
+        run: For a scene: a run trained on it (at the same --downscale), whose normals resolve the ambiguity.
+        views: For a scene: test, train, all, or names separated by commas.
+        threshold: For a scene: DoLP above which a pixel's normal is used; without it 0.05.
+        downscale: For a scene: average the pictures over boxes of this many pixels first.
+        memory: For a scene: GiB that the pictures may take; 0 is 80 % of what is free.
     """
     use_threads(machine.threads)
     reporter = ConsoleReporter()
+    if not paths:
+        raise PolarguideError(
+            "PATH", expected="at least one shot or scene", found="none", remedy="Name files or folders."
+        )
     opened = None if run is None else polarguide.open_run(run, reporter=reporter)
-    sheet = polarguide.priors(
-        scene,
+    found = polarguide.priors(
+        paths[0] if len(paths) == 1 else paths,
         out,
         run=opened,
         views=views,
         refractive_index=refractive_index,
         threshold=threshold,
-        reading=reading,
+        reading=SceneOptions(downscale, "srgb" if shots.transfer == "srgb" else "linear", memory),
+        shots=replace(shots, calibration=angles.read()),
+        formats=None if formats is None else [name.strip() for name in formats.split(",") if name.strip()],
+        intrinsics=intrinsics,
         reporter=reporter,
     )
-    console.print(f"pictures: {out}   contact sheet: {sheet}")
+    if isinstance(found, Path):
+        console.print(f"pictures: {out}   contact sheet: {found}", markup=False)
+        return
+    for name, folder in list(found.folders.items())[:4]:
+        page = folder / "shot.html"
+        console.print(f"{name}: {page if page.exists() else folder}", markup=False)
+    if len(found.folders) > 4:
+        console.print(f"... and {len(found.folders) - 4} more in {out}", markup=False)
+    if found.faults:
+        total = len(found.faults) + len(found.folders)
+        raise PolarguideError(
+            out,
+            expected=f"{total} shots",
+            found=f"{len(found.faults)} that cannot be read ({', '.join(list(found.faults)[:4])})",
+            remedy="The warnings above say why; the others are written.",
+        )

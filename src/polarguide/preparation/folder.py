@@ -6,7 +6,9 @@ A folder without ``scene.json`` is not finished; the same command goes on with i
 
 from __future__ import annotations
 
+import contextlib
 import json
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import ANGLES
 from polarguide.capture.write import intensity_codes, picture_name, write_view
 from polarguide.errors import PolarguideError
-from polarguide.files import check_out, make_folder, write_whole
+from polarguide.files import check_out, make_folder, read_file, write_whole
 from polarguide.records import decode, read_record, shortened, to_json
 
 JOURNAL = "prepare.json"
@@ -80,6 +82,8 @@ class SceneFolder:
         self.views: dict[str, dict[str, Any]] = {}
         self.finished = self.begun = False
         self._follows_none = False
+        self._finished_before: bytes | None = None
+        self._there_before = root.exists()
         check_out(root)
         whole, journal = root / SCENE, root / JOURNAL
         path = journal if journal.exists() else whole
@@ -137,10 +141,29 @@ class SceneFolder:
                     found="a link to another place",
                     remedy="Remove the link, or give another --out; nothing was written.",
                 )
+        if (self.root / SCENE).exists():
+            self._finished_before = read_file(self.root / SCENE)
         make_folder(self.root / "polar")
         make_folder(self.root / "invalid")
         self.save()
         (self.root / SCENE).unlink(missing_ok=True)
+
+    def abandon(self) -> None:
+        """Take back what was begun: a scene without poses is as it was, and of a new folder nothing is left.
+
+        Views that an earlier call has written stay for the next one.
+        """
+        shutil.rmtree(self.root / SFM, ignore_errors=True)
+        if self._finished_before is not None:
+            write_whole(self.root / SCENE, self._finished_before)
+            (self.root / JOURNAL).unlink(missing_ok=True)
+        elif not self.views:
+            for name in FOLDERS:
+                shutil.rmtree(self.root / name, ignore_errors=True)
+            (self.root / JOURNAL).unlink(missing_ok=True)
+            if not self._there_before:
+                with contextlib.suppress(OSError):  # not empty: somebody put something there
+                    self.root.rmdir()
 
     def save(self) -> None:
         """Write the journal."""

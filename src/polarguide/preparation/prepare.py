@@ -14,6 +14,7 @@ import msgspec
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Poses
+from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
@@ -24,6 +25,7 @@ from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
 from polarguide.preparation.working_folder import PHOTOGRAPHS, Workshop
 from polarguide.progress import Reporter
+from polarguide.records import option_name
 
 MOSTLY = 0.5
 """Share of saturated pixels from which on a view is warned of."""
@@ -69,7 +71,8 @@ def prepare_scene(
         reporter: where messages and progress go.
 
     Raises:
-        PolarguideError: the source or a setting cannot be used, or ``out`` holds something else.
+        PolarguideError: the source or a setting cannot be used, ``out`` holds something else, or structure from motion
+            does not connect the views; then nothing of this call is left in ``out``.
     """
     settings, reporter = settings or PrepareSettings(), reporter or Reporter()
     root, target = Path(source), Path(out)
@@ -82,6 +85,13 @@ def prepare_scene(
             expected="poses by structure from motion, which they are for",
             found=f"--poses {settings.poses}",
             remedy="Leave them out: the cameras come with the poses.",
+        )
+    if settings.poses == "sfm" and len(pictures.views) < LEAST_VIEWS:
+        raise PolarguideError(
+            root,
+            expected=f"at least {LEAST_VIEWS} views for poses by structure from motion",
+            found=f"{len(pictures.views)} ({listed(pictures.views)})",
+            remedy=_without_poses(root, pictures, settings),
         )
     poses = known_poses(root, pictures, settings.poses)
     folder = SceneFolder(target, _request(root, pictures, settings, poses))
@@ -104,7 +114,16 @@ def prepare_scene(
     work = Workshop(folder, pictures, settings, reporter)
     points: dict[str, Any] | None = None
     if settings.poses == "sfm":
-        poses = Poses.read(work.structure(), pictures.views)
+        try:
+            poses = Poses.read(work.structure(), pictures.views)
+        except NotConnectedError as error:
+            folder.abandon()
+            raise PolarguideError(
+                root,
+                expected=error.expected,
+                found=error.found,
+                remedy=f"{error.remedy} {_without_poses(root, pictures, settings)}",
+            ) from None
         points = {"from": "structure from motion", "count": poses.points}
     elif poses is not None and not poses.points:
         poses, points = work.points(poses)
@@ -121,6 +140,37 @@ def prepare_scene(
     folder.finish(_summary(folder, pictures, settings, points))
     shutil.rmtree(target / SFM, ignore_errors=True)
     return _outcome(folder, pictures, settings, new=True)
+
+
+def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> str:
+    """What can be done with views that have no poses, for a message."""
+    out = f"--out {shlex.quote(root.resolve().name + '-priors')}"
+    if pictures.kind not in ("mosaic", "filter"):
+        return (
+            f"Without poses: --poses none develops the views, then polarguide priors SCENE {out} shows each."
+        )
+    default = PrepareSettings()
+    names = (
+        "sensor",
+        "packing",
+        "width",
+        "height",
+        "bits",
+        "offset_x",
+        "offset_y",
+        "black_level",
+        "saturation",
+    )
+    flags = [
+        f" {option_name(name)} {getattr(settings, name)}"
+        for name in names
+        if getattr(settings, name) != getattr(default, name)
+    ]
+    command = f"polarguide priors {shlex.quote(str(root))} {out}{''.join(flags)}"
+    return (
+        f"Each view alone has S0, DoLP, AoLP, normals and separations: {command}. "
+        "Nothing was written; --poses none develops the views without poses."
+    )
 
 
 def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Poses | None) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,11 @@ from polarguide.capture.filter.transfer import decide_transfer, linear_intensiti
 from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import demosaic
-from polarguide.capture.sensor.pattern import tiled
+from polarguide.capture.sensor.pattern import SENSOR_SIZE, tiled
 from polarguide.capture.sensor.radiometry import estimate_levels, unusable_samples
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
+from polarguide.errors import PolarguideError
 from polarguide.preparation.mosaic_files import MosaicFiles
 from polarguide.preparation.mosaic_samples import block_intensities, sample_blocks
 from polarguide.shots.exposures import ExposureSet
@@ -67,6 +69,7 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
 def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
     path, files = shot.files[0], MosaicFiles(options.preparation())
     stored, pattern = files.read(path), files.pattern
+    _require_on_sensor(path, stored.shape, options)
     dark = files.dark(stored.shape)
     values = files.cut(stored)
     container = files.container(path, stored)
@@ -118,6 +121,18 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
         pair_ratio=ratio,
         notes=(*notes, *said),
     )
+
+
+def _require_on_sensor(path: Path, shape: tuple[int, ...], options: ShotOptions) -> None:
+    """Refuse what is larger than the sensor: another one, or no mosaic."""
+    most = tuple(n - o for n, o in zip(SENSOR_SIZE, (options.offset_x, options.offset_y), strict=True))
+    if shape[1] > most[0] or shape[0] > most[1]:
+        raise PolarguideError(
+            path,
+            expected=f"at most {most[0]}x{most[1]} pixels of {options.sensor}",
+            found=f"{shape[1]}x{shape[0]}",
+            remedy="Check --sensor, --offset-x and --offset-y; prepare reads larger sensors of the same pattern.",
+        )
 
 
 def _placed(factors: Map, calibration: Calibration) -> Map:

@@ -9,7 +9,13 @@ from pathlib import Path
 from typing import Literal
 
 from polarguide.capture.filter import shots as filter_shots
-from polarguide.capture.layout import angle_folders, describe_contents, find_layout, index_files
+from polarguide.capture.layout import (
+    angle_folders,
+    angle_of_folder,
+    describe_contents,
+    find_layout,
+    index_files,
+)
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.errors import PolarguideError
@@ -76,7 +82,14 @@ def find_shots(
 def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
     if options.sensor is not None:
         return [_mosaic(path) for path in files]
-    grouped = filter_shots.group_shots(files)
+    grouped: dict[str, dict[int, Path]] = {}
+    for path in files:
+        angle = angle_of_folder(path.resolve().parent)
+        if angle is not None and angle not in grouped.setdefault(path.stem, {}):
+            grouped[path.stem][angle] = path
+    if any(len(shot) == 1 for shot in grouped.values()):  # folders that are called so by chance
+        grouped = {}
+    grouped = grouped or filter_shots.group_shots(files)
     strangers = [path.name for path in files if not any(path in shot.values() for shot in grouped.values())]
     if strangers:
         raise PolarguideError(

@@ -82,23 +82,23 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> NDArray[np.
     bilinear, and luminance as the mean of the colors. ``x`` and ``y`` are where the pattern of the sensor begins.
     """
     pattern = sensor_pattern(sensor).shifted(x, y)
-    side = 4 * _REACH
-    step = DEMOSAIC_MODES[mode]
-    period = max(1, pattern.period // step)
+    side, step = 4 * _REACH, DEMOSAIC_MODES[mode]
+    period, cell = max(1, pattern.period // step), max(pattern.period, step)
+    # Half size is the mean over cells of full size, but for S0, of whose noise DoLP and AoLP hardly depend.
+    way = "quarter" if mode == "quarter" else "full"
     squares = np.zeros((len(ANGLES), side // step, side // step))
-    for row, column in np.ndindex(pattern.period, pattern.period):
+    for row, column in np.ndindex(cell, cell):
         picture = np.zeros((side, side), np.float32)
         picture[row::_REACH, column::_REACH] = 1
+        nothing = np.zeros(picture.shape, bool)
         done = demosaic(
-            picture,
-            np.zeros(picture.shape, bool),
-            pattern,
-            mode=mode,
-            interpolation="bilinear",
-            registered=True,
-        )
+            picture, nothing, pattern, mode=way, interpolation="bilinear", colored=False
+        ).intensities
+        response = done.mean(axis=-1, dtype=np.float64)
+        if mode == "half":
+            response = response.reshape(len(ANGLES), side // 2, 2, side // 2, 2).mean(axis=(2, 4))
         # Impulses of one position lie so far apart that no pixel sees two.
-        squares += done.intensities.mean(axis=-1, dtype=np.float64) ** 2
+        squares += response**2
     inner = slice(_REACH // step, 2 * _REACH // step)
     found = squares[:, inner, inner]
     blocks = found.reshape(4, found.shape[1] // period, period, found.shape[2] // period, period)

@@ -19,11 +19,15 @@ from polarguide.files import make_folder
 from polarguide.progress import Reporter
 
 _FEW_SHARE = 0.8
-_LEAST = 3
+LEAST_VIEWS = 3
 ADVICE = (
     "More views with more overlap (15 degrees or less between neighbors), a textured ground under the object and "
     "sharp pictures help; --matching exhaustive finds more pairs than sequential."
 )
+
+
+class NotConnectedError(PolarguideError):
+    """Structure from motion found no place for enough of the views."""
 
 
 def tone_mapped(intensities: NDArray[np.float32], pictures: str = "photograph") -> NDArray[np.uint8]:
@@ -67,7 +71,8 @@ def reconstruct(
         The folder of the model, with one camera for pictures of one size: of the model given, or SIMPLE_RADIAL.
 
     Raises:
-        PolarguideError: fewer than three views were registered, or COLMAP failed.
+        NotConnectedError: fewer than three views were registered.
+        PolarguideError: COLMAP failed.
     """
     model = folder / "model"
     if model.is_dir():
@@ -87,8 +92,8 @@ def reconstruct(
     models = _map(database, images, trial, len(sizes), seed, reporter, free)
     best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
     registered = 0 if best is None else best.num_reg_images()
-    if best is None or registered < _LEAST:
-        raise PolarguideError(
+    if best is None or registered < LEAST_VIEWS:
+        raise NotConnectedError(
             images,
             expected="pictures that structure from motion can connect",
             found=f"{registered} of {len(sizes)} views registered",
@@ -114,7 +119,7 @@ def _map(
 ) -> dict[int, Any]:
     """Incremental mapping: pycolmap's models, by number; ``free`` intrinsics are estimated."""
     options = pipeline_options(seed)
-    options.min_model_size = _LEAST
+    options.min_model_size = LEAST_VIEWS
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
     placed: list[None] = []
     step = functools.partial(placed.append, None)

@@ -16,6 +16,9 @@ _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry a polarizer cell
 SENSORS = {"IMX250MYR": True, "IMX264MYR": True, "IMX250MZR": False}
 """Sony sensors by name, and whether they are color sensors."""
 
+SENSOR_SIZE = (2464, 2056)
+"""Width and height of all of them, in pixels; cameras give 2448 x 2048."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pattern:

@@ -1,0 +1,166 @@
+"""One page to look at a shot: every map, and its numbers under the pointer. It asks for no other file."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+import zlib
+from string import Template
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polarguide.shots.catalog import KINDS, REASON_COLORS, MapKind
+from polarguide.shots.maps import REASONS, Reason, ShotMaps
+from polarguide.shots.pictures import Stretch, drawn, stretch_of
+from polarguide.shots.surface import SurfaceMaps
+from polarguide.visualization import figures
+from polarguide.visualization.embedded import content_policy, data_uri, page_part, script_json
+
+PAGE = "shot.html"
+SIDE = 816
+"""Most pixels of the longer side of what is on the page: a third of a whole sensor."""
+_HIDDEN = ("zenith_diffuse", "zenith_specular_below", "zenith_specular_above")
+"""Maps that the page tells in numbers alone."""
+_SMALLEST_SIGMA = 1e-6
+_PACKAGE = "polarguide.shots"
+
+
+def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
+    """The HTML page; all names and texts in it are escaped.
+
+    Pictures and numbers are those of every k-th pixel each way, k such that the longer side has at most ``SIDE``;
+    nothing is averaged.
+    """
+    step = max(1, math.ceil(max(maps.size) / SIDE))
+    shown = [kind for kind in KINDS if kind.key not in _HIDDEN]
+    layers, legends = [], []
+    for kind in shown:
+        values = kind.values(maps, surface)
+        stretch = stretch_of(kind, values, maps)
+        picture = drawn(kind, values, maps, stretch, step)
+        # What is listed as lossless there stays exact; the noise of the others would make the page large.
+        layers.append(data_uri(picture, "normal" if kind.look == "reason" else "", SIDE))
+        legends.append(_legend(kind, stretch))
+    height, width = maps.reason[::step, ::step].shape
+    packed, scales = _numbers(maps, surface, step)
+    data = {"width": width, "height": height, "step": step, "layers": layers, "numbers": packed, **scales,
+            "reasons": [REASONS[code] for code in Reason]}  # fmt: skip
+    script = Template(page_part(_PACKAGE, "shot.js")).substitute(data=script_json(data))
+    w, h = maps.size
+    said = f"{w} x {h} pixels" + (f"; every {step}. pixel each way is on this page" if step > 1 else "")
+    return Template(page_part(_PACKAGE, "shot.html")).substitute(
+        policy=content_policy(script),
+        title=html.escape(maps.name),
+        summary=html.escape(said),
+        style=page_part(_PACKAGE, "shot.css"),
+        buttons="".join(
+            f'<button type="button" data-layer="{k}" aria-pressed="false">{html.escape(kind.label)}</button>'
+            for k, kind in enumerate(shown)
+        ),
+        legends="".join(legends),
+        width=width,
+        height=height,
+        facts=_facts(maps, surface),
+        script=script,
+    )
+
+
+def _numbers(maps: ShotMaps, surface: SurfaceMaps, step: int) -> tuple[str, dict[str, float]]:
+    """Bytes of all numbers, plane by plane, deflated and in base64; and what they are scaled with."""
+
+    def picked(values: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(values[::step, ::step])
+
+    def halves(share: NDArray[Any]) -> list[NDArray[np.uint8]]:
+        code = np.rint(np.clip(np.nan_to_num(share), 0, 1) * 65535).astype(np.uint16)
+        return [(code >> 8).astype(np.uint8), (code & 255).astype(np.uint8)]
+
+    def logarithmic(sigma: NDArray[Any], top: float) -> NDArray[np.uint8]:
+        span = math.log(top / _SMALLEST_SIGMA)
+        share = (
+            np.log(np.clip(np.nan_to_num(sigma, posinf=top), _SMALLEST_SIGMA, top) / _SMALLEST_SIGMA) / span
+        )
+        return np.asarray(np.rint(share * 255).astype(np.uint8))
+
+    top = max(float(maps.s0.max()), 1e-6)
+    s0 = picked(maps.s0)
+    planes = halves(s0 / top) + halves(picked(maps.dolp)) + halves(picked(maps.aolp) / math.pi)
+    planes += [logarithmic(picked(maps.sigma_dolp), 10.0), logarithmic(picked(maps.sigma_aolp), 10.0)]
+    planes += [np.rint(picked(surface.normal)[..., axis] * 127 + 128).astype(np.uint8) for axis in range(3)]
+    for layer in (surface.specular_exact, surface.specular_paper):
+        share = picked(layer).mean(axis=-1) / np.maximum(s0, 1e-6)
+        planes.append(np.rint(np.clip(share, 0, 1) * 255).astype(np.uint8))
+    planes.append(picked(maps.reason))
+    data = zlib.compress(np.stack(planes).tobytes(), 6)
+    return base64.b64encode(data).decode(), {
+        "top": top,
+        "least": _SMALLEST_SIGMA,
+        "most": 10.0,
+        "index": surface.refractive_index,
+    }
+
+
+def _legend(kind: MapKind, stretch: Stretch) -> str:
+    mark = ""
+    if kind.look == "scalar":
+        stops = figures.color_gradient(kind.color_map)
+        unit = f"&#8201;{kind.shown_unit.replace('deg', '°')}" if kind.shown_unit else ""
+        mark = (
+            f'<span>{stretch.low:g}</span><span class="ramp" style="background:linear-gradient(90deg,{stops})"></span>'
+            f"<span>{stretch.high:g}{unit}</span>"
+        )
+    elif kind.look == "angle":
+        mark = _wheel()
+    elif kind.look == "reason":
+        mark = "".join(
+            f'<span class="patch" style="background:rgb{color}"></span><span>{code.name.lower()}</span>'
+            for code, color in REASON_COLORS.items()
+        )
+    elif kind.look == "normal":
+        mark = "<span>right is red, up is green, toward the camera is blue; gray: no angle</span>"
+    said = "" if kind.fixed or not stretch.text else f"<span>stretch: {html.escape(stretch.text)}</span>"
+    note = f'<span class="note">{html.escape(kind.note)}</span>' if kind.note else ""
+    return f'<p class="legend" hidden>{mark}{said}{note}</p>'
+
+
+def _wheel() -> str:
+    """The colors of the AoLP as a half disc: 0 degrees to the right, counter-clockwise."""
+    count, cx, cy, radius = 36, 66.0, 50.0, 36.0
+    angles = (torch.arange(count, dtype=torch.float64) + 0.5) * math.pi / count
+    wedges = []
+    for k, (r, g, b) in enumerate(figures.aolp_to_rgb(angles[None])[0].tolist()):
+        ends = (k * math.pi / count, min(k + 1.15, count) * math.pi / count)
+        (x1, y1), (x2, y2) = ((cx + radius * math.cos(a), cy - radius * math.sin(a)) for a in ends)
+        wedges.append(f'<path fill="rgb({r},{g},{b})" d="M{cx} {cy}L{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}Z"/>')
+    texts = "".join(
+        f'<text x="{cx + (radius + 13) * math.cos(math.radians(a)):.1f}" '
+        f'y="{cy - (radius + 6) * math.sin(math.radians(a)) + 3:.1f}">{a}°</text>'
+        for a in (0, 45, 90, 135, 180)
+    )
+    drawing = "".join(wedges) + texts
+    return f'<svg class="wheel" viewBox="0 0 132 58" role="img" aria-label="AoLP by color">{drawing}</svg>'
+
+
+def _facts(maps: ShotMaps, surface: SurfaceMaps) -> str:
+    counts = np.bincount(maps.reason.ravel(), minlength=len(Reason)) / maps.reason.size
+    ratio = (
+        "too dark to tell" if maps.pair_ratio is None else f"{maps.pair_ratio:.4f} (1 for ideal polarizers)"
+    )
+    wells = f", {1 / maps.noise.slope:,.0f} electrons at full scale" if maps.noise.slope > 0 else ""
+    facts = {
+        "pixels": ", ".join(f"{code.name.lower()} {counts[code]:.1%}" for code in Reason if counts[code] > 0),
+        "median DoLP": f"{float(np.median(maps.dolp[maps.measured])):.4f}" if maps.measured.any() else "none",
+        "(I0 + I90) / (I45 + I135)": ratio,
+        "noise of a sample": f"{maps.noise.source}: {maps.noise.floor**0.5:.2%} of full scale in the dark{wells}",
+        "refractive index": f"{surface.refractive_index:g}",
+        "rays": "of a pinhole camera"
+        if surface.perspective
+        else "parallel to the axis (--intrinsics gives others)",
+        "files": ", ".join(path.name for path in maps.files),
+        **({"notes": " ".join(maps.notes)} if maps.notes else {}),
+    }
+    return "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())

@@ -1,0 +1,240 @@
+"""The maps of a shot as pictures with a legend: what the colors mean, and how far they are stretched."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide.shots.catalog import REASON_COLORS, MapKind
+from polarguide.shots.maps import Reason, ShotMaps
+from polarguide.shots.read import tiles
+from polarguide.visualization import figures
+from polarguide.visualization.sheet import FONT, INK, Picture
+
+NOTHING = (96, 100, 110)
+"""Color of pixels without a measurement."""
+_NICE = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+_SAMPLES = 200_000
+_NARROWEST = 640
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """How numbers become colors.
+
+    Attributes:
+        low, high: the numbers at both ends, in the picture's unit; a radiance is divided by ``high``.
+        text: the same in words.
+    """
+
+    low: float
+    high: float
+    text: str
+
+
+def stretch_of(kind: MapKind, values: NDArray[Any], maps: ShotMaps) -> Stretch:
+    """The stretch that shows the numbers of a map: nearly all measured ones fit into it.
+
+    Layers share the stretch of S0, so that they can be compared.
+    """
+    if kind.fixed is not None:
+        low, high = kind.fixed
+        return Stretch(low, high, f"{low:g} to {high:g} {kind.shown_unit}".strip())
+    if kind.look == "radiance":
+        top = _nice(_quantile(maps.s0 / 2, maps.measured))
+        return Stretch(0.0, top, f"sRGB; white is S0/2 = {top:g} of full scale (x{1 / top:.3g})")
+    if kind.look == "angle":
+        top = _nice(_quantile(maps.dolp, maps.measured, 0.75))
+        return Stretch(0.0, top, f"hue: angle; full brightness from DoLP {top:g} on")
+    if kind.look == "scalar":
+        top = _nice(_quantile(values, maps.measured, 0.98) * kind.factor)
+        return Stretch(0.0, top, f"0 to {top:g}; 98 % of the pixels are in it")
+    return Stretch(0.0, 1.0, "")
+
+
+def drawn(kind: MapKind, values: NDArray[Any], maps: ShotMaps, stretch: Stretch, step: int = 1) -> Picture:
+    """The map in colors, without legend, every ``step``-th pixel: uint8 RGB [H, W, 3]."""
+    values, dolp, reason = (
+        values[::step, ::step],
+        maps.dolp[::step, ::step],
+        maps.reason[::step, ::step],
+    )
+    height, width = reason.shape
+    picture: Picture = np.empty((height, width, 3), np.uint8)
+    for part in tiles(height, width):
+        picture[part] = _colored(kind, values[part], dolp[part], reason[part], stretch)
+    return picture
+
+
+def _colored(
+    kind: MapKind, values: NDArray[Any], dolp: NDArray[Any], reason: NDArray[np.uint8], stretch: Stretch
+) -> Picture:
+    if kind.look == "reason":
+        table = np.array([REASON_COLORS[code] for code in Reason], np.uint8)
+        return np.asarray(table[values])
+    numbers = torch.from_numpy(np.ascontiguousarray(values))
+    if kind.look == "radiance":
+        return figures.radiance_to_rgb((numbers / (2 * stretch.high)).expand(-1, -1, 3))
+    if kind.look == "angle":
+        strength = torch.from_numpy(np.ascontiguousarray(dolp)) / stretch.high
+        picture = figures.aolp_to_rgb(numbers, strength)
+    elif kind.look == "normal":
+        return _normal_colors(numbers)
+    else:
+        picture = figures.scalar_to_rgb(numbers * kind.factor, stretch.low, stretch.high, kind.color_map)
+        picture[~np.isfinite(values)] = NOTHING
+    picture[reason > Reason.NOISE] = NOTHING
+    return picture
+
+
+def _normal_colors(normals: Tensor) -> Picture:
+    there = (normals != 0).any(dim=-1, keepdim=True)
+    colors = torch.where(
+        there, (normals * torch.tensor([1.0, -1.0, -1.0]) + 1) / 2 * 255, torch.tensor(NOTHING)
+    )
+    return np.asarray(torch.floor(colors + 0.5).clamp(0, 255).to(torch.uint8).numpy())
+
+
+def with_legend(picture: Picture, kind: MapKind, stretch: Stretch, title: str) -> Picture:
+    """The picture with a strip below it that says what it shows."""
+    width = picture.shape[1]
+    if width < _NARROWEST:  # a legend that can be read is wider than a small picture
+        picture = np.pad(picture, ((0, 0), (0, _NARROWEST - width), (0, 0)), constant_values=255)
+        width = _NARROWEST
+    scale = width / 1224
+    strip: Picture = np.full((round(96 * max(scale, 0.6)), width, 3), 255, np.uint8)
+    scale = max(scale, 0.6)
+    mark = _mark(kind, stretch, scale)
+    strip[: mark.shape[0], width - mark.shape[1] :] = mark
+    room = width - mark.shape[1] - round(30 * scale)
+    lines = [
+        (f"{kind.label}   {title}", 0.75),
+        (f"stretch: {stretch.text}" if stretch.text else kind.unit, 0.6),
+    ]
+    grays = _grays(kind)
+    lines.append(("; ".join(filter(None, (kind.note, grays))), 0.5))
+    y = 0.0
+    for text, size in lines:
+        y += 30 * scale
+        _text(strip, text, round(14 * scale), round(y), size * scale, room)
+    return np.concatenate((picture, strip))
+
+
+def _grays(kind: MapKind) -> str:
+    if kind.look in ("scalar", "angle"):
+        return "gray: dark, saturated or masked"
+    return "gray: no angle (noise, dark, saturated, masked)" if kind.look == "normal" else ""
+
+
+def _mark(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
+    """The key of the colors: a bar, a wheel, a ball or patches, as wide as it needs."""
+    high = round(96 * scale)
+    if kind.look == "scalar":
+        return _bar(kind, stretch, scale)
+    if kind.look == "angle":
+        return _wheel(high, scale)
+    if kind.look == "normal":
+        return _ball(high)
+    if kind.look == "reason":
+        return _patches(high, scale)
+    return np.full((high, 1, 3), 255, np.uint8)
+
+
+def _bar(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
+    wide, high, margin = round(320 * scale), round(96 * scale), round(20 * scale)
+    mark: Picture = np.full((high, wide + 2 * margin, 3), 255, np.uint8)
+    ramp = torch.linspace(stretch.low, stretch.high, wide).expand(round(34 * scale), -1)
+    top = round(16 * scale)
+    mark[top : top + ramp.shape[0], margin : margin + wide] = figures.scalar_to_rgb(
+        ramp, stretch.low, stretch.high, kind.color_map
+    )
+    for share in (0.0, 0.5, 1.0):
+        number = stretch.low + share * (stretch.high - stretch.low)
+        text = f"{number:g}" + (f" {kind.shown_unit}" if share == 1 and kind.shown_unit else "")
+        (drawn_width, _), _ = cv2.getTextSize(text, FONT, 0.55 * scale, 1)
+        x = round(margin + share * wide - drawn_width / 2)
+        x = min(max(x, 2), mark.shape[1] - drawn_width - 2)
+        _text(mark, text, x, top + ramp.shape[0] + round(24 * scale), 0.55 * scale, mark.shape[1])
+    return mark
+
+
+def _wheel(high: int, scale: float) -> Picture:
+    """Colors by direction of the field, over half a turn, with the angles written to it."""
+    radius, margin = high - round(40 * scale), round(56 * scale)
+    mark: Picture = np.full((high, 2 * (radius + margin), 3), 255, np.uint8)
+    cx, cy = radius + margin, high - round(14 * scale)
+    y, x = np.mgrid[0 : mark.shape[0], 0 : mark.shape[1]]
+    angle, distance = np.arctan2(cy - y, x - cx), np.hypot(cy - y, x - cx)
+    inside = (distance <= radius) & (distance >= 0.35 * radius) & (y <= cy)
+    mark[inside] = figures.aolp_to_rgb(torch.from_numpy(angle))[inside]
+    for degrees in (0, 45, 90, 135, 180):
+        text = str(degrees) if degrees else "0 deg"
+        (wide, tall), _ = cv2.getTextSize(text, FONT, 0.5 * scale, 1)
+        a = math.radians(degrees)
+        px = cx + (radius + 6 * scale) * math.cos(a)
+        py = cy - (radius + 6 * scale) * math.sin(a)
+        px -= wide * (1 - math.cos(a)) / 2
+        _text(
+            mark, text, round(px), round(py + (tall / 2 if degrees in (0, 180) else 0)), 0.5 * scale, wide + 9
+        )
+    return mark
+
+
+def _ball(high: int) -> Picture:
+    """A ball seen from the camera, in the colors of its normals."""
+    radius = 0.42 * high
+    y, x = np.mgrid[0:high, 0 : round(1.2 * high)]
+    right, down = (x - 0.5 * high) / radius, (y - 0.5 * high) / radius
+    inside = right**2 + down**2 <= 1
+    toward = np.sqrt(np.maximum(1 - right**2 - down**2, 0))
+    normals = torch.from_numpy(np.stack((right, down, -toward), axis=-1).astype(np.float32))
+    return np.where(inside[..., None], _normal_colors(normals), 255).astype(np.uint8)
+
+
+def _patches(high: int, scale: float) -> Picture:
+    mark: Picture = np.full((high, round(520 * scale), 3), 255, np.uint8)
+    for number, (code, color) in enumerate(REASON_COLORS.items()):
+        x, y = round((12 + 170 * (number % 3)) * scale), round((14 + 40 * (number // 3)) * scale)
+        side = round(24 * scale)
+        mark[y : y + side, x : x + side] = color
+        cv2.rectangle(mark, (x, y), (x + side, y + side), INK, 1)
+        _text(
+            mark,
+            code.name.lower(),
+            x + side + round(8 * scale),
+            y + side - round(6 * scale),
+            0.55 * scale,
+            999,
+        )
+    return mark
+
+
+def _text(picture: Picture, text: str, x: int, y: int, size: float, room: int) -> None:
+    """Draw text; smaller if it has to be, in ASCII."""
+    text = text.encode("ascii", "replace").decode()
+    while size > 0.3 and cv2.getTextSize(text, FONT, size, 1)[0][0] > room:
+        size *= 0.95
+    thickness = max(1, round(1.4 * size))
+    cv2.putText(picture, text, (x, y), FONT, size, INK, thickness, cv2.LINE_AA)
+
+
+def _quantile(values: NDArray[Any], where: NDArray[np.bool_], q: float = 0.995) -> float:
+    step = max(1, math.isqrt(values.size // _SAMPLES))
+    found = values[::step, ::step][where[::step, ::step]]
+    found = found[np.isfinite(found)]
+    return float(np.quantile(found, q)) if found.size else 1.0
+
+
+def _nice(value: float) -> float:
+    """The next round number, at most 1 for shares near it."""
+    if not value > 1e-6:
+        return 1e-3
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(f"{next(n * power for n in _NICE if n * power >= value * 0.999):.6g}")

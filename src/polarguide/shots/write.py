@@ -1,0 +1,171 @@
+"""The maps of shots as files: PNG with legends, EXR and NPY of the numbers, and a page."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.errors import PolarguideError, optional_import
+from polarguide.files import atomic, make_folder, write_text, write_whole
+from polarguide.progress import SILENT, Reporter
+from polarguide.records import to_json
+from polarguide.shots.catalog import KINDS
+from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.maps import Reason, ShotMaps
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.page_html import PAGE, shot_page
+from polarguide.shots.pictures import drawn, stretch_of, with_legend
+from polarguide.shots.read import read_shot
+from polarguide.shots.surface import SurfaceMaps, camera_of, surface_maps
+from polarguide.visualization import figures
+
+FORMATS = ("png", "exr", "npy", "page")
+UNITS_FILE = "maps.json"
+
+
+@dataclass(frozen=True)
+class WrittenShots:
+    """What came of several shots.
+
+    Attributes:
+        folders: of the shots that were written, by name.
+        faults: the errors of the others, by name.
+    """
+
+    folders: dict[str, Path]
+    faults: dict[str, PolarguideError]
+
+
+def write_shots(
+    paths: Sequence[str | os.PathLike[str]] | Sequence[ExposureSet],
+    out: str | os.PathLike[str],
+    options: ShotOptions | None = None,
+    *,
+    formats: Collection[str] = FORMATS,
+    intrinsics: str | None = None,
+    refractive_index: float = 1.5,
+    reporter: Reporter = SILENT,
+) -> WrittenShots:
+    """Write all maps of one or many shots, a folder for each.
+
+    A shot that cannot be read does not stop the others.
+
+    Args:
+        paths: files and folders as ``find_shots`` takes them, or what it has found.
+        out: folder to write; the maps of a shot are in the folder of its name there.
+        options: how shots are read.
+        formats: png (with legends), exr and npy (numbers; ``maps.json`` says their units), page.
+        intrinsics: ``fx,fy,cx,cy`` of the developed pictures; without them, and without poses of a scene, rays are
+            parallel.
+        refractive_index: of all surfaces.
+        reporter: where messages and progress go.
+
+    Raises:
+        PolarguideError: there are no shots, an option is wrong, or every shot failed: then the error of the first.
+    """
+    options = (options or ShotOptions()).checked()
+    unknown = sorted(set(formats) - set(FORMATS))
+    if unknown or not formats:
+        raise PolarguideError(
+            "formats",
+            expected=f"some of {', '.join(FORMATS)}",
+            found=", ".join(unknown) or "none",
+            remedy="Correct the name.",
+        )
+    if "exr" in formats:
+        optional_import("OpenEXR", "EXR files", install="'polarguide[exr]'")
+    found = [s for s in paths if isinstance(s, ExposureSet)]
+    found += (
+        find_shots([p for p in paths if not isinstance(p, ExposureSet)], options)
+        if len(found) < len(paths)
+        else []
+    )
+    folders: dict[str, Path] = {}
+    faults: dict[str, PolarguideError] = {}
+    with reporter.track("shots", len(found)) as advance:
+        for number, shot in enumerate(found, 1):
+            try:
+                maps = read_shot(shot, options)
+                surface = surface_maps(maps, camera_of(shot, maps.size, intrinsics), refractive_index)
+            except PolarguideError as error:
+                if len(found) == 1:
+                    raise
+                faults[shot.name] = error
+                reporter.warn(str(error))
+            else:
+                for note in maps.notes:
+                    reporter.say(f"{shot.name}: {note}")
+                folders[shot.name] = write_maps(maps, surface, Path(out) / shot.name, formats)
+            advance(number)
+    if not folders:
+        raise next(iter(faults.values()))
+    return WrittenShots(folders, faults)
+
+
+def write_maps(
+    maps: ShotMaps, surface: SurfaceMaps, folder: Path, formats: Collection[str] = FORMATS
+) -> Path:
+    """Write the maps of one shot into a folder; returns the folder.
+
+    Raises:
+        PolarguideError: the folder cannot be made.
+    """
+    make_folder(folder)
+    for kind in KINDS:
+        values = kind.values(maps, surface)
+        if "png" in formats:
+            stretch = stretch_of(kind, values, maps)
+            picture = with_legend(drawn(kind, values, maps, stretch), kind, stretch, maps.name)
+            figures.write_png(folder / f"{kind.key}.png", picture)
+        if "npy" in formats:
+            with atomic(folder / f"{kind.key}.npy") as temporary, open(temporary, "wb") as file:
+                np.save(file, values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values)
+        if "exr" in formats:
+            _write_exr(folder / f"{kind.key}.exr", values, kind.unit, kind.note)
+    write_whole(folder / UNITS_FILE, to_json(_record(maps, surface)))
+    if "page" in formats:
+        write_text(folder / PAGE, shot_page(maps, surface))
+    return folder
+
+
+def _record(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, Any]:
+    """Units of the maps, and what is known of the shot."""
+    counts = np.bincount(maps.reason.ravel(), minlength=len(Reason)) / maps.reason.size
+    return {
+        "version": 1,
+        "shot": maps.name,
+        "files": [str(path) for path in maps.files],
+        "size": list(maps.size),
+        "maps": {kind.key: {"unit": kind.unit, "note": kind.note} for kind in KINDS},
+        "shares": {code.name.lower(): round(float(counts[code]), 6) for code in Reason},
+        "noise": {"floor": maps.noise.floor, "slope": maps.noise.slope, "source": maps.noise.source},
+        "pair_ratio": maps.pair_ratio,
+        "refractive_index": surface.refractive_index,
+        "rays": "of a pinhole camera" if surface.perspective else "parallel",
+        "notes": list(maps.notes),
+    }
+
+
+def _write_exr(path: Path, values: NDArray[Any], unit: str, note: str) -> None:
+    """One map as 32-bit floats, its unit in the header; one channel Y, or R, G, B (x, y, z of a normal).
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    exr = optional_import("OpenEXR", "EXR files", install="'polarguide[exr]'")
+    numbers = np.ascontiguousarray(
+        values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values, np.float32
+    )
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage, "unit": unit, "comments": note}
+    channels = {"Y": numbers} if numbers.ndim == 2 else {"RGB": numbers}
+    with atomic(path) as temporary, exr.File(header, channels) as file:
+        try:
+            file.write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(str(error).strip().splitlines()[-1]) from None

@@ -1,0 +1,232 @@
+"""Find and read exposure sets."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polarguide import optics
+from polarguide.capture.sensor.pattern import sensor_pattern, tiled
+from polarguide.capture.write import write_view
+from polarguide.errors import PolarguideError
+from polarguide.polarizer import ANGLES, malus
+from polarguide.shots import Reason, ShotMaps, ShotOptions, find_shots, read_shot
+
+SHAPE = (64, 96)
+TINT = (0.8, 1.2, 1.0)  # of the filters; their mean is 1
+
+
+def light(height: int = SHAPE[0], width: int = SHAPE[1]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Smooth Stokes vectors of gray light."""
+    y, x = np.mgrid[0:height, 0:width] / 64.0
+    s0 = 0.7 + 0.2 * np.sin(2 * x) * np.cos(y)
+    degree, angle = 0.3 + 0.2 * np.cos(1.5 * x), 0.4 + 0.8 * y
+    return s0, s0 * degree * np.cos(2 * angle), s0 * degree * np.sin(2 * angle)
+
+
+def write_mosaic(path: Path, sensor: str = "IMX250MZR") -> None:
+    angles = tiled(sensor_pattern(sensor).angles, SHAPE)
+    values = malus(light(), np.deg2rad(angles))
+    colors = sensor_pattern(sensor).colors
+    if colors is not None:
+        values = values * np.array(TINT)[tiled(colors, SHAPE)]
+    assert cv2.imwrite(str(path), np.rint(values * 4095).astype(np.uint16))
+
+
+def write_four(folder: Path, names: tuple[str, ...]) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / name for name in names]
+    for path, angle in zip(paths, ANGLES, strict=True):
+        path.parent.mkdir(exist_ok=True)
+        values = np.rint(malus(light(), math.radians(angle)) * 65535).astype(np.uint16)
+        assert cv2.imwrite(str(path), np.repeat(values[..., None], 3, axis=2))
+    return paths
+
+
+PLAIN = ShotOptions(transfer="linear", align=False)
+MONO = ShotOptions(sensor="IMX250MZR", bits=12)
+CUP = tuple(f"cup_{angle}.png" for angle in ANGLES)
+
+
+def agrees(maps: ShotMaps, atol: float) -> None:
+    s0, s1, s2 = light()
+    np.testing.assert_allclose(maps.s0, s0, atol=atol)
+    np.testing.assert_allclose(maps.dolp, np.hypot(s1, s2) / s0, atol=atol)
+    turn = maps.aolp - np.arctan2(s2, s1) / 2
+    assert np.abs(np.sin(turn)).max() < 3 * atol
+    assert ((maps.aolp >= 0) & (maps.aolp < np.pi)).all()
+
+
+@pytest.mark.parametrize("mode", ["full", "half"])
+@pytest.mark.parametrize("sensor", ["IMX250MZR", "IMX250MYR"])
+def test_a_mosaic(tmp_path: Path, sensor: str, mode: str) -> None:
+    write_mosaic(tmp_path / "part.png", sensor)
+    options = ShotOptions(sensor=sensor, bits=12, demosaic=mode)  # type: ignore[arg-type]
+    maps = read_shot(tmp_path / "part.png", options)
+    assert maps.name == "part"
+    assert maps.intensities.shape[-1] == (1 if sensor == "IMX250MZR" else 3)
+    if mode == "full":
+        inner = np.s_[4:-4, 4:-4]
+        s0, s1, s2 = light()
+        np.testing.assert_allclose(maps.s0[inner], s0[inner], atol=2e-3)
+        np.testing.assert_allclose(maps.dolp[inner], (np.hypot(s1, s2) / s0)[inner], atol=4e-3)
+    else:
+        assert maps.size == (SHAPE[1] // 2, SHAPE[0] // 2)
+    assert maps.usable.mean() > 0.99
+
+
+@pytest.mark.parametrize(
+    "names",
+    [CUP, ("I0.png", "I45.png", "I90.png", "I135.png"), ("0/cup.png", "45/cup.png", "90/cup.png", "135/cup.png")],
+)  # fmt: skip
+def test_four_shots_as_files_and_as_a_folder(tmp_path: Path, names: tuple[str, ...]) -> None:
+    paths = write_four(tmp_path / "cup", names)
+    for given in (paths, [tmp_path / "cup"], [tmp_path]):
+        (found,) = find_shots(given)
+        assert found.kind == "filter"
+        assert found.name == "cup" if given != [tmp_path] or "/" not in names[0] else "cup_cup"
+        assert found.files == dict(zip(ANGLES, paths, strict=True))
+        agrees(read_shot(found, PLAIN), 1e-4)
+
+
+def test_a_folder_of_shots_by_suffix(tmp_path: Path) -> None:
+    for name in ("cup", "part 7"):
+        write_four(tmp_path, tuple(f"{name}_{angle}.png" for angle in ANGLES))
+    assert [shot.name for shot in find_shots([tmp_path])] == ["cup", "part 7"]
+
+
+def test_a_scene_without_poses(tmp_path: Path) -> None:
+    codes = np.stack([np.rint(malus(light(), math.radians(a)) * 65535) for a in ANGLES]).astype(np.uint16)
+    invalid = np.zeros(SHAPE, bool)
+    invalid[10:20, 30:40] = True
+    for folder in ("polar", "invalid"):
+        (tmp_path / folder).mkdir()
+    write_view(tmp_path, "v000", np.repeat(codes[..., None], 3, axis=3), invalid)
+    (found,) = find_shots([tmp_path])
+    assert (found.kind, found.view) == ("scene", "v000")
+    maps = read_shot(found)
+    agrees(maps, 1e-4)
+    assert (maps.reason == Reason.MASKED).sum() == 100
+    assert (maps.reason[10:20, 30:40] == Reason.MASKED).all()
+
+
+def test_polanalyser_agrees(tmp_path: Path) -> None:
+    """Demosaiced and computed by an independent program, which rounds its demosaicing to whole numbers."""
+    reference = pytest.importorskip("polanalyser")
+    write_mosaic(tmp_path / "a.png")
+    raw = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    maps = read_shot(tmp_path / "a.png", MONO)
+    theirs = np.stack(reference.demosaicing(raw, reference.COLOR_PolarMono)) / 4095
+    assert np.abs(theirs - maps.intensities[..., 0])[:, 2:-2, 2:-2].max() <= 0.5001 / 4095
+    stokes = reference.calcStokes(list(maps.intensities[..., 0]), np.deg2rad(ANGLES))
+    np.testing.assert_allclose(maps.stokes, np.moveaxis(stokes, -1, 0), atol=1e-5)
+    np.testing.assert_allclose(maps.dolp, reference.cvtStokesToDoLP(stokes), atol=1e-5)
+    assert np.abs(np.sin(maps.aolp - reference.cvtStokesToAoLP(stokes))).max() < 1e-5
+
+
+def test_a_region_of_the_sensor_and_a_black_level(tmp_path: Path) -> None:
+    write_mosaic(tmp_path / "a.png")
+    whole = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(tmp_path / "b.png"), (whole[1:, 3:] + 100).astype(np.uint16))
+    options = ShotOptions(sensor="IMX250MZR", bits=13, offset_x=3, offset_y=1, black_level=100)
+    part = read_shot(tmp_path / "b.png", options)
+    full = read_shot(tmp_path / "a.png", MONO)
+    np.testing.assert_allclose(part.dolp[4:50, 4:80], full.dolp[5:51, 7:83], atol=1e-4)
+
+
+def test_a_color_shot_keeps_its_colors_and_its_luminance_tells_the_angle(tmp_path: Path) -> None:
+    write_mosaic(tmp_path / "a.png", "IMX250MYR")
+    maps = read_shot(tmp_path / "a.png", ShotOptions(sensor="IMX250MYR", bits=12))
+    gray = optics.luminance(optics.stokes(maps.intensities))
+    np.testing.assert_allclose(maps.stokes, gray, atol=1e-6)
+    np.testing.assert_allclose(maps.dolp, optics.dolp(gray), atol=1e-5)
+
+
+def test_unequal_gains_are_told_and_corrected_on_demand(tmp_path: Path) -> None:
+    paths = write_four(tmp_path, CUP)
+    for path in (paths[0], paths[2]):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.rint(picture * 0.97).astype(np.uint16))
+    plain = read_shot(paths, PLAIN)
+    assert any("not corrected" in note for note in plain.notes)
+    assert plain.pair_ratio == pytest.approx(0.97, abs=1e-3)
+    corrected = read_shot(paths, ShotOptions(transfer="linear", align=False, gains="auto"))
+    s0, s1, s2 = light()
+    true = np.hypot(s1, s2) / s0
+    assert np.abs(corrected.dolp - true).max() < 0.1 * np.abs(plain.dolp - true).max()
+
+
+class TestWrong:
+    def fails(self, expected: str, given: list[Path], options: ShotOptions | None = None) -> None:
+        def read() -> None:
+            for shot in find_shots(given, options):
+                read_shot(shot, options)
+
+        with pytest.raises(PolarguideError, match=expected):
+            read()
+
+    def test_three_of_four(self, tmp_path: Path) -> None:
+        paths = write_four(tmp_path, CUP)
+        self.fails("shots of view cup at 0, 45, 90 and 135 degrees, found none at 90", [*paths[:2], paths[3]])
+        paths[1].unlink()
+        self.fails("found none at 45", [tmp_path])
+
+    def test_files_without_angles(self, tmp_path: Path) -> None:
+        write_mosaic(tmp_path / "part.png")
+        self.fails("raw mosaics with --sensor, or shots with angles in their names", [tmp_path / "part.png"])
+        self.fails("raw mosaics with --sensor", [tmp_path])
+
+    def test_no_such_file(self, tmp_path: Path) -> None:
+        self.fails("expected a file or folder of shots, found none", [tmp_path / "none.png"])
+
+    def test_an_empty_folder(self, tmp_path: Path) -> None:
+        self.fails("expected shots, found an empty folder", [tmp_path])
+
+    def test_wrong_sensor(self, tmp_path: Path) -> None:
+        rng = np.random.default_rng(0)
+        values = np.kron(rng.uniform(600, 2500, (32, 32)), np.ones((8, 8))).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / "a.png"), values)
+        self.fails("found no sign of color filters", [tmp_path / "a.png"], ShotOptions(sensor="IMX250MYR"))
+
+    def test_a_file_cut_short(self, tmp_path: Path) -> None:
+        write_mosaic(tmp_path / "a.png")
+        data = (tmp_path / "a.png").read_bytes()
+        (tmp_path / "a.png").write_bytes(data[: len(data) // 2])
+        self.fails("found a PNG file cut short", [tmp_path / "a.png"], MONO)
+
+    def test_wrong_depth(self, tmp_path: Path) -> None:
+        write_mosaic(tmp_path / "a.png")
+        self.fails(
+            "values below 256 for 8 bits", [tmp_path / "a.png"], ShotOptions(sensor="IMX250MZR", bits=8)
+        )
+
+    def test_wrong_size(self, tmp_path: Path) -> None:
+        write_mosaic(tmp_path / "a.png")
+        options = ShotOptions(sensor="IMX250MZR", width=2448, height=2048)
+        self.fails("expected 2448x2048 pixels", [tmp_path / "a.png"], options)
+        cv2.imwrite(str(tmp_path / "b.png"), np.zeros((2100, 2500), np.uint16))
+        self.fails("at most 2464x2056 pixels", [tmp_path / "b.png"], MONO)
+
+    def test_two_shots_where_one_is_asked_for(self, tmp_path: Path) -> None:
+        for name in "ab":
+            write_mosaic(tmp_path / f"{name}.png")
+        with pytest.raises(PolarguideError, match="expected one shot, found 2"):
+            read_shot(tmp_path, MONO)
+
+    def test_two_of_one_name(self, tmp_path: Path) -> None:
+        for folder in "ab":
+            (tmp_path / folder).mkdir()
+            write_mosaic(tmp_path / folder / "part.png")
+        found = find_shots([tmp_path / "a" / "part.png", tmp_path / "b" / "part.png"], MONO)
+        assert [shot.name for shot in found] == ["a_part", "b_part"]
+        shutil.copytree(tmp_path / "a", tmp_path / "c" / "a")
+        self.fails("expected one shot of each name", [tmp_path / "a", tmp_path / "c" / "a"], MONO)
+
+    def test_options_out_of_range(self) -> None:
+        with pytest.raises(PolarguideError, match="--bits: expected 8 to 16, found 20"):
+            ShotOptions(bits=20).checked()
