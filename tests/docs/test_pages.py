@@ -9,6 +9,7 @@ import pytest
 
 import polarguide
 from polarguide.evaluation.table import METRICS
+from polarguide.measurement.fields import FORMAT, KEYS
 from polarguide.recipes import ABLATIONS, RECIPES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -174,3 +175,14 @@ def test_pages_that_messages_name_exist() -> None:
     }
     assert named
     assert {name for name in named if not (ROOT / name).is_file()} == set()
+
+
+def test_every_field_of_the_table_of_measure_is_explained():
+    section = (
+        text_of(DOCS / "reference" / "formats.md")
+        .partition("## The table of `measure`")[2]
+        .partition("\n## ")[0]
+    )
+    assert f"format {FORMAT} " in section
+    rows = [line for line in section.splitlines() if line.startswith("| `")]
+    assert [key for row in rows for key in re.findall(r"`(\w+)`", row.split("|")[1])] == list(KEYS)

@@ -158,6 +158,20 @@ def test_the_reference_and_the_dark_frame_are_not_measured(
     assert sorted(names(tmp_path / "out")) == ["v000", "v002"]
 
 
+def test_a_reference_is_named_by_one_of_its_four_files(tmp_path: Path) -> None:
+    from camera_files import behind, smooth_light, write_shots
+
+    write_shots(tmp_path / "in", "cup", behind(smooth_light()))
+    write_shots(tmp_path / "in", "jar", behind(0.9 * smooth_light()))
+    one = next(path for path in sorted((tmp_path / "in").rglob("*.png")) if "cup" in path.stem)
+    options = MeasureOptions(reference=one)
+    done = measure_shots([tmp_path / "in"], tmp_path / "out", options, ShotOptions(align=False))
+    assert done.counts == {"measured": 2}
+    rows = [json.loads(line)["regions"][0] for line in (tmp_path / "out" / LINES).read_bytes().splitlines()]
+    assert rows[0]["s0_difference"] == 0
+    assert rows[1]["s0_difference"] == pytest.approx(-0.1 * rows[0]["s0_mean"], rel=1e-3)
+
+
 @pytest.mark.skipif(os.name != "posix", reason="kills a process as POSIX systems do")
 def test_kill_9_loses_no_line_and_doubles_none(folder: Path, tmp_path: Path, reading: ShotOptions) -> None:
     for number in range(3, 40):

@@ -35,6 +35,11 @@ VERBS: list[tuple[list[str], dict[str, str]]] = [
         "count": "bits saturation offset-x seed", "number": "black-level zero",
         "text": "order white-balance sensor calibration dark-frame masks poses intrinsics",
     }),
+    (["measure", "mosaics", "--out", "new", "--sensor", "IMX250MYR", "--bits", "16"], {
+        "count": "bits saturation offset-x offset-y threads",
+        "number": "threshold settle patience idle black-level full-well read-noise snr",
+        "text": "roi limits reference calibration dark-frame sensor",
+    }),
     (["inspect", "scene", "--out", "new"], {"count": "steps downscale", "number": "refractive-index"}),
     (["compare", "scene", "--out", "new"], {"count": "seeds jobs threads steps", "text": "recipes"}),
 ]  # fmt: skip

@@ -35,9 +35,9 @@ def _spread(key: str, unit: str, what: str) -> tuple[Field, ...]:
     )
 
 
-def _difference(key: str, unit: str, what: str, mean: str) -> tuple[Field, ...]:
+def _difference(key: str, unit: str, what: str, mean: str, more: str = "") -> tuple[Field, ...]:
     return (
-        Field(f"{key}_difference", unit, f"{mean} of the shot's {what} less that of the reference"),
+        Field(f"{key}_difference", unit, f"{mean} of the shot's {what} less that of the reference{more}"),
         Field(f"{key}_difference_rms", unit, f"root mean square of the difference in {what}"),
         Field(
             f"{key}_difference_p{DIFFERENCE_PERCENTILE}",
@@ -78,7 +78,7 @@ FIELDS = (
     Field("compared_angles", "pixels", "usable in both"),
     *_difference("s0", "full scale", "S0", "mean"),
     *_difference("dolp", "", "debiased DoLP", "mean"),
-    *_difference("aolp", "degrees", "AoLP, -90 to 90,", "circular mean"),
+    *_difference("aolp", "degrees", "AoLP", "circular mean", ", -90 to 90"),
 )
 """In the order of the columns. Without a value (no pixel for it, no reference) a cell is empty, in JSON null."""
 KEYS = tuple(field.key for field in FIELDS)

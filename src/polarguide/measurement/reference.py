@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.layout import angle_of_folder
 from polarguide.errors import PolarguideError
 from polarguide.measurement.fields import COMPARED, DIFFERENCE_PERCENTILE
 from polarguide.measurement.region_figures import Value, axial_mean
@@ -88,11 +89,13 @@ def _where(mask: Mask, values: Map) -> Map:
 
 
 def _reference_shot(path: Path, options: ShotOptions) -> ExposureSet:
-    found = find_shots([path], options)
-    if path.is_file() and len(found) == 1 and found[0].kind == "filter":
-        beside = find_shots([path.parent], options)
+    if path.is_file() and options.sensor is None:
         same = path.resolve()
+        folder = same.parent if angle_of_folder(same.parent) is None else same.parent.parent
+        beside = find_shots([folder], options)
         found = [shot for shot in beside if any(file.resolve() == same for file in shot.paths)]
+    else:
+        found = find_shots([path], options)
     if len(found) != 1:
         raise PolarguideError(
             "--reference",
