@@ -61,7 +61,7 @@ def rasterizer(rng: random.Random) -> None:
         array(rng, n, 3),
         array(rng, n, 4),
         np.abs(array(rng, n, 3)),
-        np.abs(array(rng, n)) % 1,
+        np.clip(np.abs(array(rng, n)), 0, 1),
         array(rng, n, d),
     ]
     out, alpha, radius = array(rng, height, width, d), array(rng, height, width), array(rng, n)
