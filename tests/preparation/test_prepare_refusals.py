@@ -336,6 +336,7 @@ def test_views_with_blanks_and_umlauts(tmp_path: Path) -> None:
         ('{"order": [0, 45]}', "a list of length 4"),
         ('{"sense": "left"}', "ccw or cw"),
         ('{"zero": null}', "a number, found null"),
+        ('{"zero": 1e308}', r"\(zero\): expected -3600 to 3600, found 1e\+308"),
     ],
 )
 def test_calibration_files(tmp_path: Path, text: str, message: str) -> None:

@@ -38,7 +38,7 @@ mosaic .npy of a wrong key/mosaic sparse of 2 GiB/gt is junk in LZMA/gt has a br
 scene with 60000 objects/scene.json of 2 GiB/transforms.json of a place at 1e300/transforms.json of a negative focal length along y/
 transforms.json beside a TIFF cut short/cameras.xml of a width of infinity/cameras.xml of a width of words/cameras.xml of a camera twice/
 cameras.npz of a broken head/cameras.npz of a head with a dictionary as key/cameras.npz that lies about its size/cameras.npz that is junk in LZMA/
-run log of 8 million lines/run scene of a long name/masks with links to themselves/view with control characters and no pose
+option a zero of 1e308/run log of 8 million lines/run scene of a long name/masks with links to themselves/view with control characters and no pose
 """.replace("\n", "").split("/")
 """Cases that ended otherwise than they should before what they showed was mended."""
 SHARE_OF_OTHERS = 5

@@ -21,6 +21,8 @@ Sense = Literal["ccw", "cw"]
 UNIT_GAINS: Gains = (1.0, 1.0, 1.0, 1.0)
 LARGEST_IMBALANCE = 0.1
 """Pair sums that differ by more than this share are no gain differences: files are swapped, or not linear."""
+LARGEST_ZERO = 3600.0
+"""Degrees; farther, a number says less and less about an angle."""
 ROTATED_PEAK = (1.0 + math.sqrt(2.0)) / 2.0
 """The most a turned analyzer can measure where four angles stay under 1."""
 UNIDENTIFIED = (
@@ -46,7 +48,7 @@ class Calibration:
     gains: Gains | None = None
     order: tuple[int, int, int, int] = ANGLES
     sense: Sense | None = None
-    zero: float = 0.0
+    zero: Annotated[float, msgspec.Meta(ge=-LARGEST_ZERO, le=LARGEST_ZERO)] = 0.0
 
     @property
     def permutes(self) -> bool:
