@@ -122,6 +122,10 @@ def test_colors_of_differences() -> None:
         (("--threshold", "2"), "--threshold: expected 0 to 1"),
         (("--limits", "none.json"), "none.json: expected a readable file"),
         (("--reference", "none.png"), "none.png: expected a file or folder of shots"),
+        (
+            ("--dark-frame", "none.png"),
+            "none.png: expected a readable file, found nothing. Check --dark-frame.",
+        ),
         (("--watch", "."), "--watch: expected shots to measure, or a folder to watch"),
         (("--settle", "-1"), "--settle"),
     ],

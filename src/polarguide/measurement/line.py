@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder
+from polarguide.files import make_folder, require_file
 from polarguide.measurement.fields import FORMAT
 from polarguide.measurement.limits import NO_LIMITS, faults, read_limits
 from polarguide.measurement.options import MeasureOptions
@@ -23,6 +23,7 @@ from polarguide.measurement.regions import WHOLE, Region, parse_regions, placed
 from polarguide.measurement.table import Entry, FileStamp, Status, Table, stamps
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
+from polarguide.records import option_name
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import ShotMaps
 from polarguide.shots.options import ShotOptions
@@ -180,11 +181,13 @@ class Line:
     def _settings(self) -> dict[str, Any]:
         """What the figures depend on, as JSON."""
         reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
-        beside = [value for value in reading.values() if isinstance(value, Path)]
+        named = {name: value for name, value in reading.items() if isinstance(value, Path)}
+        for name, path in named.items():
+            require_file(path, expected="a readable file", remedy=f"Check {option_name(name)}.")
         made: dict[str, Any] = msgspec.to_builtins(
             {
                 "reading": reading,
-                "read_files": stamps(beside),
+                "read_files": stamps(tuple(named.values())),
                 "regions": self._regions,
                 "threshold": self._options.threshold,
                 "limits": self._limits,
