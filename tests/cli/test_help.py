@@ -19,6 +19,7 @@ ELSEWHERE = {
     ("prepare", "calibration"),
     ("prepare", "analyzers"),
     ("measure", "calibration"),
+    *((verb, "analyzers") for verb in ("measure", "priors")),
 }
 HEAVY = ("torch", "scipy", "pycolmap", "cv2", "viser")
 

@@ -49,7 +49,7 @@ def measure(
             found="both" if paths else "neither",
             remedy="Give files and folders for one pass, or --watch FOLDER.",
         )
-    reading = replace(reading, calibration=angles.read())
+    reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
     said = _Lines()
     if watching.watch is None:
         line = importlib.import_module("polarguide.measurement.line")

@@ -70,7 +70,7 @@ def priors(
         refractive_index=refractive_index,
         threshold=threshold,
         reading=SceneOptions(downscale, "srgb" if shots.transfer == "srgb" else "linear", memory),
-        shots=replace(shots, calibration=angles.read()),
+        shots=replace(shots, calibration=angles.read(), analyzers=angles.analyzers()),
         formats=None if formats is None else [name.strip() for name in formats.split(",") if name.strip()],
         intrinsics=intrinsics,
         reporter=reporter,

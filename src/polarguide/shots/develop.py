@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from polarguide.capture.filter.exif import apply_orientation, orientation_calibr
 from polarguide.capture.filter.shots import read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
 from polarguide.capture.layout import find_layout, select_views
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers, spread_to_cells
 from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import demosaic
 from polarguide.capture.sensor.pattern import SENSOR_SIZE, tiled
@@ -22,6 +24,7 @@ from polarguide.capture.sensor.radiometry import estimate_levels, unusable_sampl
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.errors import PolarguideError
+from polarguide.files import require_file
 from polarguide.preparation.mosaic_files import MosaicFiles
 from polarguide.preparation.mosaic_samples import block_intensities, sample_blocks
 from polarguide.shots.exposures import ExposureSet
@@ -63,6 +66,13 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
     """
     if shot.kind == "mosaic":
         return _mosaic(shot, options)
+    if options.analyzers is not None:
+        raise PolarguideError(
+            options.analyzers,
+            expected="raw mosaics, whose samples it corrects",
+            found=f"{shot.name}, {'shots through a filter' if shot.kind == 'filter' else 'a view of a scene'}",
+            remedy="Leave it out, or give --sensor and the mosaics; prepare --calibration corrects a scene.",
+        )
     return _filter(shot, options) if shot.kind == "filter" else _scene_view(shot, options)
 
 
@@ -87,11 +97,20 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
         notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
     side = 2 * pattern.period
     floor = None if dark is None else sample_blocks(dark, side)
-    angles, _, usable = block_intensities([sample_blocks(values, side)], levels, floor, pattern)
+    assert options.sensor is not None
+    x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
+    analyzers, matrices = _analyzers(stored.shape, options), None
+    if analyzers is not None:
+        of_cells = analyzers.correction((x, y), values.shape[::-1])
+        matrices = np.stack([[sample_blocks(cell, pattern.period) for cell in row] for row in of_cells])
+    angles, _, usable = block_intensities([sample_blocks(values, side)], levels, floor, pattern, matrices)
     ratio = pair_ratio(angles, usable)
     gains, said = _gains(ratio, options)
     saturated, black = unusable_samples(values, levels, dark)
     linear = levels.linear(values, dark)
+    if analyzers is not None:
+        linear = analyzers.apply(linear, offset=(x, y))
+        saturated, black = spread_to_cells(saturated), spread_to_cells(black)
     if gains != UNIT_GAINS:
         of_angle = dict(zip(ANGLES, gains, strict=True))
         linear *= tiled(np.vectorize(lambda a: np.float32(1 / of_angle[a]))(pattern.angles), linear.shape)
@@ -109,8 +128,6 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
     if black.any():
         blacks = demosaic(linear, black, pattern, mode=mode, interpolation=way).invalid
     shape = lost.shape
-    assert options.sensor is not None
-    x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
     return Developed(
         intensities=oriented(picture.intensities, options.calibration),
         dark=blacks,
@@ -121,6 +138,24 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
         pair_ratio=ratio,
         notes=(*notes, *said),
     )
+
+
+def _analyzers(shape: tuple[int, ...], options: ShotOptions) -> AnalyzerCalibration | None:
+    """The calibration of the sensor, checked against what it is to correct; read once for all shots."""
+    path = options.analyzers
+    if path is None:
+        return None
+    require_file(path, expected="a file of polarguide calibrate", remedy="Check --calibration.")
+    state = path.stat()
+    found = _read(path, state.st_mtime_ns, state.st_size)
+    found.require_sensor(options.sensor, path)
+    found.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
+    return found
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, *_: int) -> AnalyzerCalibration:
+    return read_analyzers(path)
 
 
 def _require_on_sensor(path: Path, shape: tuple[int, ...], options: ShotOptions) -> None:
@@ -146,6 +181,13 @@ def _gains(
     ratio: float | None, options: ShotOptions
 ) -> tuple[tuple[float, float, float, float], tuple[str, ...]]:
     """Gains of the four pictures, and what to say of them."""
+    if options.analyzers is not None:
+        if ratio is None:
+            return UNIT_GAINS, ()
+        notes = [f"With the calibration, I0 + I90 is {ratio - 1:+.2%} off I45 + I135."]
+        if abs(ratio - 1) > _LARGE_IMBALANCE:
+            notes.append("That is more than a calibration of this camera leaves: is it one of another?")
+        return UNIT_GAINS, tuple(notes)
     if options.calibration.gains is not None:
         return options.calibration.gains, ()
     if ratio is None:

@@ -38,6 +38,7 @@ class ShotOptions:
         align: Estimate and correct small shifts between the four shots of a filter.
         gains: none takes the angles as they are, auto corrects what the light of each shot tells of their gains.
         calibration: gains, order, sense and zero of the angles.
+        analyzers: calibration of the sensor that polarguide calibrate wrote, for raw mosaics; takes the place of gains.
         full_well: Electrons of a sample at full scale, for its noise; without it the noise is estimated from each shot.
         read_noise: Electrons of noise without light; goes with the full well.
         snr: DoLP in units of its standard deviation from which on an angle counts.
@@ -59,6 +60,7 @@ class ShotOptions:
     align: bool = True
     gains: Literal["auto", "none"] = "none"
     calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
+    analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
     full_well: Annotated[float, Meta(ge=10, le=1e9)] | None = None
     read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     snr: Annotated[float, Meta(ge=0, le=1000)] = 3.0

@@ -1,0 +1,61 @@
+"""Single shots with a file of ``calibrate``: the maps are those of ideal polarizers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_sensor import made_sensor, true_calibration, write_codes
+
+from polarguide.capture.sensor.analyzers import write_analyzers
+from polarguide.errors import PolarguideError
+from polarguide.shots import ShotOptions, read_shot
+
+SIZE = (64, 96)
+
+
+def _light() -> np.ndarray:
+    """Stokes vectors [H, W, 3]: a DoLP of 0.1 at all angles."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    turn = np.pi * x / SIZE[1] + y / 100
+    s0 = 0.9 + 0.1 * np.sin(x / 60)
+    return np.stack([s0, 0.1 * s0 * np.cos(2 * turn), 0.1 * s0 * np.sin(2 * turn)], axis=-1)
+
+
+def _made(folder: Path, name: str) -> ShotOptions:
+    sensor = made_sensor(name, SIZE, single=True, seed=5)
+    write_codes(folder / "v.png", sensor.sees(_light()))
+    write_analyzers(folder / "camera.safetensors", true_calibration(sensor))
+    return ShotOptions(sensor=name, bits=12)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["IMX250MZR", "IMX250MYR"])
+@pytest.mark.parametrize("mode", ["half", "full"])
+def test_the_error_of_dolp_falls_fivefold(tmp_path: Path, name: str, mode: str) -> None:
+    options = replace(_made(tmp_path, name), demosaic=mode)
+    corrected = replace(options, analyzers=tmp_path / "camera.safetensors", gains="auto")
+    before, after = (
+        np.abs(read_shot(tmp_path / "v.png", o).dolp[4:-4, 4:-4] - 0.1).mean() for o in (options, corrected)
+    )
+    assert after < before / 5
+    maps = read_shot(tmp_path / "v.png", corrected)
+    assert maps.pair_ratio == pytest.approx(1.0, abs=0.002)
+    assert any("With the calibration" in note for note in maps.notes)
+
+
+def test_what_it_does_not_fit_is_refused(tmp_path: Path) -> None:
+    options = replace(_made(tmp_path, "IMX250MZR"), analyzers=tmp_path / "camera.safetensors")
+    with pytest.raises(PolarguideError, match="a calibration of the sensor IMX250MYR"):
+        read_shot(tmp_path / "v.png", replace(options, sensor="IMX250MYR"))
+    with pytest.raises(PolarguideError, match="a calibration of"):
+        read_shot(tmp_path / "v.png", replace(options, offset_x=2))
+    for angle in (0, 45, 90, 135):
+        write_codes(tmp_path / f"w_{angle:03d}.png", np.full(SIZE, 0.5))
+    shots = [tmp_path / f"w_{angle:03d}.png" for angle in (0, 45, 90, 135)]
+    with pytest.raises(PolarguideError, match="shots through a filter"):
+        read_shot(shots, replace(options, sensor=None))
+    (tmp_path / "camera.safetensors").unlink()
+    with pytest.raises(PolarguideError, match=r"camera\.safetensors: expected a file"):
+        read_shot(tmp_path / "v.png", options)
