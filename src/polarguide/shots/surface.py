@@ -108,9 +108,9 @@ def surface_maps(maps: ShotMaps, camera: Camera | None = None, refractive_index:
     check_finite("refractive_index", refractive_index, 1.0001, 4.0)
     channels, height, width = maps.intensities.shape[3], *maps.reason.shape
     zeniths = torch.empty((3, height, width))
-    normal = torch.empty((height, width, 3))
+    normal = torch.empty((3, height, width)).movedim(0, -1)
     paper_specular, paper_diffuse, specular, diffuse = (
-        torch.empty((height, width, channels)) for _ in range(4)
+        torch.empty((channels, height, width)).movedim(0, -1) for _ in range(4)
     )
     conditioned = torch.empty((height, width), dtype=torch.bool)
     stokes, dolp, aolp = (torch.from_numpy(a) for a in (maps.stokes, maps.dolp, maps.aolp))
@@ -170,4 +170,5 @@ def _chosen_normal(
     x = torch.where(specular, -sine, cosine) * sign
     y = torch.where(specular, cosine, sine) * sign
     axes = zip(*(v.unbind(-1) for v in (x_ref, up_ref, rays)), strict=True)
-    return zeniths, torch.stack([x * a + y * b - cosine_z * ray for a, b, ray in axes], dim=-1)
+    # Component by component in memory, as all that follows reads them.
+    return zeniths, torch.stack([x * a + y * b - cosine_z * ray for a, b, ray in axes]).movedim(0, -1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from polarguide.capture.sensor.interpolate import (
     GUIDED_RADIUS,
     bilinear,
-    bilinear_cell,
+    bilinear_cells,
     guided_color,
     guided_polarization,
     used_by_bilinear,
@@ -141,7 +141,7 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> DemosaicedPict
     for channel, plane in enumerate(mosaic):
         if interpolation == "bilinear":
             for index, angle in enumerate(ANGLES):
-                planes[index, channel] = bilinear_cell(plane, *at[angle])
+                bilinear_cells(plane, *at[angle], out=planes[index, channel])
         else:
             planes[:, channel] = guided_polarization(plane, tiled(pattern.angles[:2, :2], bad.shape))
     # Around every pixel the 3x3 pixels hold what is used of all angles.

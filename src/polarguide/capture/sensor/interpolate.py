@@ -48,16 +48,16 @@ def used_by_bilinear(bad: Mask, known: Mask) -> Mask:
     return np.where(known, bad, _filtered((bad & known).astype(np.float32)) > 0)
 
 
-def bilinear_cell(mosaic: Array, row: int, column: int) -> Array:
+def bilinear_cells(mosaic: Array, row: int, column: int, out: Array) -> None:
     """``bilinear`` of the samples at rows ``row``, ``row + 2``, ... and columns ``column``, ``column + 2``, ...
 
     Args:
-        mosaic: [H, W], H and W even. row, column: 0 or 1.
+        mosaic: [H, W], H and W even. row, column: 0 or 1. out: [H, W], takes the result.
     """
     spread = np.zeros_like(mosaic)
     spread[row::2, column::2] = mosaic[row::2, column::2]
     # Reflected about the outermost pixel the lattice goes on, and the weights add up to 1 everywhere.
-    return np.asarray(cv2.sepFilter2D(spread, -1, _HALVES, _HALVES, borderType=cv2.BORDER_REFLECT_101))
+    cv2.sepFilter2D(spread, -1, _HALVES, _HALVES, dst=out, borderType=cv2.BORDER_REFLECT_101)
 
 
 def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
