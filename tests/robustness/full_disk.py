@@ -88,14 +88,8 @@ def fix() -> None:
     importlib.import_module("polarguide.inspection.fix").fix_scene(capture, calibration, Path("new"))
 
 
-EXPORTS = (
-    "ply",
-    "spz",
-    "sog",
-    "points",
-    "environment",
-    "cameras",
-)  # so short a training has no surface for a mesh
+EXPORTS = ("ply", "spz", "sog", "environment", "cameras")
+"""Not of surfaces: so short a training has none."""
 COMMANDS: dict[str, Command] = {
     "train": train,
     "eval": lambda: EVAL,
@@ -110,7 +104,7 @@ COMMANDS: dict[str, Command] = {
     "share": lambda: ["share", "run", "--out", "new/page.html"],
     **{f"export {kind}": lambda kind=kind: ["export", "run", "--format", kind, "--out", "new"] for kind in EXPORTS},
     "compare": lambda: ["compare", "scene", "--recipes", "3dgs", "polarguide", "--steps", STEPS, "--out", "new"],
-    "synth": lambda: ["synth", "proof", "--out", "new", "--size", "16x12", "--samples", "1"],
+    "synth": lambda: ["synth", "proof", "--out", "new", "--size", "16x16", "--samples", "1"],
     "bench": lambda: ["bench", "--out", "new"],
 }  # fmt: skip
 AT_ONCE_ONLY = {"bench"}
