@@ -144,9 +144,7 @@ def test_one_option_takes_both_kinds_of_files(tmp_path: Path) -> None:
     (tmp_path / "angles.json").write_text('{"order": [90, 45, 0, 135]}')
     analyzers = CalibrationOptions(calibration=tmp_path / "camera.safetensors", sense="cw")
     assert analyzers.analyzers() == tmp_path / "camera.safetensors"
-    assert analyzers.read(analyzers_apart=True) == Calibration(sense="cw")
-    with pytest.raises(PolarguideError, match="which holds the analyzers of a sensor"):
-        analyzers.read()  # a caller that would drop the analyzers
+    assert analyzers.read() == Calibration(sense="cw")
     angles = CalibrationOptions(calibration=tmp_path / "angles.json")
     assert angles.analyzers() is None
     assert angles.read().order == (90, 45, 0, 135)

@@ -34,7 +34,7 @@ def prepare(
     """
     use_threads(compute.threads)
     preparation = importlib.import_module("polarguide.preparation.prepare")
-    asked = replace(settings, calibration=angles.read(analyzers_apart=True), analyzers=angles.analyzers())
+    asked = replace(settings, calibration=angles.read(), analyzers=angles.analyzers())
     done = preparation.prepare_scene(source, out, asked, ConsoleReporter())
     without = f", {len(done.left_out)} left out" if done.left_out else ""
     console.print(f"scene: {done.folder} ({len(done.views)} views{without})", markup=False)

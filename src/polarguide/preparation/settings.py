@@ -160,22 +160,12 @@ class CalibrationOptions:
     sense: Sense | None = None
     zero: float | None = None
 
-    def read(self, *, analyzers_apart: bool = False) -> Calibration:
+    def read(self) -> Calibration:
         """The calibration of the file, with what is given beside it.
-
-        Args:
-            analyzers_apart: whether the caller applies what ``analyzers`` gives; else such a file is refused.
 
         Raises:
             PolarguideError: the file or the order is wrong.
         """
-        if self.analyzers() is not None and not analyzers_apart:
-            raise PolarguideError(
-                "--calibration",
-                expected="a JSON file with gains, order, sense and zero",
-                found=f"{self.calibration}, which holds the analyzers of a sensor",
-                remedy="This command cannot correct with it; prepare can.",
-            )
         if self.calibration is None or self.analyzers() is not None:
             found = Calibration()
         else:
