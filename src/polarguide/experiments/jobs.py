@@ -204,7 +204,7 @@ def _stop(children: Sequence[Child]) -> None:
             child.kill()
 
 
-class _Row(msgspec.Struct):
+class LogRow(msgspec.Struct):
     """A line of a log, as far as progress shows it."""
 
     step: Annotated[int, msgspec.Meta(ge=0)]
@@ -212,10 +212,10 @@ class _Row(msgspec.Struct):
     gaussians: int | None = None
 
 
-_ROWS = msgspec.json.Decoder(_Row)
+_ROWS = msgspec.json.Decoder(LogRow)
 
 
-def last_row(log: Path) -> _Row | None:
+def last_row(log: Path) -> LogRow | None:
     """The last whole line of a log, or None where there is none yet."""
     try:
         if not log.is_file():  # a pipe would never end

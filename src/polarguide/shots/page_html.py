@@ -64,6 +64,7 @@ def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
         legends="".join(legends),
         width=width,
         height=height,
+        ratio=f"{width / height:.4f}",
         facts=_facts(maps, surface),
         script=script,
     )
