@@ -45,7 +45,7 @@ def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
     Noise makes a DoLP larger: unpolarized light measures as noise does. The debiased DoLP is the modified asymptotic
     estimator ``d - b^2 (1 - exp(-d^2 / b^2)) / (2 d)`` with b the noise across the direction of polarization
     (Plaszczynski, Montier, Levrier and Tristram 2014, "A novel estimator of the polarization amplitude from normally
-    distributed Stokes parameters", MNRAS 439, 4048, equation 37), which is unbiased from about d = 2 b on. Of
+    distributed Stokes parameters", MNRAS 439, 4048), which is unbiased from about d = 2 b on. Of
     unpolarized light it leaves four fifths of what noise makes: over a region, average Stokes vectors instead.
 
     Args:
