@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.sensor.color_filters import color_filters
+from polarguide.capture.sensor.color_filters import require_kind
 from polarguide.capture.sensor.packing import PACKINGS
 from polarguide.capture.sensor.pattern import SENSORS, sensor_pattern
 from polarguide.capture.sensor.radiometry import Levels
@@ -70,17 +70,8 @@ class MosaicFiles:
 
     def require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
         """Refuse mosaics of the other kind of sensor: nothing later would tell."""
-        found = color_filters(blocks, levels.saturation, levels.black)
-        color = self.pattern.colors is not None
-        if found is None or (found == "color") == color:
-            return
-        other = next(name for name, colored in SENSORS.items() if colored != color)
-        raise PolarguideError(
-            "--sensor",
-            expected=f"mosaics of {self._settings.sensor}, a {'color' if color else 'monochrome'} sensor",
-            found="no sign of color filters" if color else "the Bayer pattern of color filters",
-            remedy=f"Use --sensor {other}, or that of your camera with this pattern.",
-        )
+        assert self._settings.sensor is not None
+        require_kind(self._settings.sensor, blocks, levels)
 
     def cut(self, values: NDArray[Any]) -> NDArray[Any]:
         """Crop to whole cells."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.layout import describe_contents, index_files
-from polarguide.capture.sensor.color_filters import SIDE, color_filters
+from polarguide.capture.sensor.color_filters import SIDE, require_kind
 from polarguide.capture.sensor.packing import PACKINGS
-from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
+from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
 from polarguide.capture.sensor.radiometry import Levels, estimate_levels
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 from polarguide.errors import PolarguideError
@@ -120,7 +120,7 @@ class Shots:
         levels = self._levels(counts)
         for path, count in zip(files, counts, strict=True):
             self._require_exposed(path, count, levels)
-        self._require_kind(np.concatenate(blocks), levels)
+        require_kind(self._settings.sensor, np.concatenate(blocks), levels)
         self._require_uniform(light)
         means = np.stack(sums) / (levels.white - levels.black)
         dim = int(means.mean(axis=1).argmin())
@@ -209,20 +209,6 @@ class Shots:
                 found=f"{share:.1%}",
                 remedy="Expose shorter: the brightest shot should stay below 90 % of full scale.",
             )
-
-    def _require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
-        """Refuse mosaics of the other kind of sensor."""
-        found = color_filters(blocks, levels.saturation, levels.black)
-        color = self.pattern.colors is not None
-        if found is None or (found == "color") == color:
-            return
-        other = next(name for name, colored in SENSORS.items() if colored != color)
-        raise PolarguideError(
-            "--sensor",
-            expected=f"mosaics of {self._settings.sensor}, a {'color' if color else 'monochrome'} sensor",
-            found="no sign of color filters" if color else "the Bayer pattern of color filters",
-            remedy=f"Use --sensor {other}, or that of your camera with this pattern.",
-        )
 
     def _require_uniform(self, light: NDArray[np.float32]) -> None:
         """Refuse shots of a scene: light has to be alike over each neighborhood, and nowhere much dimmer."""

@@ -7,6 +7,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.sensor.pattern import SENSORS
+from polarguide.capture.sensor.radiometry import Levels
+from polarguide.errors import PolarguideError
+
 Kind = Literal["color", "monochrome"]
 SIDE = 8
 """Pixels along a block that is looked at: 4 x 4 cells of polarizers."""
@@ -49,3 +53,24 @@ def color_filters(blocks: NDArray[Any], saturation: float, floor: float = 0.0) -
     if signed > _DIFFERENT and spread > _STRONGER:
         return "color"
     return "monochrome" if signed < _EQUAL and spread < _ALIKE else None
+
+
+def require_kind(sensor: str, blocks: NDArray[Any], levels: Levels) -> None:
+    """Refuse mosaics of the other kind of sensor: nothing later would tell.
+
+    Args:
+        sensor: its name, a key of ``SENSORS``. blocks: as for ``color_filters``. levels: of the stored values.
+
+    Raises:
+        PolarguideError: the samples say that it is another one.
+    """
+    found = color_filters(blocks, levels.saturation, levels.black)
+    if found is None or (found == "color") == SENSORS[sensor]:
+        return
+    other = next(name for name, colored in SENSORS.items() if colored != SENSORS[sensor])
+    raise PolarguideError(
+        "--sensor",
+        expected=f"mosaics of {sensor}, a {'color' if SENSORS[sensor] else 'monochrome'} sensor",
+        found="no sign of color filters" if SENSORS[sensor] else "the Bayer pattern of color filters",
+        remedy=f"Use --sensor {other}, or that of your camera with this pattern.",
+    )
