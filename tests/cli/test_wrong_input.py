@@ -87,7 +87,7 @@ def test_resume_without_a_run(refused, tmp_path: Path, demo_scene: Path, short) 
 @pytest.mark.parametrize(
     ("flag", "value", "field"),
     [
-        ("--steps", 50, "settings"),
+        ("--steps", 50, "steps"),
         ("--seed", 1, "settings"),
         ("--recipe", "3dgs", "recipe"),
         ("--downscale", 8, "downscale"),
@@ -131,8 +131,8 @@ def test_a_folder_that_is_no_run(refused, tmp_path: Path, verb: str) -> None:
 
 def test_unknown_layers_and_views(refused, trained: Path, demo_scene: Path, tmp_path: Path) -> None:
     assert "found color" in refused("render", trained, "--layers", "final,color")
-    line = refused("render", trained, "--views", "v001", "--out", tmp_path / "r")
-    assert "found 'v001'" in line
+    line = refused("render", trained, "--views", "v0001", "--out", tmp_path / "r")
+    assert "found 'v0001'" in line
     assert "The nearest names are: v0" in line
     line = refused("priors", demo_scene, "--views", "x", "--out", tmp_path / "p", "--downscale", 4)
     assert "found 'x'" in line
@@ -190,7 +190,7 @@ def test_a_verb_that_is_nearly_one(refused, word: str, meant: str) -> None:
 
 
 def test_a_word_that_is_no_verb(refused) -> None:
-    assert "fly: expected a verb: demo, prepare" in refused("fly")
+    assert "fly: expected a verb: demo, calibrate, prepare" in refused("fly")
 
 
 def test_viewing_a_file_says_what_is_wanted(refused, tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def _case(
         change(folder)
         return list(command)
 
-    return MadeCase(f"more {name}", 0, make, accepted, check, command[0])
+    return MadeCase(f"more {name}", 0, make, accepted, check, command=command[0])
 
 
 # Pictures.

@@ -16,7 +16,7 @@ from torch import Tensor
 import polarguide
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
-from polarguide.options import SceneOptions
+from polarguide.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint
 from polarguide.training.checked import refuse_foreign
@@ -131,11 +131,24 @@ def test_signs_and_lengths(tiny_scene: Scene, busy_recipe: Recipe) -> None:
         refuse_foreign(still, busy_recipe)
 
 
+@pytest.fixture(scope="module")
+def with_moments(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run that has kept the optimizer's state."""
+    out = tmp_path_factory.mktemp("moments") / "run"
+    session = SessionOptions(threads=1, keep_optimizer=True)
+    polarguide.train(
+        demo_scene, out, settings=TrainSettings(40), reading=SceneOptions(downscale=4), session=session
+    )
+    return out
+
+
 @pytest.mark.parametrize("way", ["open", "resume"])
-def test_opening_and_going_on_check_alike(trained: Path, demo_scene: Path, tmp_path: Path, way: str) -> None:
+def test_opening_and_going_on_check_alike(
+    with_moments: Path, demo_scene: Path, tmp_path: Path, way: str
+) -> None:
     """Moments that do not fit used to crash the optimizer, and only where a run was gone on with."""
     run = tmp_path / "run"
-    shutil.copytree(trained, run)
+    shutil.copytree(with_moments, run)
     tensors = load_file(run / CHECKPOINT)
     tensors["adam.means.exp_avg"] = tensors["adam.means.exp_avg"][:-1].clone()
     save_file(tensors, run / CHECKPOINT)
