@@ -78,7 +78,7 @@ def test_numbers_in_a_file_are_finite(record: dict[str, Any], tmp_path: Path) ->
         read_results(tmp_path / "results.json")
 
 
-@pytest.mark.parametrize("path", sorted(STORED.glob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(STORED.rglob("*.json")), ids=lambda path: path.stem)
 def test_stored_results_are_read_and_shown(path: Path) -> None:
     stored = read_results(path)
     assert len(scores_section(stored).blocks) == len(stored["scenes"]) + (len(stored["scenes"]) > 1)
