@@ -13,6 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from polarguide.errors import PolarguideError
+
 MEBIBYTE = 1 << 20
 LAST_WORDS_SECONDS = 5.0
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
@@ -100,6 +102,23 @@ def exclusive_lock(path: Path) -> Iterator[None]:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.set_inheritable(file.fileno(), True)
+        yield
+
+
+@contextlib.contextmanager
+def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
+    """Hold the lock of a folder.
+
+    Raises:
+        PolarguideError: another process holds it; ``expected`` and ``found`` say so.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(exclusive_lock(lock))
+        except BlockingIOError:
+            raise PolarguideError(
+                lock.parent, expected=expected, found=found, remedy="Wait for it, or give another --out."
+            ) from None
         yield
 
 

@@ -22,7 +22,7 @@ from polarguide.options import ComputeOptions, PathLike, check_choice, check_cou
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.system import exclusive_lock
+from polarguide.system import only_writer
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
@@ -193,14 +193,9 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keep two comparisons out of an existing folder. Children inherit the lock and hold it if the parent is killed."""
-    with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(exclusive_lock(folder / LOCK))
-        except BlockingIOError:
-            raise PolarguideError(
-                folder,
-                expected="a folder that nobody is writing to",
-                found="another comparison at work in it",
-                remedy="Wait for it, or give another --out.",
-            ) from None
+    with only_writer(
+        folder / LOCK,
+        expected="a folder that nobody is writing to",
+        found="another comparison at work in it",
+    ):
         yield

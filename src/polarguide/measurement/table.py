@@ -26,7 +26,7 @@ from polarguide.measurement.fields import FORMAT, KEYS
 from polarguide.measurement.region_figures import Value
 from polarguide.records import decode, read_record, shortened, to_json
 from polarguide.spreadsheet import csv_lines
-from polarguide.system import exclusive_lock
+from polarguide.system import only_writer
 
 LINES, CSV, SETTINGS, LOCK = "table.jsonl", "table.csv", "measure.json", ".lock"
 Status = Literal["measured", "within", "beyond", "unread"]
@@ -106,15 +106,13 @@ class Table:
         self._files: list[BinaryIO] = []
         self._stack = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
-            try:
-                stack.enter_context(exclusive_lock(folder / LOCK))
-            except BlockingIOError:
-                raise PolarguideError(
-                    folder,
+            stack.enter_context(
+                only_writer(
+                    folder / LOCK,
                     expected="a table that nobody else writes",
                     found="another polarguide measure at work on it",
-                    remedy="Wait for it, or give another --out.",
-                ) from None
+                )
+            )
             self._begin({"format": FORMAT, **settings}, overwrite)
             stack.callback(self._close_files)
             for name in (LINES, CSV):

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.sensor.color_filters import require_kind
-from polarguide.capture.sensor.packing import PACKINGS
 from polarguide.capture.sensor.pattern import SENSORS, sensor_pattern
 from polarguide.capture.sensor.radiometry import Levels
 from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic
@@ -53,20 +52,11 @@ class MosaicFiles:
         Raises:
             PolarguideError: the file cannot be read, or is too small.
         """
-        values = read_mosaic(path, self._raw)
-        if min(values.shape) < SMALLEST:
-            raise PolarguideError(
-                path,
-                expected=f"a mosaic of at least {SMALLEST}x{SMALLEST} pixels",
-                found=f"{values.shape[1]}x{values.shape[0]}",
-                remedy="Give the whole picture of the sensor.",
-            )
-        return values
+        return read_mosaic(path, self._raw, least=SMALLEST)
 
     def container(self, path: Path, values: NDArray[Any]) -> int:
         """Bits that a pixel takes in the file."""
-        packing = self._settings.packing if path.suffix.lower() == ".raw" else None
-        return values.dtype.itemsize * 8 if packing is None else PACKINGS[packing][2]
+        return self._raw.container(path, values.dtype)
 
     def require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
         """Refuse mosaics of the other kind of sensor: nothing later would tell."""

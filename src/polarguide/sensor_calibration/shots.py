@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from polarguide.capture.layout import describe_contents, index_files
 from polarguide.capture.sensor.color_filters import SIDE, require_kind
-from polarguide.capture.sensor.packing import PACKINGS
 from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
 from polarguide.capture.sensor.radiometry import Levels, estimate_levels
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
@@ -67,6 +66,7 @@ class Shots:
         remedy = "Give the folder of the shots of the polarizer, one mosaic each."
         require_folder(root, expected="a folder of raw mosaics", remedy=remedy)
         self._settings = settings
+        self._raw = RawFormat(settings.width, settings.height, settings.packing)
         self._flat = _files("--flat", settings.flat)
         self._dark = _files("--dark-frame", settings.dark_frame)
         others = {os.path.realpath(path) for path in (*self._flat, *self._dark)}
@@ -146,16 +146,8 @@ class Shots:
                 advance(number)
 
     def _read(self, path: Path) -> NDArray[Any]:
-        asked = self._settings
-        values = read_mosaic(path, RawFormat(asked.width, asked.height, asked.packing))
+        values = read_mosaic(path, self._raw, least=_SMALLEST)
         if self._first is None:
-            if min(values.shape) < _SMALLEST:
-                raise PolarguideError(
-                    path,
-                    expected=f"a mosaic of at least {_SMALLEST}x{_SMALLEST} pixels",
-                    found=f"{values.shape[1]}x{values.shape[0]}",
-                    remedy="Give the whole picture of the sensor.",
-                )
             self._first = (path, values.shape, values.dtype)
         first, shape, kind = self._first
         if (values.shape, values.dtype) != (shape, kind):
@@ -184,8 +176,7 @@ class Shots:
         bits = int(np.bitwise_or.reduce(np.concatenate(used)))
         assert self._first is not None
         asked, (path, _, kind) = self._settings, self._first
-        packing = asked.packing if path.suffix.lower() == ".raw" else None
-        container = np.dtype(kind).itemsize * 8 if packing is None else PACKINGS[packing][2]
+        container = self._raw.container(path, np.dtype(kind))
         black = 0.0 if self._dark else asked.black_level
         return estimate_levels(
             largest, bits, container, bits=asked.bits, black=black, saturation=asked.saturation

@@ -25,23 +25,40 @@ class RawFormat:
     height: int | None = None
     packing: str | None = None
 
+    def container(self, path: Path, kind: np.dtype[Any]) -> int:
+        """Bits that a pixel of type ``kind`` takes in a file."""
+        packing = self.packing if path.suffix.lower() == ".raw" else None
+        return kind.itemsize * 8 if packing is None else PACKINGS[packing][2]
 
-def read_mosaic(path: Path, raw: RawFormat) -> NDArray[Any]:
+
+def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
     """Read one raw mosaic.
 
     Args:
         path: a PNG, TIFF, ``.npy`` or packed ``.raw`` file.
         raw: size and packing of a ``.raw`` file; where it gives a size, other files must have it too.
+        least: pixels that the shorter side must have.
 
     Returns:
         [H, W] uint8 or uint16, the values as stored.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged, has color channels or another size.
+        PolarguideError: the file cannot be read, is damaged, has color channels or another size, or is too small.
     """
+    packed = path.suffix.lower() == ".raw"
+    values = _read_packed(path, read_file(path), raw) if packed else _read_plain(path, raw)
+    if min(values.shape) < least:
+        raise PolarguideError(
+            path,
+            expected=f"a mosaic of at least {least}x{least} pixels",
+            found=f"{values.shape[1]}x{values.shape[0]}",
+            remedy="Give the whole picture of the sensor.",
+        )
+    return values
+
+
+def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
     suffix = path.suffix.lower()
-    if suffix == ".raw":
-        return _read_packed(path, read_file(path), raw)
     values = read_array(path) if suffix == ".npy" else decode_stored(path, read_file(path))
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
