@@ -60,6 +60,7 @@ def collect(
             "threads": comparison.options.threads,
             "jobs": comparison.options.parallel,
             "against": comparison.options.against,
+            "background": comparison.settings.background,
         },
         scenes=[
             {

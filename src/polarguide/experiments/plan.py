@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from polarguide import __version__
+from polarguide.capture.background import without_surroundings
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import model_digest, scoring_digest, training_digest
@@ -68,6 +69,7 @@ class Comparison:
         words += ["--steps", str(settings.steps), "--seeds", str(options.seeds), "--out", str(self.out)]
         words += ["--downscale", str(options.downscale), "--transfer", options.transfer]
         words += ["--refractive-index", str(settings.refractive_index)]
+        words += ["--background", settings.background, "--split", options.split]
         return shlex.join(words)
 
 
@@ -129,8 +131,8 @@ class PlannedRun:
             found.scene_digest == self.scene.digest
             and found.recipe_data == self.recipe.data()
             and found.settings == self.settings
-            and (found.recipe, found.downscale, found.transfer)
-            == (self.recipe.name, self.reading.downscale, self.reading.transfer)
+            and (found.recipe, found.downscale, found.transfer, found.test_views)
+            == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
         )
         return found if same else None
 
@@ -144,6 +146,8 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
     entries: list[SceneEntry] = []
     for path in comparison.scenes:
         scene = read_scene(path, comparison.options, reporter)
+        if comparison.settings.background == "masked":
+            without_surroundings(scene)  # an error now where masks are missing
         if scene.name in [entry.name for entry in entries]:
             raise PolarguideError(
                 path,
@@ -173,7 +177,7 @@ def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[Plan
 
 def _planned(comparison: Comparison, scene: SceneEntry, recipe: Recipe, seed: int) -> PlannedRun:
     settings, options = replace(comparison.settings, seed=seed), comparison.options
-    reading = SceneOptions(options.downscale, options.transfer)
+    reading = SceneOptions(options.downscale, options.transfer, split=options.split)
     code = f"{__version__} {training_digest()}{model_digest(type(recipe.shading))}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     folder = comparison.out / RUNS / scene.name / recipe.name.replace(":", "__") / f"{seed}-{key}"

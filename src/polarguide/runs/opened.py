@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene, read_model
+from polarguide.capture.background import without_surroundings
 from polarguide.capture.layout import find_layout
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
@@ -189,7 +190,7 @@ class OpenedRun:
             PolarguideError: it is not there any more, cannot be read, or was read otherwise than for the training.
         """
         configuration, found = self.configuration, self._scene_source
-        options = SceneOptions(configuration.downscale, configuration.transfer)
+        options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
         if not isinstance(found, Scene):
             found = read_scene(configuration.scene if found is None else found, options, self._reporter)
         if (found.downscale, found.transfer) != (options.downscale, options.transfer):
@@ -200,7 +201,10 @@ class OpenedRun:
             raise PolarguideError("scene", expected=expected, found=given, remedy="Load it like that.")
         if found.digest != configuration.scene_digest:
             _warn(f"{found.root} has changed since {self.folder} was trained on it.")
-        return found
+        if configuration.test_views is not None and configuration.test_views != found.test_names:
+            names = {view.name for view in found.views}
+            found = replace(found, test_names=tuple(n for n in configuration.test_views if n in names))
+        return without_surroundings(found) if configuration.settings.background == "masked" else found
 
     @property
     def scene_folder(self) -> Path:
@@ -313,6 +317,7 @@ def read_scene(
         downscale=options.downscale,
         transfer=options.transfer,
         memory=options.memory,
+        split=options.split,
         reporter=reporter,
     )
     for warning in scene.warnings:
