@@ -64,9 +64,12 @@ def _middles(apart: NDArray[np.float64], count: int) -> list[int]:
     """
     middles = [int(apart.sum(axis=1).argmin())]
     while len(middles) < count:
-        middles.append(int(apart[:, middles].min(axis=1).argmax()))
+        reach = apart[:, middles].min(axis=1)
+        reach[middles] = -1.0  # never twice, also of cameras in one place
+        middles.append(int(reach.argmax()))
     for _ in range(_ROUNDS):
         group = apart[:, middles].argmin(axis=1)
+        group[middles] = np.arange(count)
         members = [np.flatnonzero(group == k) for k in range(count)]
         found = [int(m[apart[np.ix_(m, m)].sum(axis=1).argmin()]) for m in members]
         if found == middles:
