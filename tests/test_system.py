@@ -15,6 +15,7 @@ from polarguide import system
 from polarguide.system import (
     StopSignals,
     exclusive_lock,
+    free_memory,
     keep_freed_memory,
     peak_memory_mib,
     process_is_alive,
@@ -115,3 +116,14 @@ def test_elsewhere_the_allocator_is_left_alone(libc: object, monkeypatch: pytest
 
     monkeypatch.setattr(system.ctypes, "CDLL", load)
     keep_freed_memory()
+
+
+def test_memory_that_holds_files_is_free(tmp_path: Path) -> None:
+    """As of a container in which much has been read."""
+    (tmp_path / "memory.max").write_text("4000000\n")
+    (tmp_path / "memory.current").write_text("3900000\n")
+    (tmp_path / "memory.stat").write_text("anon 100000\ninactive_file 3000000\nactive_file 500000\n")
+    assert free_memory(tmp_path) == 3_600_000
+    (tmp_path / "memory.max").write_text("max\n")
+    whole = free_memory(tmp_path)
+    assert whole is None or whole > 4_000_000

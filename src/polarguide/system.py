@@ -147,15 +147,19 @@ def keep_freed_memory() -> None:
         libc.mallopt(M_MMAP_THRESHOLD, 1 << 25)  # the most that older versions take
 
 
-def free_memory() -> int | None:
-    """Bytes of memory that this process may still take, as the system and its control group say; None: they do not."""
+def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Bytes of memory that this process may still take, as the system and its control group say; None: they do not.
+
+    What a control group holds of files goes when memory is asked for, and counts as free.
+    """
     found = []
     with contextlib.suppress(OSError, ValueError, IndexError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         found += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     with contextlib.suppress(OSError, ValueError):
-        group = Path("/sys/fs/cgroup")
-        found.append(int((group / "memory.max").read_text()) - int((group / "memory.current").read_text()))
+        free = int((group / "memory.max").read_text()) - int((group / "memory.current").read_text())
+        held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        found.append(free + int(held.get("inactive_file", 0)) + int(held.get("active_file", 0)))
     return max(0, min(found)) if found else None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -9,9 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import polarguide
 from polarguide.capture import load_scene
+from polarguide.capture.split import chosen_views, far_from_training
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions
 from polarguide.training.settings import TrainSettings
@@ -72,6 +75,20 @@ def test_the_run_records_which_views_were_held_out(demo_scene: Path, tmp_path: P
     again = {"settings": TrainSettings(steps=2), "reading": reading, "resume": True}
     with pytest.raises(PolarguideError, match="test_views"):
         polarguide.train(scene, tmp_path / "directions", **again)
+
+
+def test_opening_a_run_does_not_judge_a_split_that_is_not_its_own(demo_scene: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(demo_scene, scene, ignore=shutil.ignore_patterns("split.json"))
+    run = polarguide.train(scene, tmp_path / "run", settings=TrainSettings(steps=2), reading=READING)
+    first = run.scene.views[0].name  # held out by its place among the names
+    far = dataclasses.replace(run.scene.views[0].camera, translation=torch.tensor([50.0, 0.0, 0.0]).double())
+    cameras = {view.name: view.camera for view in run.scene.views} | {first: far}
+    assert far_from_training(cameras, chosen_views(cameras, "every-8th")) == [first]
+    assert far_from_training(cameras, chosen_views(cameras, "directions")) == []
+    tests = load_scene(scene, split="every-8th", test_views=run.scene.test_names)
+    assert tests.test_names == run.scene.test_names
+    assert not [warning for warning in tests.warnings if "far from" in warning]
 
 
 def test_a_run_of_before_the_record_holds_out_every_eighth(demo_scene: Path, tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def load_scene(
     views: Sequence[str] | None = None,
     memory: float = 0.0,
     split: Split = "directions",
+    test_views: Sequence[str] | None = None,
     reporter: Reporter = SILENT,
 ) -> Scene:
     """Read a capture.
@@ -76,6 +77,7 @@ def load_scene(
         views: names of the views to read; all if None. The split is that of the whole capture.
         memory: GiB that the pictures may take; 0: 80 % of what is free.
         split: which views are held out where there is no ``split.json``, see ``split.chosen_views``.
+        test_views: names of the views to hold out, whatever else says so, as far as there are such views.
         reporter: receives the progress.
 
     Returns:
@@ -93,7 +95,7 @@ def load_scene(
     files = Files()
     for file in model.files:
         files.read(file)
-    tests, stray = _held_out(root / "split.json", files, layout, model, split)
+    tests, stray = _held_out(root / "split.json", files, layout, model, split, test_views)
     about = files.read_if_there(root / "scene.json")
     index = refractive_index_of(root / "scene.json", about)
     for name in names:
@@ -138,15 +140,22 @@ def load_scene(
 
 
 def _held_out(
-    path: Path, files: Files, layout: Layout, model: ColmapModel, split: Split
+    path: Path,
+    files: Files,
+    layout: Layout,
+    model: ColmapModel,
+    split: Split,
+    asked: Sequence[str] | None,
 ) -> tuple[tuple[str, ...], list[str]]:
     """The names of the test views, and a warning where some are far from all that is trained on."""
     check_choice("split", split, get_args(Split))
     data, posed = files.read_if_there(path), frozenset(model.names)
     cameras = {name: model.camera(name) for name in layout.names if name in posed}
     tests = chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)
+    if asked is not None:
+        tests = tuple(name for name in sorted(asked) if name in layout.names)
     far = far_from_training(cameras, tests)
-    if not far:
+    if asked is not None or not far:  # whoever asks has been told
         return tests, []
     other = (
         "take --split directions" if data is None and split != "directions" else "name others in split.json"

@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from polarguide import __version__
+from polarguide.capture import View
 from polarguide.capture.background import without_surroundings
+from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import model_digest, scoring_digest, training_digest
@@ -29,6 +31,8 @@ from polarguide.training.settings import TrainSettings
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
+BLACK = 0.002
+"""Share of full scale under which a pixel is black."""
 KEY_DIGITS = 10
 
 
@@ -82,6 +86,7 @@ class SceneEntry:
     digest: str
     views: int
     test_views: tuple[str, ...]
+    black_share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -147,7 +152,7 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
     for path in comparison.scenes:
         scene = read_scene(path, comparison.options, reporter)
         if comparison.settings.background == "masked":
-            without_surroundings(scene)  # an error now where masks are missing
+            scene = without_surroundings(scene)
         if scene.name in [entry.name for entry in entries]:
             raise PolarguideError(
                 path,
@@ -159,8 +164,15 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
             raise PolarguideError(
                 path, expected="test views", found="none", remedy="Name some in split.json to score on."
             )
-        entries.append(SceneEntry(path, scene.name, scene.digest, len(scene.views), scene.test_names))
+        share = black_share(scene.test_views[0])
+        entries.append(SceneEntry(path, scene.name, scene.digest, len(scene.views), scene.test_names, share))
     return entries
+
+
+def black_share(view: View) -> float:
+    """The share of a view's pixels that are black, as it is scored."""
+    brightest = view.codes[0].float().amax(dim=-1)
+    return float((brightest < BLACK * FULL_CODE).float().mean())
 
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:

@@ -83,13 +83,17 @@ def write_pictures(
     Raises:
         PolarguideError: there is no such view or layer.
     """
+    check_choice("format", format, get_args(PictureFormat))
+    if transparent and format != "png":
+        raise PolarguideError(
+            "transparent", expected="format png", found=format, remedy="Leave one of the two out."
+        )
     folder = run.folder / "render" if out is None else Path(out)
     if out is None:
         require_inside(run.folder, folder)
     names = checked_layers(list(run.layers if layers is None else layers))
     chosen = select_views(run.scene, views)
     make_folder(folder)
-    check_choice("format", format, get_args(PictureFormat))
     shown: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
     gains = run.presentation.gains

@@ -191,8 +191,10 @@ class OpenedRun:
         """
         configuration, found = self.configuration, self._scene_source
         options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
+        recorded = configuration.test_views
         if not isinstance(found, Scene):
-            found = read_scene(configuration.scene if found is None else found, options, self._reporter)
+            folder = configuration.scene if found is None else found
+            found = read_scene(folder, options, self._reporter, recorded)
         if (found.downscale, found.transfer) != (options.downscale, options.transfer):
             expected = (
                 f"downscale {options.downscale}, transfer {options.transfer}, as {self.folder} was trained"
@@ -201,9 +203,9 @@ class OpenedRun:
             raise PolarguideError("scene", expected=expected, found=given, remedy="Load it like that.")
         if found.digest != configuration.scene_digest:
             _warn(f"{found.root} has changed since {self.folder} was trained on it.")
-        if configuration.test_views is not None and configuration.test_views != found.test_names:
+        if recorded is not None and recorded != found.test_names:
             names = {view.name for view in found.views}
-            found = replace(found, test_names=tuple(n for n in configuration.test_views if n in names))
+            found = replace(found, test_names=tuple(name for name in recorded if name in names))
         return without_surroundings(found) if configuration.settings.background == "masked" else found
 
     @property
@@ -305,9 +307,16 @@ def checked_layers(names: list[str]) -> list[str]:
 
 
 def read_scene(
-    folder: PathLike, options: SceneOptions = SceneOptions(), reporter: Reporter = SILENT
+    folder: PathLike,
+    options: SceneOptions = SceneOptions(),
+    reporter: Reporter = SILENT,
+    test_views: tuple[str, ...] | None = None,
 ) -> Scene:
     """Load a scene, with progress, and hand on its warnings.
+
+    Args:
+        folder: of the scene. options: how it is read. reporter: told how far it is.
+        test_views: as for ``load_scene``.
 
     Raises:
         PolarguideError: it cannot be read.
@@ -318,6 +327,7 @@ def read_scene(
         transfer=options.transfer,
         memory=options.memory,
         split=options.split,
+        test_views=test_views,
         reporter=reporter,
     )
     for warning in scene.warnings:
