@@ -99,5 +99,7 @@ def _print_outcome(outcome: Any) -> None:
     console.print(f"shots: {shots or 'none'}{before}", markup=False)
     if outcome.waiting:
         console.print(f"not complete, and not measured: {', '.join(outcome.waiting)}", markup=False)
+    if outcome.trouble:
+        console.print(f"in the folder: {outcome.trouble}", markup=False)
     pictures = f"   pictures: {outcome.folder}/beyond" if counts["beyond"] else ""
     console.print(f"table: {outcome.folder}/table.csv, .jsonl{pictures}", markup=False)

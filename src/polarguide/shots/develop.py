@@ -64,6 +64,8 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
     Raises:
         PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
     """
+    if shot.fault is not None:
+        raise shot.fault
     if shot.kind == "mosaic":
         return _mosaic(shot, options)
     if options.analyzers is not None:
