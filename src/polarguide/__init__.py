@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         calibrate,
         demo_scene,
         inspect,
+        measure,
         open_run,
         prepare,
         present,
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from polarguide.experiments.compare import compare
     from polarguide.experiments.options import CompareOptions
     from polarguide.inspection.settings import InspectSettings
+    from polarguide.measurement.options import MeasureOptions, WatchOptions
+    from polarguide.measurement.watch import watch_folder
     from polarguide.options import SceneOptions, SessionOptions
     from polarguide.preparation.settings import PrepareSettings
     from polarguide.progress import Reporter
@@ -45,6 +48,7 @@ _NAMES = {
         "calibrate",
         "demo_scene",
         "inspect",
+        "measure",
         "open_run",
         "prepare",
         "present",
@@ -58,6 +62,8 @@ _NAMES = {
     "experiments.compare": ("compare",),
     "experiments.options": ("CompareOptions",),
     "inspection.settings": ("InspectSettings",),
+    "measurement.options": ("MeasureOptions", "WatchOptions"),
+    "measurement.watch": ("watch_folder",),
     "options": ("SceneOptions", "SessionOptions"),
     "preparation.settings": ("PrepareSettings",),
     "progress": ("Reporter",),
@@ -74,6 +80,7 @@ __all__ = [
     "CalibrateSettings",
     "CompareOptions",
     "InspectSettings",
+    "MeasureOptions",
     "PolarguideError",
     "PolarguideWarning",
     "PrepareSettings",
@@ -87,6 +94,7 @@ __all__ = [
     "ShotOptions",
     "SurfaceMaps",
     "TrainSettings",
+    "WatchOptions",
     "__version__",
     "ablate",
     "calibrate",
@@ -95,6 +103,7 @@ __all__ = [
     "find_shots",
     "inspect",
     "load_scene",
+    "measure",
     "open_run",
     "optics",
     "prepare",
@@ -104,6 +113,7 @@ __all__ = [
     "read_shot",
     "surface_maps",
     "train",
+    "watch_folder",
 ]
 
 
