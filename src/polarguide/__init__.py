@@ -24,7 +24,8 @@ if TYPE_CHECKING:
         train,
     )
     from polarguide.capture import Scene, load_scene
-    from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
+    from polarguide.capture.sensor.analyzer_file import read_analyzers
+    from polarguide.capture.sensor.analyzers import AnalyzerCalibration
     from polarguide.errors import PolarguideError, PolarguideWarning
     from polarguide.experiments.ablate import ablate
     from polarguide.experiments.compare import compare
@@ -56,7 +57,8 @@ _NAMES = {
         "train",
     ),
     "capture": ("Scene", "load_scene"),
-    "capture.sensor.analyzers": ("AnalyzerCalibration", "read_analyzers"),
+    "capture.sensor.analyzer_file": ("read_analyzers",),
+    "capture.sensor.analyzers": ("AnalyzerCalibration",),
     "errors": ("PolarguideError", "PolarguideWarning"),
     "experiments.ablate": ("ablate",),
     "experiments.compare": ("compare",),
