@@ -174,3 +174,22 @@ def test_ambiguous_and_incomplete_shots_are_lines_of_their_own(
     (parts / "cup_45.tif").unlink()
     run(["measure", str(parts), "--out", str(out), "--transfer", "linear"])
     assert {row["shot"] for row in rows_of(out) if row["status"] == "measured"} == {"cup", "jar", "lid"}
+
+
+def test_a_watch_says_at_its_end_what_never_came(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = tmp_path / "parts"
+    write_four(parts, tuple(f"{angle}/cup.png" for angle in ANGLES))
+    (parts / "90").rename(tmp_path / "90")
+    command = ["measure", "--watch", str(parts), "--out", str(tmp_path / "out"), "--transfer", "linear"]
+    command += ["--settle", "0.05", "--patience", "0.1", "--idle", "0.3"]
+    assert run(command) == 2
+    assert f"error: {parts}: expected four folders" in capsys.readouterr().err
+    (parts / "90").mkdir()
+    assert run(command) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {parts}: expected complete shots, found 1 that are not")
+    assert "(cup)" in line
+    (parts / "90").rmdir()
+    (tmp_path / "90").rename(parts / "90")
+    assert run(command) == 0
+    assert capsys.readouterr().err == ""
