@@ -22,6 +22,7 @@ from polarguide.export import formats
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
 from polarguide.inspection.record import write_inspection
 from polarguide.inspection.settings import InspectSettings
+from polarguide.measurement.line import measure_shots
 from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOptions, VisitorOptions
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
@@ -72,6 +73,7 @@ class Run(OpenedRun):
 
 open_run = Run.open
 calibrate = calibrate_sensor
+measure = measure_shots
 present = presenting.present
 prepare = prepare_scene
 

@@ -12,7 +12,7 @@ from camera_files import write_model
 from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.sensor.analyzers import write_analyzers
+from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.errors import PolarguideError
 from polarguide.inspection.analyzers import analyzer_check, corrected
 from polarguide.inspection.capture import read_capture

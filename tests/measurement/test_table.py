@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from polarguide.errors import PolarguideError
 from polarguide.measurement.fields import FORMAT, KEYS
+from polarguide.measurement.line import measure_shots
 from polarguide.measurement.table import CSV, LINES, Entry, FileStamp, Table
+from polarguide.shots import ShotOptions
 
 SETTINGS = {"threshold": 0.05}
 
@@ -117,3 +122,21 @@ def test_names_are_no_formulas_and_need_not_be_unicode(tmp_path: Path) -> None:
     assert shots == ["=1+10", "a\udcff1", 'b,"c\nd2']
     write(tmp_path, [entry(0, "=1+1"), entry(1, "a\udcff"), entry(2, 'b,"c\nd')])
     assert (tmp_path / LINES).read_bytes().count(b"\n") == 3
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads the memory as Linux states it")
+def test_two_hundred_shots_take_no_more_memory_than_twenty(tmp_path: Path, reading: ShotOptions) -> None:
+    """The maps of one of these shots take 2 MB."""
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    rng = np.random.default_rng(0)
+    cv2.imwrite(str(parts / "s000.png"), rng.integers(200, 3000, (144, 192)).astype(np.uint16))
+    for number in range(1, 200):
+        os.link(parts / "s000.png", parts / f"s{number:03d}.png")
+    taken: list[int] = []
+
+    def heard(_: Entry) -> None:
+        taken.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
+
+    assert measure_shots([parts], tmp_path / "out", reading=reading, heard=heard).counts == {"measured": 200}
+    assert max(taken[20:]) - max(taken[:20]) < 30e6

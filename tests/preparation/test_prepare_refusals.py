@@ -140,7 +140,7 @@ SHOTS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
     "missing folder": (lambda d: shutil.rmtree(d / "135"), FILTER, "none for 135 degrees"),
     "two folders for an angle": (lambda d: (d / "I-45").mkdir(), FILTER, "one folder for 45 degrees"),
     "duplicate shot": (
-        lambda d: shutil.copy(d / "0" / "a.png", d / "0" / "a.tif"), FILTER, "one file called a"
+        lambda d: shutil.copy(d / "0" / "a.png", d / "0" / "a.tif"), FILTER, "picture of a at 0 degrees, .*a.tif"
     ),
     "truncated": (lambda d: cut(d / "45" / "b.png", 300), FILTER, "b.png: .*cut short"),
     "mixed sizes": (

@@ -19,7 +19,8 @@ from made_sensor import (
     write_polarizer_shots,
 )
 
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
+from polarguide.capture.sensor.analyzer_file import read_analyzers
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.errors import PolarguideError
 from polarguide.progress import Reporter
 from polarguide.sensor_calibration.calibrate import Calibrated, calibrate_sensor

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from made_sensor import made_sensor, true_calibration, write_codes
 
-from polarguide.capture.sensor.analyzers import write_analyzers
+from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.errors import PolarguideError
 from polarguide.shots import ShotOptions, read_shot
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
 from polarguide.capture.colmap.undistort import Geometry, undistortion
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
+from polarguide.capture.sensor.analyzer_file import read_analyzers
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file

@@ -50,19 +50,21 @@ class Outcome:
         counts: shots by status, those included that were in the table before.
         earlier: how many these are.
         waiting: shots of a watched folder that were not complete when it stopped.
+        trouble: why no shot was found in a watched folder in the end, though it is not empty; else "".
     """
 
     folder: Path
     counts: Counter[str]
     earlier: int = 0
     waiting: tuple[str, ...] = ()
+    trouble: str = ""
 
     @property
     def exit_status(self) -> int:
         """3 if a shot is beyond a limit, else 2 if one was not read, else 0."""
         if self.counts["beyond"]:
             return 3
-        return 2 if self.counts["unread"] or self.waiting else 0
+        return 2 if self.counts["unread"] or self.waiting or self.trouble else 0
 
 
 class ChangedWhileRead(PolarguideError):

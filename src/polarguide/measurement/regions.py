@@ -11,7 +11,7 @@ from polarguide.errors import PolarguideError
 
 WHOLE = "all"
 """The region that is measured where none is given."""
-_FORM = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<numbers>-?\d+(?:,-?\d+){3})")
+_FORM = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<numbers>-?[0-9]{1,12}(?:,-?[0-9]{1,12}){3})")
 _LONGEST_NAME = 64
 _MOST = 1_000_000
 
@@ -73,7 +73,12 @@ def _parse(text: str, number: int) -> Region:
 
 
 def _wrong(expected: str, found: str) -> PolarguideError:
-    return PolarguideError("--roi", expected=expected, found=found, remedy="Correct the region.")
+    return PolarguideError(
+        "--roi",
+        expected=expected,
+        found=found if len(found) <= 100 else f"{found[:100]}...",
+        remedy="Correct the region.",
+    )
 
 
 def placed(regions: Sequence[Region], size: tuple[int, int], where: Path) -> tuple[Region, ...]:

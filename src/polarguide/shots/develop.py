@@ -16,7 +16,8 @@ from polarguide.capture.filter.exif import apply_orientation, orientation_calibr
 from polarguide.capture.filter.shots import read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
 from polarguide.capture.layout import find_layout, select_views
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers, spread_to_cells
+from polarguide.capture.sensor.analyzer_file import read_analyzers
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
 from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import demosaic
 from polarguide.capture.sensor.pattern import SENSOR_SIZE, tiled
@@ -64,6 +65,8 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
     Raises:
         PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
     """
+    if shot.fault is not None:
+        raise shot.fault
     if shot.kind == "mosaic":
         return _mosaic(shot, options)
     if options.analyzers is not None:
