@@ -1,13 +1,16 @@
-"""What the console shows of names that come from files."""
+"""What the console shows of names that come from files, of sizes, and of what has no value."""
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 
 import pytest
 
 from polarguide.cli.app import run
-from polarguide.cli.console import printable
+from polarguide.cli.console import printable, size_text
+from polarguide.cli.evaluate import _without_value
+from polarguide.evaluation.table import METRICS
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
 
@@ -26,3 +29,27 @@ def test_errors_show_names_without_their_control_characters(
     assert r"\x1b[2J" in said
     assert "\x1b" not in said
     assert "\u202e" not in said
+
+
+def test_sizes_of_files() -> None:
+    assert [size_text(size) for size in (3, 42_446, 1_000_000, 4_850_000)] == [
+        "1 kB",
+        "42 kB",
+        "1.0 MB",
+        "4.8 MB",
+    ]
+
+
+def test_a_mesh_without_its_libraries_is_no_want_of_ground_truth(monkeypatch) -> None:
+    def only(module: str, *rest, found=importlib.util.find_spec):
+        return None if module == "skimage" else found(module, *rest)
+
+    record = {metric.key: 1.0 for metric in METRICS} | {"mesh_fscore_1": None, "normal_mae_deg": None}
+    assert _without_value(record) == [
+        "no ground truth, or no such layer, for: normal error, mesh F-score 1 %"
+    ]
+    monkeypatch.setattr(importlib.util, "find_spec", only)
+    lines = _without_value(record)
+    assert lines[1:] == ["no ground truth, or no such layer, for: normal error"]
+    assert "mesh F-score 1 %" in lines[0]
+    assert "skimage" in lines[0]

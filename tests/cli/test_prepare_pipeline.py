@@ -40,7 +40,8 @@ def test_mosaics_to_a_trained_scene(
     assert run(command) == 0
     printed = capsys.readouterr().out
     assert f"scene: {scene} (6 views)" in printed
-    assert f"next: polarguide train {scene}" in printed
+    assert f"next: polarguide inspect {scene}" in printed
+    assert f"then: polarguide train {scene}" in printed
     before = cv2.imread(str(demo_scene / "polar" / f"{views[0]}_000.png"), cv2.IMREAD_UNCHANGED)
     after = cv2.imread(str(tmp_path / "scene" / "polar" / f"{views[0]}_000.png"), cv2.IMREAD_UNCHANGED)
     # What was sampled stays (up to the one gain of the angles that was estimated), the rest is interpolated.

@@ -15,6 +15,7 @@ from tiny_capture import encode_srgb, write_picture
 
 from polarguide.capture.filter.align import estimate_shifts
 from polarguide.capture.filter.exif import apply_orientation, orientation
+from polarguide.capture.filter.shots import find_shots
 from polarguide.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -33,6 +34,9 @@ def summary(scene: Path) -> dict:
         [f"{angle}/cup.png" for angle in ANGLES],
         [f"I-{angle:02d}/cup.tif" for angle in ANGLES],
         [f"{angle:03d}/cup.tiff" for angle in ANGLES],
+        [f"image_{angle}/cup.png" for angle in ANGLES],
+        [f"cup/{angle}.png" for angle in ANGLES],
+        [f"2026-05-01/cup_pol{angle}.tif" for angle in ANGLES],
         [f"cup_{angle}.png" for angle in ANGLES],
         [f"cup-I{angle:02d}.tif" for angle in ANGLES],
         [f"cup {angle:03d}deg.png" for angle in ANGLES],
@@ -62,6 +66,38 @@ def test_files_named_like_the_angles_alone_are_one_view(tmp_path: Path) -> None:
     for angle, values in zip(ANGLES, behind(smooth_light()), strict=True):
         write_picture(tmp_path / "cup" / f"I{angle}.png", values, bits=16)
     assert prepare_scene(tmp_path / "cup", tmp_path / "out", PLAIN).views == ["cup"]
+
+
+def test_folders_of_days_are_one_capture(tmp_path: Path) -> None:
+    for day, view in (("2026-05-01", "a"), ("2026-05-02", "b")):
+        write_shots(tmp_path / "in" / day, view, behind(smooth_light()))
+    for angle in ANGLES:  # of one view in four folders, to two views in two
+        for day, view in (("2026-05-01", "a"), ("2026-05-02", "b")):
+            folder = tmp_path / "in" / day
+            (folder / str(angle) / f"{view}.png").rename(folder / f"{view}_{angle}.png")
+            (folder / str(angle)).rmdir()
+    assert prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN).views == ["a", "b"]
+    twice = tmp_path / "in" / "2026-05-02" / "a_0.png"
+    twice.write_bytes((tmp_path / "in" / "2026-05-01" / "a_0.png").read_bytes())
+    message = "expected one picture of a at 0 degrees, found 2026-05-01/a_0.png and 2026-05-02/a_0.png"
+    with pytest.raises(PolarguideError, match=message):
+        prepare_scene(tmp_path / "in", tmp_path / "again", PLAIN)
+
+
+def test_folders_below_are_not_read_in_place_of_mosaics(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    np.save(tmp_path / "in" / "a.npy", np.zeros((64, 64), np.uint8))
+    write_picture(tmp_path / "in" / "old" / "a_0.png", behind(smooth_light())[0])
+    assert find_shots(tmp_path / "in", nested=True) == {}
+
+
+def test_shots_under_the_numbers_of_the_camera_are_named(tmp_path: Path) -> None:
+    for k, (angle, values) in enumerate(zip(ANGLES, behind(smooth_light()), strict=True)):
+        for view in range(2):
+            write_picture(tmp_path / "in" / str(angle) / f"DSC_{4 * view + k}.png", values)
+    message = "expected equal names of the four shots .* found 2 files in each, all under different names"
+    with pytest.raises(PolarguideError, match=message):
+        prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
 
 
 def test_floating_point_pictures(tmp_path: Path) -> None:

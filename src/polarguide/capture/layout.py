@@ -15,9 +15,11 @@ from polarguide.files import require_folder
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
+_NUMBER = re.compile(r"(?<!\d)\d{1,3}(?!\d)")
 _HINT = (
-    "Give a folder that holds polar/<view>_000.png, _045.png, _090.png and _135.png, or the four folders "
-    "I-00, I-45, I-90 and I-135 (also 0, 45, 90, 135) with equally named pictures."
+    "Camera files become one by polarguide prepare FOLDER --out SCENE. Else give a folder that holds "
+    "polar/<view>_000.png, _045.png, _090.png and _135.png, or the four folders I-00, I-45, I-90 and I-135 (also 0, "
+    "45, 90, 135) with equally named pictures."
 )
 
 
@@ -180,16 +182,32 @@ def require_angle_folders(root: Path, folders: Mapping[int, Path]) -> None:
 
 
 def angle_folders(root: Path) -> dict[int, Path]:
-    """Folders named like a polarizer angle (I-00, I_45, 090, pol135, ...)."""
+    """Folders named like a polarizer angle (I-00, I_45, 090, pol135), or four alike but for it (image_0, image_45).
+
+    Raises:
+        PolarguideError: two folders have the same angle.
+    """
     folders: dict[int, Path] = {}
-    for path in sorted(root.iterdir()):
+    inside = [path for path in sorted(root.iterdir()) if path.is_dir()]
+    for path in inside:
         angle = angle_of_folder(path)
-        if angle is None or not path.is_dir():
+        if angle is None:
             continue
         if angle in folders:
             raise ambiguous(root, f"one folder for {angle} degrees", folders[angle], path)
         folders[angle] = path
-    return dict(sorted(folders.items()))
+    return dict(sorted((folders or _alike_but_for_the_angle(inside)).items()))
+
+
+def _alike_but_for_the_angle(folders: Sequence[Path]) -> dict[int, Path]:
+    """The only four folders whose names differ in one number, 0, 45, 90 and 135; nothing where there is no such set."""
+    sets: dict[tuple[str, str], dict[int, Path]] = {}
+    for path in folders:
+        for match in _NUMBER.finditer(path.name):
+            around = path.name[: match.start()], path.name[match.end() :]
+            sets.setdefault(around, {})[int(match[0])] = path
+    found = [of_angle for of_angle in sets.values() if set(of_angle) == set(ANGLES)]
+    return found[0] if len(found) == 1 else {}
 
 
 def angle_of_folder(path: Path) -> int | None:
@@ -226,7 +244,9 @@ def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 def ambiguous(folder: Path, expected: str, first: Path, second: Path) -> PolarguideError:
     """The error that two files of a folder have the same meaning."""
-    found = f"{first.name} and {second.name}"
+    apart = first.name == second.name
+    names = [f"{path.parent.name}/{path.name}" if apart else path.name for path in (first, second)]
+    found = " and ".join(names)
     return PolarguideError(folder, expected=expected, found=found, remedy="Remove or rename one of them.")
 
 

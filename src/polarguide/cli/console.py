@@ -37,6 +37,11 @@ def warn(text: object) -> None:
     console.print(printable(str(text)), markup=False)
 
 
+def size_text(size: int) -> str:
+    """The size of a file in bytes, for people."""
+    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
+
+
 @contextlib.contextmanager
 def warnings_printed() -> Iterator[None]:
     """Inside, the library's warnings are lines on the console."""

@@ -9,7 +9,8 @@ from rich.table import Table
 
 from polarguide.cli.console import console
 from polarguide.cli.runs import RunFolder, opened
-from polarguide.options import ComputeOptions
+from polarguide.errors import PolarguideError, require_package
+from polarguide.options import EXPORT_PACKAGES, ComputeOptions
 
 
 def evaluate(
@@ -31,13 +32,27 @@ def evaluate(
         f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
     )
     console.print(_table(record, title))
-    if absent := importlib.import_module("polarguide.evaluation.table").absent_metrics(record):
-        console.print(f"no ground truth, or no such layer, for: {', '.join(absent)}")
+    for line in _without_value(record):
+        console.print(line, markup=False)
     if record["objects"]:
         console.print(_errors(record))
     sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE
     console.print(f"metrics: {run / 'metrics.json'}")
     console.print(f"where the errors are: {run / sheet}")
+
+
+def _without_value(record: dict[str, Any]) -> list[str]:
+    """What has no value and why, a line for each reason."""
+    table = importlib.import_module("polarguide.evaluation.table")
+    absent, lines = table.absent_metrics(record), []
+    if table.MESH_LABEL in absent and record["depth_error_median_percent"] is not None:
+        try:
+            for package in EXPORT_PACKAGES["mesh"]:
+                require_package(package, table.MESH_LABEL)
+        except PolarguideError as error:
+            absent.remove(table.MESH_LABEL)
+            lines.append(f"n/a: {error}")
+    return lines + ([f"no ground truth, or no such layer, for: {', '.join(absent)}"] if absent else [])
 
 
 def _errors(record: dict[str, Any]) -> Table:

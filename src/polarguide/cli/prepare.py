@@ -39,7 +39,8 @@ def prepare(
     without = f", {len(done.left_out)} left out" if done.left_out else ""
     console.print(f"scene: {done.folder} ({len(done.views)} views{without})", markup=False)
     if done.posed:
-        console.print(f"next: polarguide train {done.folder} --out runs/{done.folder.name}", markup=False)
+        console.print(f"next: polarguide inspect {done.folder}", markup=False)
+        console.print(f"then: polarguide train {done.folder} --out runs/{done.folder.name}", markup=False)
     else:
         console.print("it has no poses: repeat the command with --poses sfm or --poses PATH", markup=False)
         console.print(

@@ -23,6 +23,7 @@ from polarguide.evaluation.metrics import layer_error, normal_mae_deg, normal_wi
 from polarguide.evaluation.target import ViewTarget
 
 HIGHEST_PSNR = 100.0
+MESH_LABEL = "mesh F-score 1 %"
 """What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
 
 Layers = Mapping[str, Tensor | None]
@@ -223,7 +224,7 @@ METRICS: tuple[Metric, ...] = (
         shown="files",
         factor=100.0,
     ),
-    _mesh("mesh_fscore_1", "mesh F-score 1 %", shown="tables"),
+    _mesh("mesh_fscore_1", MESH_LABEL, shown="tables"),
     _mesh("mesh_fscore_05", "mesh F-score 0.5 %"),
     _mesh("mesh_accuracy_1", "mesh accuracy 1 %"),
     _mesh("mesh_accuracy_05", "mesh accuracy 0.5 %"),

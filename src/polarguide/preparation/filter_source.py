@@ -44,7 +44,7 @@ class FilterSource(Source):
 
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
         self._settings = settings
-        shots = find_shots(root)
+        shots = find_shots(root, nested=True)
         require_four_shots(root, shots)
         self._files = dict(sorted(shots.items()))
         self.views = list(self._files)

@@ -40,7 +40,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
     if kind == "auto":
         kind = detect_dataset(root) or "filter"
         if kind == "filter" and not angle_folders(root):
-            several = any(len(files) > 1 for files in find_shots(root).values())
+            shots = find_shots(root, nested=settings.sensor is None)
+            several = any(len(files) > 1 for files in shots.values())
             kind = "filter" if several else "mosaic"
             if kind == "mosaic" and settings.sensor is None:
                 raise _unknown_layout(root)

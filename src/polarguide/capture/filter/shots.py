@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
 from polarguide.capture.filter.exif import orientation
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_file
-from polarguide.capture.layout import ambiguous, angle_folders, list_files, require_angle_folders
-from polarguide.capture.view import ANGLES
+from polarguide.capture.layout import ambiguous, angle_folders, index_files, list_files, require_angle_folders
+from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
+from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.view_reader import require_alike
 from polarguide.errors import PolarguideError
 
@@ -47,12 +48,16 @@ class Shots:
     dark: NDArray[np.bool_]
 
 
-def find_shots(root: Path) -> dict[str, dict[int, Path]]:
+def find_shots(root: Path, *, nested: bool = False) -> dict[str, dict[int, Path]]:
     """View -> angle -> file: from four folders named like the angles, or from four suffixes.
 
     Folders are ``0``, ``45``, ``90``, ``135``, also ``000``, ``I-00``, ``pol_45``, ...; suffixes are the same
     after ``_``, ``-``, a point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``. Files named like the angles alone
     (``I0.png``, ``I45.png``, ...) are one view, called like the folder, where there is nothing else.
+
+    Args:
+        root: the folder.
+        nested: read the folders in one that has no pictures itself, such as one for each view or day.
 
     Returns:
         Nothing where neither is found. Angles may be missing; ``require_four_shots`` checks.
@@ -60,7 +65,7 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
     Raises:
         PolarguideError: two files have the same view and angle, or a folder is missing.
     """
-    shots, _ = list_shots(root)
+    shots, _ = list_shots(root, nested=nested)
     for view, files in shots.items():
         fault = ambiguity(view, files)
         if fault is not None:
@@ -68,7 +73,7 @@ def find_shots(root: Path) -> dict[str, dict[int, Path]]:
     return {view: {angle: paths[0] for angle, paths in files.items()} for view, files in shots.items()}
 
 
-def list_shots(root: Path) -> tuple[Candidates, list[Path]]:
+def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Path]]:
     """What ``find_shots`` finds, with every file of a view and angle where there are several, and the other pictures.
 
     Raises:
@@ -76,7 +81,11 @@ def list_shots(root: Path) -> tuple[Candidates, list[Path]]:
     """
     folders = angle_folders(root)
     if not folders:
-        return group_files(list_files(root, SHOT_SUFFIXES))
+        files = list_files(root, SHOT_SUFFIXES)
+        if nested and not files and not index_files(root, RAW_SUFFIXES):
+            below = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
+            files = [file for folder in below for file in list_files(folder, SHOT_SUFFIXES)]
+        return group_files(files)
     require_angle_folders(root, folders)
     shots: Candidates = {}
     for angle, folder in folders.items():
@@ -120,6 +129,14 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
     Raises:
         PolarguideError: a shot is missing.
     """
+    counts = [sum(angle in files for files in shots.values()) for angle in ANGLES]
+    if all(len(files) == 1 for files in shots.values()) and min(counts) == max(counts) > 0:
+        raise PolarguideError(
+            root,
+            expected="equal names of the four shots of a view in the four folders",
+            found=f"{counts[0]} files in each, all under different names ({listed(sorted(shots))})",
+            remedy="Name the shots of a view alike; docs/how-to/prepare.md has a command that numbers them in order.",
+        )
     for view, files in sorted(shots.items()):
         missing = [str(angle) for angle in ANGLES if angle not in files]
         if missing:
