@@ -127,7 +127,7 @@ def test_colors_of_differences() -> None:
         (("--reference", "none.png"), "none.png: expected a file or folder of shots"),
         (
             ("--dark-frame", "none.png"),
-            "none.png: expected a readable file, found nothing. Check --dark-frame.",
+            "none.png: expected a dark frame, found nothing. Check --dark-frame.",
         ),
         (("--watch", "."), "--watch: expected shots to measure, or a folder to watch"),
         (("--settle", "-1"), "--settle"),

@@ -100,6 +100,16 @@ def test_one_table_has_one_set_of_options(tmp_path: Path) -> None:
     assert (tmp_path / LINES).read_bytes() == b""
 
 
+def test_which_of_many_options_is_another_is_told(tmp_path: Path) -> None:
+    settings = {"reading": {"order": (0, 45), "bits": 12, **{f"o{k}": 1 for k in range(99)}}}
+    with Table(tmp_path, settings) as table:
+        table.add(entry(0))
+    Table(tmp_path, settings).close()
+    settings["reading"]["o98"] = 2
+    with pytest.raises(PolarguideError, match=r"\(reading.o98\): expected 1, found 2"):
+        Table(tmp_path, settings)
+
+
 def test_a_table_of_nothing_but_failures_is_begun_anew(tmp_path: Path) -> None:
     write(tmp_path, [entry(0, status="unread")])
     Table(tmp_path, {"threshold": 0.1}).close()

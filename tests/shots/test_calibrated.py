@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from heard import Heard
 from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.errors import PolarguideError
-from polarguide.shots import ShotOptions, read_shot
+from polarguide.measurement.line import measure_shots
+from polarguide.shots import ShotOptions, read_shot, write_shots
 
 SIZE = (64, 96)
 
@@ -57,5 +59,17 @@ def test_what_it_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PolarguideError, match="shots through a filter"):
         read_shot(shots, replace(options, sensor=None))
     (tmp_path / "camera.safetensors").unlink()
-    with pytest.raises(PolarguideError, match=r"camera\.safetensors: expected a file"):
+    with pytest.raises(PolarguideError, match=r"camera\.safetensors\): expected a file"):
         read_shot(tmp_path / "v.png", options)
+
+
+def test_a_calibration_that_fits_no_shot_is_told_once(tmp_path: Path) -> None:
+    options = replace(_made(tmp_path, "IMX250MZR"), analyzers=tmp_path / "camera.safetensors")
+    heard = Heard()
+    for wrong in (replace(options, sensor="IMX250MYR"), replace(options, analyzers=tmp_path / "none")):
+        with pytest.raises(PolarguideError, match=f"^{wrong.analyzers}: expected a "):
+            write_shots([tmp_path], tmp_path / "out", wrong, formats=("npy",), reporter=heard)
+        with pytest.raises(PolarguideError, match=f"^{wrong.analyzers}: expected a "):
+            measure_shots([tmp_path], tmp_path / "table", reading=wrong)
+    assert heard.said == []
+    assert not (tmp_path / "table").exists()

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, require_file, require_inside
+from polarguide.files import make_folder, require_inside
 from polarguide.measurement.fields import FORMAT
 from polarguide.measurement.limits import NO_LIMITS, faults, read_limits
 from polarguide.measurement.options import MeasureOptions
@@ -23,7 +23,7 @@ from polarguide.measurement.regions import WHOLE, Region, parse_regions, placed
 from polarguide.measurement.table import Entry, FileStamp, Status, Table, stamps
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
-from polarguide.records import option_name
+from polarguide.shots.develop import check_files
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import ShotMaps
 from polarguide.shots.options import ShotOptions
@@ -81,6 +81,7 @@ class Line:
             PolarguideError: one of them is wrong.
         """
         self._reading = reading.checked()
+        check_files(self._reading)
         self._options = options
         self._regions = parse_regions(options.roi)
         names = [region.name for region in self._regions] or [WHOLE]
@@ -184,13 +185,11 @@ class Line:
     def _settings(self) -> dict[str, Any]:
         """What the figures depend on, as JSON."""
         reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
-        named = {name: value for name, value in reading.items() if isinstance(value, Path)}
-        for name, path in named.items():
-            require_file(path, expected="a readable file", remedy=f"Check {option_name(name)}.")
+        named = [value for value in reading.values() if isinstance(value, Path)]
         made: dict[str, Any] = msgspec.to_builtins(
             {
                 "reading": reading,
-                "read_files": stamps(tuple(named.values())),
+                "read_files": stamps(tuple(named)),
                 "regions": self._regions,
                 "threshold": self._options.threshold,
                 "limits": self._limits,

@@ -173,11 +173,12 @@ class Table:
                 require_file(place, expected="a file of a table", remedy=_ANEW)
         if path.exists() and lines.exists():
             before = read_record(path, dict[str, Any], remedy=_ANEW) if not overwrite else None
-            if before == json.loads(to_json(settings)):
+            now: dict[str, Any] = json.loads(to_json(settings))
+            if before == now:
                 self._mend()
                 return
             if before is not None and _holds_measurements(lines):
-                raise _other_settings(path, before, settings)
+                raise _other_settings(path, before, now)
         elif lines.exists() and not overwrite:
             raise PolarguideError(
                 path, expected="the options that this table was made with", found="nothing", remedy=_ANEW
@@ -237,9 +238,13 @@ def _holds_measurements(path: Path) -> bool:
 
 def _other_settings(path: Path, before: dict[str, Any], now: dict[str, Any]) -> PolarguideError:
     name = next(name for name in {**before, **now} if before.get(name) != now.get(name))
+    was, is_now = before.get(name), now.get(name)
+    while isinstance(was, dict) and isinstance(is_now, dict):
+        inner = next(key for key in {**was, **is_now} if was.get(key) != is_now.get(key))
+        name, was, is_now = f"{name}.{inner}", was.get(inner), is_now.get(inner)
     return PolarguideError(
         f"{path} ({name})",
-        expected=shortened(before.get(name), 200),
-        found=shortened(now.get(name), 200),
+        expected=shortened(was, 200),
+        found=shortened(is_now, 200),
         remedy=f"One table has one set of options. {_ANEW}",
     )

@@ -16,6 +16,7 @@ from polarguide.files import atomic, make_folder, write_text, write_whole
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
 from polarguide.shots.catalog import KINDS
+from polarguide.shots.develop import check_files
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
@@ -86,6 +87,7 @@ def write_shots(
         if len(found) < len(paths)
         else []
     )
+    check_files(options)
     folders: dict[str, Path] = {}
     faults: dict[str, PolarguideError] = {}
     with reporter.track("shots", len(found)) as advance:
