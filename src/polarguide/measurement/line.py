@@ -27,13 +27,11 @@ from polarguide.records import option_name
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import ShotMaps
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide.shots.read import UNREADABLE, fault_of, read_shot
 from polarguide.visualization.figures import write_png
 
 BEYOND, DIFFERENCES = "beyond", "differences"
 """Folders of pictures beside the table."""
-UNREADABLE = (PolarguideError, OSError, MemoryError)
-"""What one bad file may raise; others come after it."""
 Heard = Callable[[Entry], None]
 
 
@@ -140,8 +138,7 @@ class Line:
 
     def unread(self, shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseException) -> Entry:
         """Write the line of a shot that cannot be measured."""
-        why = str(error) if isinstance(error, PolarguideError) else f"{shot.paths[0]}: {_words(error)}."
-        entry = Entry(FORMAT, shot.name, files, "unread", why, (), ())
+        entry = Entry(FORMAT, shot.name, files, "unread", str(fault_of(shot, error)), (), ())
         self.table.add(entry)
         return entry
 
@@ -199,12 +196,6 @@ class Line:
             enc_hook=str,
         )
         return made
-
-
-def _words(error: BaseException) -> str:
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    return "it needs more memory than there is" if isinstance(error, MemoryError) else str(error)
 
 
 def measure_shots(
