@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 import polarguide
 from polarguide.capture.calibration import Calibration
 from polarguide.errors import PolarguideError
+from polarguide.options import SceneOptions
 from polarguide.shots import ShotOptions, find_shots, read_shot, write_shots
 from polarguide.shots.exposures import ExposureSet
 from tests.helpers.heard import Heard
@@ -125,3 +127,43 @@ def test_formats_of_an_earlier_call_do_not_stay(tmp_path: Path) -> None:
     write_shots([tmp_path / "a.png"], tmp_path / "out", MONO, formats=("npy",))
     assert {path.suffix for path in folder.iterdir()} == {".npy", ".json", ".png"}
     assert [path.name for path in folder.glob("*.png")] == ["notes.png"]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"full_well": 1e4}, {"snr": 5.0}, {"gains": "auto"}, {"calibration": Calibration(order=(90, 45, 0, 135))},
+     {"calibration": Calibration(gains=(1.0, 1.1, 1.0, 1.0))}, {"bits": 12}, {"transfer": "srgb"}],
+)  # fmt: skip
+def test_options_of_shots_are_refused_for_a_scene_with_poses(tmp_path: Path, given: dict[str, Any]) -> None:
+    name = next(iter(given))
+    with (
+        polarguide.demo_scene() as scene,
+        pytest.raises(
+            PolarguideError, match=f"^--{name.replace('_', '-')}: expected shots, found a scene with poses"
+        ),
+    ):
+        polarguide.priors(scene, tmp_path / "x", views="v000", shots=ShotOptions(**given))
+    assert not (tmp_path / "x").exists()
+
+
+def test_noise_counts_for_the_maps_of_a_scene_with_poses(tmp_path: Path) -> None:
+    with polarguide.demo_scene() as scene:
+        noisy = ShotOptions(full_well=100.0)
+        polarguide.priors(scene, tmp_path, views="v000", shots=noisy, formats=["npy"])
+        record = json.loads((tmp_path / "v000" / "maps.json").read_text())
+        assert record["noise"]["source"] == "given"
+        wrong = ShotOptions(calibration=Calibration(order=(90, 45, 0, 135)))
+        with pytest.raises(PolarguideError, match="calibration: expected shots"):
+            polarguide.priors(scene, tmp_path, views="v000", shots=wrong, formats=["npy"])
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [("views", {"views": "all"}), ("memory", {"reading": SceneOptions(memory=1.0)}),
+     ("transfer", {"reading": SceneOptions(transfer="srgb")})],
+)  # fmt: skip
+def test_options_of_scenes_are_refused_for_shots(tmp_path: Path, name: str, given: dict[str, Any]) -> None:
+    paths = write_four(tmp_path / "in", CUP)
+    with pytest.raises(PolarguideError, match=f"^--{name}: expected a scene with poses, found shots"):
+        polarguide.priors(paths, tmp_path / "out", **given)
+    assert not (tmp_path / "out").exists()
