@@ -45,8 +45,9 @@ class Outcome:
 
     Attributes:
         folder: of the table.
-        counts: shots by status, those included that were in the table before.
-        earlier: how many these are.
+        counts: shots by status. Of ``measure_shots`` these are all it was given, those included that were in the table
+            before; of ``watch_folder`` those that came while it watched.
+        earlier: how many were in the table before; 0 of ``watch_folder``.
         waiting: shots of a watched folder that were not complete when it stopped.
         trouble: why no shot was found in a watched folder in the end, though it is not empty; else "".
     """
@@ -129,10 +130,10 @@ class Line:
         status: Status = (
             "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
         )
-        self._draw(maps, differences, [(r, beyond) for r, _, beyond in found] if status == "beyond" else [])
-        entry = Entry(
-            FORMAT, shot.name, files, status, "", maps.notes, tuple(figures for _, figures, _ in found)
-        )
+        beyond = [(region, which) for region, _, which in found] if status == "beyond" else []
+        picture = self._draw(maps, differences, beyond)
+        measured = tuple(figures for _, figures, _ in found)
+        entry = Entry(FORMAT, shot.name, files, status, "", maps.notes, measured, picture)
         self.table.add(entry)
         return entry
 
@@ -168,15 +169,19 @@ class Line:
         maps: ShotMaps,
         differences: Differences | None,
         beyond: Sequence[tuple[Region, Sequence[str]]],
-    ) -> None:
-        """Write pictures before the line of the table: where that is, they are."""
+    ) -> str:
+        """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
+        if not beyond and differences is None:
+            return ""
+        name = self.table.picture_name(maps.name)
         if beyond:
             make_folder(self.out / BEYOND)
-            write_png(self.out / BEYOND / f"{maps.name}.png", regions_picture(maps, beyond))
+            write_png(self.out / BEYOND / f"{name}.png", regions_picture(maps, beyond))
         if differences is not None and self._reference is not None:
             make_folder(self.out / DIFFERENCES)
             picture = difference_picture(differences, maps.name, self._reference.name)
-            write_png(self.out / DIFFERENCES / f"{maps.name}.png", picture)
+            write_png(self.out / DIFFERENCES / f"{name}.png", picture)
+        return name
 
     def _settings(self) -> dict[str, Any]:
         """What the figures depend on, as JSON."""
