@@ -14,6 +14,7 @@ import pytest
 from polarguide.errors import PolarguideError
 from polarguide.measurement.fields import FORMAT, KEYS
 from polarguide.measurement.line import measure_shots
+from polarguide.measurement.options import MeasureOptions
 from polarguide.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
 from polarguide.shots import ShotOptions
 
@@ -192,3 +193,31 @@ def test_a_table_writes_nowhere_else_and_waits_for_nothing(tmp_path: Path, name:
     with pytest.raises(PolarguideError, match=name):
         Table(folder, SETTINGS)
     assert victim.read_bytes() == before
+
+
+def test_pictures_of_shots_of_one_name_do_not_replace_each_other(
+    tmp_path: Path, reading: ShotOptions
+) -> None:
+    rng = np.random.default_rng(0)
+    limits = tmp_path / "limits.json"
+    limits.write_text('{"limits": {"s0_mean": {"max": 0.001}}}')
+    out = tmp_path / "out"
+
+    def measured(day: str, name: str) -> dict:
+        (tmp_path / day).mkdir(exist_ok=True)
+        path = tmp_path / day / f"{name}.png"
+        cv2.imwrite(str(path), rng.integers(200, 3000, (48, 64)).astype(np.uint16))
+        options = MeasureOptions(limits=limits, reference=tmp_path / "golden.png")
+        assert measure_shots([path], out, options, reading).counts == {"beyond": 1}
+        return json.loads((out / LINES).read_bytes().splitlines()[-1])
+
+    cv2.imwrite(str(tmp_path / "golden.png"), rng.integers(200, 3000, (48, 64)).astype(np.uint16))
+    assert measured("monday", "part1")["picture"] == "part1"
+    before = {path: path.read_bytes() for path in out.glob("*/part1.png")}
+    assert len(before) == 2
+    assert measured("tuesday", "part1")["picture"] == "part1-2"
+    assert measured("tuesday", "part1")["picture"] == "part1-3"  # written anew
+    assert measured("tuesday", "part1-2")["picture"] == "part1-2-2"
+    assert measured("tuesday", "PART1")["picture"] == "PART1-4"
+    assert {path: path.read_bytes() for path in before} == before
+    assert len(list((out / "beyond").iterdir())) == len(list((out / "differences").iterdir())) == 5

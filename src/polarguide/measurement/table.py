@@ -75,6 +75,7 @@ class Entry(msgspec.Struct, frozen=True):
         why: then, the reason.
         notes: what was assumed about it.
         regions: by ``Field.key``, from ``region`` on.
+        picture: name of its pictures without suffix, "" where none was drawn.
     """
 
     format: int
@@ -84,6 +85,7 @@ class Entry(msgspec.Struct, frozen=True):
     why: str
     notes: tuple[str, ...]
     regions: tuple[dict[str, Value], ...]
+    picture: str = ""
 
     def rows(self) -> Iterator[list[Value]]:
         """The lines of the CSV table."""
@@ -116,6 +118,7 @@ class Table:
         make_folder(folder)
         self.folder = folder
         self._done: dict[bytes, Status] = {}
+        self._pictures: set[str] = set()
         self._files: list[BinaryIO] = []
         self._stack = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
@@ -151,6 +154,14 @@ class Table:
         """The status in the line of these files as they are, None where there is no such line."""
         return self._done.get(_key(files))
 
+    def picture_name(self, shot: str) -> str:
+        """A name for the pictures of a shot that those of no other have, upper and lower case taken alike."""
+        name, number = shot, 1
+        while name.casefold() in self._pictures:
+            number += 1
+            name = f"{shot}-{number}"
+        return name
+
     def add(self, entry: Entry) -> None:
         """Write the lines of a shot; when this returns, they are on disk.
 
@@ -160,8 +171,13 @@ class Table:
         lines, rows = self._files
         # JSON's escapes keep names that are no Unicode.
         _append(self.folder / LINES, lines, json.dumps(msgspec.to_builtins(entry)).encode() + b"\n")
-        self._done[_key(entry.files)] = entry.status
+        self._note(entry)
         _append(self.folder / CSV, rows, _csv(entry.rows()))
+
+    def _note(self, entry: Entry) -> None:
+        self._done[_key(entry.files)] = entry.status
+        if entry.picture:
+            self._pictures.add(entry.picture.casefold())
 
     def _begin(self, settings: dict[str, Any], overwrite: bool) -> None:
         """Make what there is whole again, or begin anew."""
@@ -199,7 +215,7 @@ class Table:
                 if entry.format != FORMAT:
                     place, found = f"{path} (line {number}, format)", str(entry.format)
                     raise PolarguideError(place, expected=str(FORMAT), found=found, remedy=_ANEW)
-                self._done[_key(entry.files)] = entry.status
+                self._note(entry)
                 rows.write(_csv(entry.rows()))
                 whole += len(line)
         if whole < path.stat().st_size:

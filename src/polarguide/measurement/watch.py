@@ -15,13 +15,14 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
-from polarguide.measurement.line import UNREADABLE, ChangedWhileRead, Heard, Line, Outcome, ignore
+from polarguide.measurement.line import ChangedWhileRead, Heard, Line, Outcome, ignore
 from polarguide.measurement.options import MeasureOptions, WatchOptions
 from polarguide.measurement.table import Entry, FileStamp, stamps
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.shots.exposures import ExposureSet, list_shots, mosaics
 from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import UNREADABLE
 
 _POLL = (0.05, 0.5)
 """Seconds between two looks, at least and at most, unless a look takes long itself."""
@@ -130,6 +131,7 @@ def watch_folder(
     """
     root = Path(folder)
     require_folder(root, expected="a folder to watch", remedy="Check --watch.")
+    reading.require_kind("filter" if reading.sensor is None else "mosaic", root.name)
     counts: Counter[str] = Counter()
     with Line(Path(out), options, reading) as line:
         ignored = [*line.reference_files, *([reading.dark_frame] if reading.dark_frame else [])]

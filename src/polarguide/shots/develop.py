@@ -67,6 +67,7 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
     """
     if shot.fault is not None:
         raise shot.fault
+    options.require_kind(shot.kind, shot.name)
     if shot.kind == "mosaic":
         try:
             return _mosaic(shot, options)
@@ -79,13 +80,6 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
             raise PolarguideError(
                 where, expected=error.expected, found=error.found, remedy=error.remedy
             ) from error
-    if options.analyzers is not None:
-        raise PolarguideError(
-            options.analyzers,
-            expected="raw mosaics, whose samples it corrects",
-            found=f"{shot.name}, {'shots through a filter' if shot.kind == 'filter' else 'a view of a scene'}",
-            remedy="Leave it out, or give --sensor and the mosaics; prepare --calibration corrects a scene.",
-        )
     return _filter(shot, options) if shot.kind == "filter" else _scene_view(shot, options)
 
 

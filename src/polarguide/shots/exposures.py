@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.layout import (
@@ -20,9 +19,8 @@ from polarguide.capture.layout import (
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import Kind, ShotOptions
 
-Kind = Literal["mosaic", "filter", "scene"]
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
     "Raw mosaics need --sensor (IMX250MYR is color, IMX250MZR monochrome); four shots need their angles in the names, "
@@ -70,11 +68,19 @@ def find_shots(
     What is ambiguous or tells no angle does not hide the shots beside it: it is a set with a ``fault``.
 
     Raises:
-        PolarguideError: a path does not exist, or there is nothing but files and folders that are no shot.
+        PolarguideError: there are no paths, one does not exist, there is nothing but files and folders that are no
+            shot, or an option means nothing for the kind of shots found.
     """
+    options = options or ShotOptions()
+    if not paths:
+        raise PolarguideError(
+            "paths", expected="at least one file or folder of shots", found="none", remedy="Name some."
+        )
     found = list_shots(paths, options)
     faults = [shot.fault for shot in found if shot.fault is not None and not shot.files]
     if len(faults) < len(found):
+        for kind, shot in {shot.kind: shot for shot in reversed(found) if shot.fault is None}.items():
+            options.require_kind(kind, shot.name)
         return found
     root = Path(paths[0])
     if len(paths) == 1 and len(faults) > 1:
@@ -200,7 +206,11 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
 
 
 def _named_apart(found: list[ExposureSet]) -> list[ExposureSet]:
-    """Sets of one name are called by their folder, too; it is their fault where that does not tell them apart."""
+    """Sets of one name are called by their folder, too; it is their fault where that does not tell them apart.
+
+    So is a name that is none of a folder.
+    """
+    found = [shot if usable_name(shot.name) else _unusable(shot) for shot in found]
     names = Counter(shot.name for shot in found)
     apart = [
         shot
@@ -212,6 +222,34 @@ def _named_apart(found: list[ExposureSet]) -> list[ExposureSet]:
     for shot in apart:
         named.setdefault(shot.name, []).append(shot)
     return [shot if len(named[shot.name]) == 1 else _ambiguous(shot, named[shot.name]) for shot in apart]
+
+
+def usable_name(name: str) -> bool:
+    """Whether a shot of this name can have a folder of that name."""
+    return name not in ("", ".", "..") and os.sep not in name and not (os.altsep and os.altsep in name)
+
+
+def require_name(shot: ExposureSet) -> None:
+    """Refuse a shot whose files would not be written into a folder of its own.
+
+    Raises:
+        PolarguideError: its name is none of a folder.
+    """
+    if not usable_name(shot.name):
+        raise PolarguideError(
+            shot.paths[0],
+            expected="a name that a folder can have",
+            found=repr(shot.name),
+            remedy="Rename the file.",
+        )
+
+
+def _unusable(shot: ExposureSet) -> ExposureSet:
+    try:
+        require_name(shot)
+    except PolarguideError as error:
+        return replace(shot, fault=shot.fault or error)
+    return shot
 
 
 def _ambiguous(shot: ExposureSet, alike: Sequence[ExposureSet]) -> ExposureSet:
