@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from polarguide.capture import Scene
+from polarguide.capture.calibration import Calibration
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import evaluate
 from polarguide.evaluation.record import read_metrics
@@ -158,7 +160,7 @@ def priors(
     many = (
         [] if isinstance(paths, Scene) else [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     )
-    posed = isinstance(paths, Scene) or (len(many) == 1 and (Path(many[0]) / "sparse").exists())
+    posed = isinstance(paths, Scene) or (len(many) == 1 and os.path.lexists(Path(many[0]) / "sparse"))
     if not posed:
         for name, given in (("run", run), ("threshold", threshold)):
             if given is not None:
@@ -184,13 +186,18 @@ def priors(
             refractive_index=refractive_index,
             reporter=reporter,
         )
-    if intrinsics is not None or (shots is not None and shots.sensor is not None):
+    asked: dict[str, Any] = {"intrinsics": intrinsics}
+    if shots is not None:
+        calibrated = shots.analyzers or (None if shots.calibration == Calibration() else shots.calibration)
+        asked |= {"sensor": shots.sensor, "calibration": calibrated}
+    if any(value is not None for value in asked.values()):
         raise PolarguideError(
-            "sensor" if intrinsics is None else "intrinsics",
+            next(name for name, value in asked.items() if value is not None),
             expected="shots",
             found="a scene with poses",
             remedy="Leave it out: the scene has developed pictures and cameras.",
         )
+    refuse_scene(Path(out))
     scene = paths if isinstance(paths, Scene) else read_scene(many[0], reading, reporter)
     sheet = write_priors(
         scene,

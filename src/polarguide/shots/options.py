@@ -10,6 +10,7 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
+from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.records import check_options
 
@@ -73,6 +74,13 @@ class ShotOptions:
         """
         check_options(self)
         checked(self.calibration, "calibration")
+        if self.read_noise and self.full_well is None:
+            raise PolarguideError(
+                "--read-noise",
+                expected="a --full-well that it goes with",
+                found="none",
+                remedy="Give both, or neither: the noise is then estimated from each shot.",
+            )
         return self
 
     def preparation(self) -> PrepareSettings:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +30,8 @@ from polarguide.records import decode
 FORMAT, VERSION = "polarguide-analyzers", 1
 SUFFIX = ".safetensors"
 LEAST_DIATTENUATION = 0.3
+MOST_THROUGHPUT = 1e3
+MOST_OFF = math.radians(15)
 """Of a pixel's polarizer; below it, its angle and the correction mean nothing. (Extinction ratio 1.9.)"""
 _ENTRY, _TENSOR = "polarguide", "vectors"
 _AT_ONCE = 16
@@ -460,8 +463,23 @@ def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
     gain = found.vectors[..., 0]
     if not (np.isfinite(found.vectors).all() and (gain > 0).all()):
         raise _damaged(path, "vectors that are not finite, or have no throughput")
+    if gain.min() < 1 / MOST_THROUGHPUT or gain.max() > MOST_THROUGHPUT:
+        raise _damaged(
+            path, f"throughputs of {gain.min():g} to {gain.max():g}, whose mean is 1/2 in such a file"
+        )
+    if not _are_apart(found):
+        raise _damaged(path, "polarizers that are not 45 degrees apart")
     if (np.hypot(found.vectors[..., 1], found.vectors[..., 2]) < LEAST_DIATTENUATION * gain).any():
         raise _damaged(path, "vectors of pixels that hardly polarize")
+
+
+def _are_apart(found: AnalyzerCalibration) -> bool:
+    """Whether the polarizers of most blocks lie as their names say, but for a turn of all of them."""
+    turned = found.vectors[..., 1] + 1j * found.vectors[..., 2]
+    turned = turned / np.maximum(np.abs(turned), 1e-12) * np.exp(-2j * np.radians(found.pattern.angles))
+    mean = turned.mean(axis=(2, 3), keepdims=True)
+    off = (turned * np.conj(mean)).real.min(axis=(2, 3)) / np.maximum(np.abs(mean[..., 0, 0]), 1e-12)
+    return bool(np.median(off) > math.cos(2 * MOST_OFF))
 
 
 def _damaged(path: Path, found: str) -> PolarguideError:
