@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from polarguide.capture import Scene
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import evaluate
 from polarguide.evaluation.record import read_metrics
@@ -164,7 +165,7 @@ def priors(
     many = (
         [] if isinstance(paths, Scene) else [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     )
-    posed = isinstance(paths, Scene) or (len(many) == 1 and (Path(many[0]) / "sparse").exists())
+    posed = isinstance(paths, Scene) or (len(many) == 1 and os.path.lexists(Path(many[0]) / "sparse"))
     if not posed:
         _refuse_for_shots(run, views, threshold, reading, shots)
         return write_shots(
@@ -177,6 +178,7 @@ def priors(
             reporter=reporter,
         )
     _refuse_with_poses(intrinsics, shots, reading, bool(formats))
+    refuse_scene(Path(out))
     scene = paths if isinstance(paths, Scene) else read_scene(many[0], reading, reporter)
     sheet = write_priors(
         scene,

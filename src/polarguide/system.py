@@ -8,7 +8,7 @@ import importlib
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -111,6 +111,26 @@ def exclusive_lock(path: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.set_inheritable(file.fileno(), True)
         yield
+
+
+def hold_folder(folder: Path) -> Callable[[], None]:
+    """Lock a folder itself, without a file in it; returns what lets it go. Does nothing where folders have no locks.
+
+    Raises:
+        BlockingIOError: another process holds it.
+    """
+    fcntl = _posix("fcntl")
+    if fcntl is None:
+        return lambda: None
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise
+    except OSError:  # a disk of the network without locks
+        pass
+    return lambda: os.close(handle)
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -201,6 +202,27 @@ def test_a_file_with_its_checksum_that_makes_no_sense_is_refused(tmp_path: Path)
             PolarguideError, match=r"bad\.safetensors: expected a file that polarguide calibrate"
         ):
             read_analyzers(tmp_path / "bad.safetensors")
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize(
+    ("factor", "turned", "words"),
+    [
+        (1e30, False, "throughputs of"),
+        (1e-30, False, "throughputs of"),
+        (1, True, "far from the sensor's angles"),
+    ],
+)
+def test_vectors_that_no_sensor_has_are_refused(
+    tmp_path: Path, name: str, factor: float, turned: bool, words: str
+) -> None:
+    calibration = true_calibration(made_sensor(name, (16, 24)))
+    vectors = calibration.vectors * np.float32(factor)
+    if turned:  # every polarizer as the first one of its block
+        vectors[:] = vectors[:, :, :1, :1]
+    write_analyzers(tmp_path / "a.safetensors", replace(calibration, vectors=vectors))
+    with pytest.raises(PolarguideError, match=words):
+        read_analyzers(tmp_path / "a.safetensors")
 
 
 def test_other_sizes_and_sensors_are_refused(saved: Path) -> None:

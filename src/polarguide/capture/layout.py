@@ -82,6 +82,18 @@ def find_layout(root: Path) -> Layout:
     return Layout(root, pictures, sides["masks"], sides["invalid"], sides["gt"], tuple(warnings))
 
 
+def refuse_scene(out: Path) -> None:
+    """Refuse to write into a scene: what lies beside its pictures means something.
+
+    Raises:
+        PolarguideError: there is one.
+    """
+    if out.is_dir() and ((out / "polar").is_dir() or len(angle_folders(out)) == len(ANGLES)):
+        raise PolarguideError(
+            out, expected="a folder for what is written", found="a scene", remedy="Give another --out."
+        )
+
+
 def select_views(layout: Layout, views: Sequence[str] | None) -> list[str]:
     """The names to read, sorted: all, or those asked for.
 

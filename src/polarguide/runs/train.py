@@ -14,6 +14,7 @@ import torch
 
 from polarguide.capture import Scene
 from polarguide.capture.background import without_surroundings
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
@@ -270,6 +271,10 @@ def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
 
 
 def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
+    try:
+        refuse_scene(out)
+    except PolarguideError as error:
+        return error
     if (out / CONFIGURATION).exists() == resume:
         return None
     expected, found, remedy = (
@@ -293,7 +298,14 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _check_slots(state: TrainingState, settings: TrainSettings, out: Path) -> None:
-    """Refuse sums of the density control for another number of views a step than ``run.json`` states."""
+    """Refuse a later step than ``run.json`` states, and sums of the density control for other views a step."""
+    if state.step > settings.steps:
+        raise PolarguideError(
+            out / CHECKPOINT,
+            expected=f"the state of a training of {settings.steps} steps",
+            found=f"one after step {state.step}",
+            remedy="Train again into a new folder.",
+        )
     sums = state.statistics.gradient
     found = sums.shape[0] if sums.ndim == 2 else 1
     if found != settings.views_per_step:

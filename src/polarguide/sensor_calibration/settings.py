@@ -52,7 +52,7 @@ class CalibrateSettings:
     """
 
     sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"]
-    lens: str = ""
+    lens: Annotated[str, Meta(max_length=200)] = ""
     angles: str | None = None
     sense: Sense = "ccw"
     reference: Literal["angles", "mean"] | None = None
@@ -76,6 +76,9 @@ class CalibrateSettings:
             PolarguideError: a value is out of range, or does not fit another.
         """
         check_options(self)
+        if not self.lens.isprintable():
+            found = repr(self.lens)
+            raise PolarguideError("--lens", expected="one line of text", found=found, remedy="Correct it.")
         period = sensor_pattern(self.sensor).period
         if self.block is not None and self.block != 1 and self.block % period:
             raise PolarguideError(

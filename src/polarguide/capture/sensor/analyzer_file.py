@@ -27,6 +27,7 @@ from polarguide.records import decode
 
 FORMAT, VERSION = "polarguide-analyzers", 1
 SUFFIX = ".safetensors"
+MOST_THROUGHPUT = 1e3
 _ENTRY, _TENSOR = "polarguide", "vectors"
 _REMEDY = "Calibrate again (polarguide calibrate), or copy the file again."
 
@@ -133,6 +134,9 @@ def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
     gain = found.vectors[..., 0]
     if not (np.isfinite(found.vectors).all() and (gain > 0).all()):
         raise _damaged(path, "vectors that are not finite, or have no throughput")
+    if gain.min() < 1 / MOST_THROUGHPUT or gain.max() > MOST_THROUGHPUT:
+        throughputs = f"throughputs of {gain.min():g} to {gain.max():g}, whose mean is 1/2 in such a file"
+        raise _damaged(path, throughputs)
     if (np.hypot(found.vectors[..., 1], found.vectors[..., 2]) < LEAST_DIATTENUATION * gain).any():
         raise _damaged(path, "vectors of pixels that hardly polarize")
     nominal = 2 * np.radians(found.pattern.angles)
