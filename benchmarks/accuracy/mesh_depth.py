@@ -4,6 +4,7 @@
 
 Needs trimesh with a ray engine (``pip install embreex``). Errors are in percent of the scene's extent, 1.1 times the
 largest distance of a camera from the cameras' mean; "rendered" is the depth of the Gaussians themselves, alpha blended.
+A mesh that was exported with an up axis or a scale is taken back to the scene's axes and units, by what its file says.
 """
 
 from __future__ import annotations
@@ -15,10 +16,24 @@ import cv2
 import numpy as np
 import torch
 import trimesh
+from plyfile import PlyData
 
 from polarguide.api import open_run
 from polarguide.gaussians.initialize import scene_extent
 from polarguide.visualization import figures
+
+
+def scene_mesh(path: Path) -> trimesh.Trimesh:
+    """The mesh of a PLY file of ``polarguide export``, in the axes and units of the scene that it was exported from."""
+    mesh = trimesh.load(path, process=False)
+    file = PlyData.read(path)
+    lines = [*file.comments, *(line for element in file.elements for line in element.comments)]
+    about = dict(line.split(" ", 1) for line in lines if " " in line)
+    turn = np.array(about.get("rotation_of_scene", "1 0 0 0 1 0 0 0 1").split(), np.float64).reshape(3, 3)
+    back = np.eye(4)
+    # File = scale * rotation @ scene, see polarguide.export.placement.
+    back[:3, :3] = turn.T / float(about.get("meters_per_unit_of_scene", "1"))
+    return mesh.apply_transform(back)
 
 
 def mesh_depth(mesh: trimesh.Trimesh, camera, step: int) -> np.ndarray:
@@ -56,7 +71,7 @@ def main() -> None:
     arguments = parser.parse_args()
     opened = open_run(arguments.run)
     extent = scene_extent(torch.stack([camera.center for camera in opened.cameras.values()]))
-    mesh = trimesh.load(arguments.mesh, process=False)
+    mesh = scene_mesh(arguments.mesh)
     if arguments.picture:
         shown = pictures(mesh, opened.scene.test_views[0].camera)
         cv2.imwrite(str(arguments.picture), cv2.resize(shown, None, fx=2, fy=2)[..., ::-1])

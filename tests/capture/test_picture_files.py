@@ -19,7 +19,8 @@ from polarguide.capture import load_scene
 from polarguide.capture.formats.integrity import find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
 from polarguide.capture.view import FULL_CODE
-from polarguide.capture.write import intensity_codes, rounding_of
+from polarguide.capture.write import intensity_codes, rounding_of, write_png
+from polarguide.color import srgb_decode_array
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
 
@@ -81,18 +82,51 @@ def test_gray_pictures_become_three_equal_channels(capture: TinyCapture, bits: i
 @pytest.mark.parametrize(("bits", "rounding"), [(8, 64), (10, 16), (12, 4), (14, 1), (16, 1)])
 def test_codes_are_rounded_to_less_than_a_fifth_of_a_step(bits: int, rounding: int) -> None:
     step = FULL_CODE / (2**bits - 1)
-    assert rounding_of(step) == rounding
+    bands = rounding_of(np.array([0.0, step]))
+    assert bands == [(0, rounding)]
     values = np.random.default_rng(1).random((4, 40, 50, 3), np.float32)
     values[0, 0, :2] = 1.0
     invalid = np.zeros((40, 50), bool)
     invalid[0, 0] = True
-    codes = intensity_codes(values, invalid, rounding).astype(int)
+    codes = intensity_codes(values, invalid, bands).astype(int)
     kept = ~invalid
     assert np.abs(codes - values * FULL_CODE)[:, kept].max() <= max(rounding / 2, 1) + 0.01
     assert rounding == 1 or rounding / 2 < step / 5
     assert not (codes[codes < FULL_CODE - 1] % rounding).any()
     assert codes[:, kept].max() < FULL_CODE
     assert (codes[0, 0, 0] == FULL_CODE).all()
+
+
+def test_codes_of_srgb_pictures_are_rounded_by_the_step_at_their_value() -> None:
+    shown = np.arange(256) / 255
+    steps = FULL_CODE * srgb_decode_array(shown)
+    bands = rounding_of(steps)
+    assert [multiple for _, multiple in bands] == [4, 8, 16, 32, 64, 128]
+    values = np.linspace(0, 0.998, 4 * 50 * 50 * 3, dtype=np.float32).reshape(4, 50, 50, 3)
+    codes = intensity_codes(values, np.zeros((50, 50), bool), bands).astype(int)
+    step = np.interp(values * FULL_CODE, steps[:-1], np.diff(steps))
+    assert (np.abs(codes - values * FULL_CODE) < 0.2 * step + 0.01).all()
+    for start, multiple in bands:
+        later = codes[codes > start + multiple]
+        assert not (later % multiple).any()
+
+
+def test_pictures_are_written_with_the_filter_that_suits_them(tmp_path: Path) -> None:
+    random = np.random.default_rng(2)
+    few = (random.integers(0, 40, (100, 120, 3)) ** 2 * 40).astype(np.uint16)
+    ramp = (np.arange(120)[:, None] * 500 + random.integers(0, 40, (100, 120, 3))).astype(np.uint16)
+    smallest = []
+    for pixels in (few, ramp):
+        sizes = [
+            len(
+                cv2.imencode(".png", pixels, (cv2.IMWRITE_PNG_FILTER, way, cv2.IMWRITE_PNG_COMPRESSION, 6))[1]
+            )
+            for way in (cv2.IMWRITE_PNG_FILTER_NONE, cv2.IMWRITE_PNG_FILTER_SUB)
+        ]
+        smallest.append(int(np.argmin(sizes)))
+        assert write_png(tmp_path / "a.png", pixels) <= min(sizes) * 1.01
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"), -1)[..., ::-1], pixels)
+    assert smallest == [0, 1]
 
 
 @pytest.mark.parametrize("bits", [8, 16])

@@ -118,6 +118,7 @@ def test_colors_of_differences() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (("--roi", f"1,2,3,{'9' * 5000}"), "--roi: expected x,y,width,height"),
         (("--roi", "1,2,3"), "--roi: expected x,y,width,height"),
         (("--roi", "a=0,0,1,1", "--roi", "a=0,0,2,2"), "a twice"),
         (("--roi", "60,40,10,10"), "the region roi1 within 64x48 pixels"),

@@ -91,16 +91,19 @@ def test_columns_are_those_that_a_run_has(monkeypatch, tmp_path):
     ]
 
 
-def test_scales_stand_below_the_heat_maps(monkeypatch, tmp_path):
+def test_a_key_to_its_colors_stands_below_every_column(monkeypatch, tmp_path):
     seen = drawn(monkeypatch, tmp_path, known_scene())
-    there = [picture is not None for picture in seen["footer"]]
-    assert [name for name, bar in zip(seen["columns"], there, strict=True) if bar] == [
-        "picture error",
-        "normal error",
-        "specular error",
-        "diffuse error",
-        "S1, S2 error",
-    ]
+    keys = dict(zip(seen["columns"], seen["footer"], strict=True))
+    assert len(keys) == len(COLUMNS)
+    assert (keys["photograph"][:22] == error_sheet.NOT_COUNTED).all()
+    for name in ("AoLP x DoLP / 0.5", "predicted"):
+        # Full DoLP on top, none at the bottom; 0, 60 and 120 degrees are red, green and blue.
+        top = keys[name][0]
+        assert [int(top[x].argmax()) for x in (0, 85, 170, 255)] == [0, 1, 2, 0]
+        assert top.max() == 255
+        assert not keys[name][21].any()
+    for name in ("picture error", "normal error", "specular error", "diffuse error", "S1, S2 error"):
+        assert keys[name][0, -1].sum() > 600 > 60 > keys[name][0, 0].sum()
 
 
 def test_many_views_are_thinned_out(monkeypatch, tmp_path):

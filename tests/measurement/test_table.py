@@ -14,7 +14,7 @@ import pytest
 from polarguide.errors import PolarguideError
 from polarguide.measurement.fields import FORMAT, KEYS
 from polarguide.measurement.line import measure_shots
-from polarguide.measurement.table import CSV, LINES, Entry, FileStamp, Table
+from polarguide.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
 from polarguide.shots import ShotOptions
 
 SETTINGS = {"threshold": 0.05}
@@ -150,3 +150,45 @@ def test_two_hundred_shots_take_no_more_memory_than_twenty(tmp_path: Path, readi
 
     assert measure_shots([parts], tmp_path / "out", reading=reading, heard=heard).counts == {"measured": 200}
     assert max(taken[20:]) - max(taken[:20]) < 30e6
+
+
+@pytest.mark.parametrize(
+    ("line", "where"),
+    [({"format": FORMAT + 1}, "format"), ({"files": [{"path": "a", "bytes": 1, "modified": 10**30}]}, "modified"),
+     ({"files": [{"path": "a", "bytes": 1, "modified": -(10**20)}]}, "modified")],
+)  # fmt: skip
+def test_a_line_that_this_version_does_not_write_is_named(tmp_path: Path, line: dict, where: str) -> None:
+    write(tmp_path, [entry(0)])
+    written = json.loads((tmp_path / LINES).read_text())
+    (tmp_path / LINES).write_text(json.dumps({**written, **line}) + "\n")
+    with pytest.raises(PolarguideError, match=where):
+        Table(tmp_path, SETTINGS)
+
+
+def test_a_time_of_no_date_is_still_a_line(tmp_path: Path) -> None:
+    """Some disks have times of any 64 bits."""
+    path = tmp_path / "a.png"
+    path.touch()
+    try:
+        os.utime(path, (0, 2**34 - 1))  # the year 2514
+    except OSError:
+        pytest.skip("this disk has no such time")
+    files = stamps([path])
+    folder = tmp_path / "table"
+    write(folder, [Entry(FORMAT, "a", files, "measured", "", (), ({"region": "all"},))])
+    with Table(folder, SETTINGS) as table:
+        assert table.status_of(files) == "measured"
+
+
+@pytest.mark.parametrize("name", [LINES, "measure.json"])
+@pytest.mark.parametrize("how", ["link", "pipe"])
+def test_a_table_writes_nowhere_else_and_waits_for_nothing(tmp_path: Path, name: str, how: str) -> None:
+    folder, victim = tmp_path / "table", tmp_path / "victim.txt"
+    write(folder, [entry(0)])
+    victim.write_bytes((folder / name).read_bytes())
+    before = victim.read_bytes()
+    (folder / name).unlink()
+    (folder / name).symlink_to(victim) if how == "link" else os.mkfifo(folder / name)
+    with pytest.raises(PolarguideError, match=name):
+        Table(folder, SETTINGS)
+    assert victim.read_bytes() == before

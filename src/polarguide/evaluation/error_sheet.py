@@ -39,7 +39,7 @@ COLUMNS = {
 
 
 class ErrorSheet:
-    """Pictures of the errors of some views, one row each, and below them the scales of the heat maps.
+    """Pictures of the errors of some views, one row each, and below each column the key to its colors.
 
     Heat maps are black at no error and bright at the end of their scale; what does not count is gray. Layers and
     picture: mean over channels of the absolute difference of shown values. Polarization: angle of the field as hue,
@@ -90,12 +90,17 @@ class ErrorSheet:
             headings["measured"] = f"AoLP x DoLP / {brightest:g}"
         keys = [key for key in COLUMNS if any(key in pictures for _, pictures in self._rows)]
         rows: list[list[Picture | None]] = [[pictures.get(key) for key in keys] for _, pictures in self._rows]
-        bars = {key: figures.scale_bar(0.0, end, MAP) for key, end in ends.items()}
+        bars = {
+            key: figures.scale_bar(0.0, end, MAP, "deg" if key == "normal" else "")
+            for key, end in ends.items()
+        }
+        bars |= dict.fromkeys(("measured", "predicted"), figures.angle_bar())
+        bars["photograph"] = figures.color_patch(NOT_COUNTED, "gray: not counted")
         sheet = contact_sheet(
             rows,
             [name for name, _ in self._rows],
             [headings[key] for key in keys],
-            footer=[bars.get(key) for key in keys],
+            footer=[bars[key] for key in keys],
         )
         figures.write_png(path, sheet)
 

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder
+from polarguide.files import make_folder, require_inside
 from polarguide.measurement.fields import FORMAT
 from polarguide.measurement.limits import NO_LIMITS, faults, read_limits
 from polarguide.measurement.options import MeasureOptions
@@ -93,6 +93,7 @@ class Line:
             self._reference = Reference.read(options.reference, self._reading)
             placed(self._regions, self._reference.size, options.reference)
         self.out = out
+        require_inside(out, out / BEYOND, out / DIFFERENCES)
         self.table = Table(out, self._settings(), overwrite=options.overwrite)
 
     def __enter__(self) -> Line:

@@ -16,12 +16,21 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO, Literal
 
 import msgspec
+from msgspec import Meta
 
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, check_out, make_folder, write_whole, writing
+from polarguide.files import (
+    atomic,
+    check_out,
+    make_folder,
+    require_file,
+    require_inside,
+    write_whole,
+    writing,
+)
 from polarguide.measurement.fields import FORMAT, KEYS
 from polarguide.measurement.region_figures import Value
 from polarguide.records import decode, read_record, shortened, to_json
@@ -29,6 +38,8 @@ from polarguide.spreadsheet import csv_lines
 from polarguide.system import only_writer
 
 LINES, CSV, SETTINGS, LOCK = "table.jsonl", "table.csv", "measure.json", ".lock"
+_LAST = 2**63 - 1
+"""Of the nanoseconds that a time may lie from 1970, 292 years; some disks have later ones."""
 Status = Literal["measured", "within", "beyond", "unread"]
 _ANEW = "Give another --out, or --overwrite to begin this table anew."
 
@@ -38,7 +49,7 @@ class FileStamp(msgspec.Struct, frozen=True):
 
     path: str
     bytes: int
-    modified: int
+    modified: Annotated[int, Meta(ge=-_LAST, le=_LAST)]
 
 
 def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
@@ -48,7 +59,9 @@ def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
         OSError: one is not there.
     """
     about = ((os.path.abspath(path), os.stat(path)) for path in paths)
-    return tuple(FileStamp(path, state.st_size, state.st_mtime_ns) for path, state in about)
+    return tuple(
+        FileStamp(path, state.st_size, min(max(state.st_mtime_ns, -_LAST), _LAST)) for path, state in about
+    )
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -154,6 +167,10 @@ class Table:
         """Make what there is whole again, or begin anew."""
         path = self.folder / SETTINGS
         lines = self.folder / LINES
+        for place in (path, lines):
+            if os.path.lexists(place):  # somebody else may have made the folder
+                require_inside(self.folder, place)
+                require_file(place, expected="a file of a table", remedy=_ANEW)
         if path.exists() and lines.exists():
             before = read_record(path, dict[str, Any], remedy=_ANEW) if not overwrite else None
             now: dict[str, Any] = json.loads(to_json(settings))
@@ -179,6 +196,9 @@ class Table:
                 if not line.endswith(b"\n"):
                     break
                 entry = decode(line, Entry, f"{path} (line {number})", remedy=_ANEW)
+                if entry.format != FORMAT:
+                    place, found = f"{path} (line {number}, format)", str(entry.format)
+                    raise PolarguideError(place, expected=str(FORMAT), found=found, remedy=_ANEW)
                 self._done[_key(entry.files)] = entry.status
                 rows.write(_csv(entry.rows()))
                 whole += len(line)

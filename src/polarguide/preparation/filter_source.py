@@ -22,10 +22,10 @@ from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
-from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.memory import require_memory, stated_size
-from polarguide.capture.view import ANGLES
-from polarguide.capture.write import rounding_of
+from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.write import EXACT, Rounding, rounding_of
+from polarguide.color import srgb_decode_array
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
@@ -112,14 +112,15 @@ class FilterSource(Source):
             "notes": notes,
         }
 
-    def _rounding(self, transfer: str, scale: float) -> int:
-        """What codes are rounded to: by the smallest step of 8-bit values, none for 16 bits."""
+    def _rounding(self, transfer: str, scale: float) -> Rounding:
+        """What codes are rounded to: by the steps of 8-bit values, which grow with sRGB's; none for 16 bits."""
         stored = read_shots(self._files[self.views[0]], self._white).pictures
         if self._settings.precision == "full" or stored.dtype != np.uint8:
-            return 1
+            return EXACT
         gains = self._settings.calibration.gains
         smallest = scale / (max(gains) if gains is not None else 1.0 / math.sqrt(1.0 - LARGEST_IMBALANCE))
-        return rounding_of(smallest * float(linear_codes(np.array([0, 1], np.uint8), transfer)[1]))
+        shown = np.arange(256) / 255
+        return rounding_of(FULL_CODE * smallest * (srgb_decode_array(shown) if transfer == "srgb" else shown))
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the four shots: validity, transfer, shifts, gains, the sense of the angles, then the turn."""

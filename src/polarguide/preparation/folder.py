@@ -11,15 +11,15 @@ import json
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.view import ANGLES
-from polarguide.capture.write import intensity_codes, picture_name, write_view
+from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.write import EXACT, intensity_codes, picture_name, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, holds_files, make_folder, read_file, require_inside, write_whole
 from polarguide.records import decode, read_record, shortened, to_json
@@ -32,6 +32,10 @@ FOLDERS = ("polar", "invalid", "masks", "sparse")
 """What is written into."""
 REMEDY = "Give another --out; nothing was written."
 _OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
+
+
+_Code = Annotated[int, msgspec.Meta(ge=0, le=FULL_CODE)]
+_Multiple = tuple[_Code, Annotated[int, msgspec.Meta(ge=1, le=FULL_CODE)]]
 
 
 class _Settings(msgspec.Struct):
@@ -52,10 +56,14 @@ class _View(msgspec.Struct):
     warp: Any
 
 
+class _Measured(msgspec.Struct):
+    rounding: Annotated[tuple[_Multiple, ...], msgspec.Meta(min_length=1)] = ((0, 1),)
+
+
 class _State(msgspec.Struct):
     request: _Request
     views: dict[str, _View] = {}
-    measured: dict[str, Any] | None = None
+    measured: _Measured | None = None
 
 
 class _Journal(msgspec.Struct):
@@ -192,7 +200,7 @@ class SceneFolder:
         mask: NDArray[np.bool_] | None = None,
     ) -> None:
         """Write the pictures of a view, then note it."""
-        codes = intensity_codes(intensities, invalid, (self.measured or {}).get("rounding", 1))
+        codes = intensity_codes(intensities, invalid, (self.measured or {}).get("rounding", EXACT))
         sizes = write_view(self.root, view, codes, invalid, mask)
         self.views[view] = {**record, "files": sizes}
         self.save()

@@ -22,7 +22,7 @@ from polarguide.capture.sensor.pattern import tiled
 from polarguide.capture.sensor.radiometry import Levels, estimate_levels, unusable_samples
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, FULL_CODE
-from polarguide.capture.write import rounding_of
+from polarguide.capture.write import EXACT, Rounding, rounding_of
 from polarguide.errors import PolarguideError
 from polarguide.preparation.mosaic_files import MosaicFiles
 from polarguide.preparation.mosaic_samples import block_intensities, gray_world, sample_blocks
@@ -170,11 +170,11 @@ class MosaicSource(Source):
             mask=None if self._dataset is None else resized_mask(self._dataset, view, (height, width)),
         )
 
-    def _rounding(self, levels: Levels, factor: float) -> int:
+    def _rounding(self, levels: Levels, factor: float) -> Rounding:
         """What codes are rounded to, with the smallest factor that a sample is multiplied by."""
         if self._settings.precision == "full" or levels.gamma != 1.0:
-            return 1
-        return rounding_of(FULL_CODE * factor / ((1 << levels.bits) - 1))
+            return EXACT
+        return rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
 
     def _require_alike(self, path: Path, values: NDArray[Any], first: tuple[Any, Any]) -> None:
         if (values.shape, values.dtype) != first:

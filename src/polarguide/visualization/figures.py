@@ -123,20 +123,39 @@ def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = 0.25) -
     return scalar_to_rgb((shown(pred_linear.detach().cpu()) - true).abs().mean(-1), 0.0, high, "inferno")
 
 
-def scale_bar(low: float, high: float, colormap: str) -> Picture:
+def scale_bar(low: float, high: float, colormap: str, unit: str = "") -> Picture:
     """The colors of ``scalar_to_rgb`` from ``low`` to ``high``, with both numbers below: uint8 RGB [44, 256, 3]."""
+    ramp = torch.linspace(low, high, 256).expand(22, -1)
+    return _bar(scalar_to_rgb(ramp, low, high, colormap), f"{low:g}", f"{high:g}{unit and ' '}{unit}")
+
+
+def angle_bar() -> Picture:
+    """The colors of ``aolp_to_rgb`` from 0 to 180 degrees, darker downwards as with less DoLP: [44, 256, 3]."""
+    angles = torch.linspace(0.0, math.pi, 256).expand(22, -1)
+    return _bar(aolp_to_rgb(angles, torch.linspace(1.0, 0.0, 22)[:, None].expand(-1, 256)), "0", "180 deg")
+
+
+def color_patch(color: int, text: str) -> Picture:
+    """A patch of a gray from 0 to 255, and below it what it means: uint8 RGB [44, 256, 3]."""
+    return _bar(np.full((22, 256, 3), color, np.uint8), text, "")
+
+
+def _bar(colors: Picture, left: str, right: str) -> Picture:
+    """Colors [22, 256, 3], and below them what stands at their two ends."""
     drawn: Picture = np.full((44, 256, 3), 255, np.uint8)
-    drawn[:22] = scalar_to_rgb(torch.linspace(low, high, 256).expand(22, -1), low, high, colormap)
-    for number, last in ((low, False), (high, True)):
-        text = f"{number:g}"
+    drawn[:22] = colors
+    for text, last in ((left, False), (right, True)):
         (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
         origin = (256 - width if last else 0, 39)
         cv2.putText(drawn, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (32, 32, 32), 1, cv2.LINE_AA)
     return drawn
 
 
-def write_png(path: str | Path, rgb8: Picture) -> None:
+def write_png(path: str | Path, rgb8: Picture, alpha8: Picture | None = None) -> None:
     """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
+
+    Args:
+        path: of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
 
     Raises:
         ValueError: not such a picture.
@@ -148,16 +167,17 @@ def write_png(path: str | Path, rgb8: Picture) -> None:
         raise PolarguideError(
             path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
         )
-    write_whole(path, png_bytes(rgb8))
+    write_whole(path, png_bytes(rgb8, alpha8))
 
 
-def png_bytes(rgb8: Picture) -> bytes:
-    """A uint8 RGB [H, W, 3] picture as a PNG file.
+def png_bytes(rgb8: Picture, alpha8: Picture | None = None) -> bytes:
+    """A uint8 RGB [H, W, 3] picture as a PNG file, with how opaque it is [H, W] where that is given.
 
     Raises:
         ValueError: it cannot be encoded.
     """
-    encoded, data = cv2.imencode(".png", rgb8[..., ::-1])
+    stored = rgb8[..., ::-1] if alpha8 is None else np.dstack((rgb8[..., ::-1], alpha8))
+    encoded, data = cv2.imencode(".png", stored)
     if not encoded:
         raise ValueError("picture: it could not be encoded as PNG")
     return data.tobytes()

@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from polarguide.capture.sensor.analyzers import (
+    FARTHEST_ANGLE,
     LEAST_DIATTENUATION,
     AnalyzerCalibration,
     Reference,
@@ -134,6 +135,12 @@ def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
         raise _damaged(path, "vectors that are not finite, or have no throughput")
     if (np.hypot(found.vectors[..., 1], found.vectors[..., 2]) < LEAST_DIATTENUATION * gain).any():
         raise _damaged(path, "vectors of pixels that hardly polarize")
+    nominal = 2 * np.radians(found.pattern.angles)
+    angles = np.arctan2(found.vectors[..., 2], found.vectors[..., 1])
+    if (
+        np.cos(angles - nominal) < np.cos(2 * FARTHEST_ANGLE)
+    ).any():  # and four alike could not be solved for light
+        raise _damaged(path, "vectors of polarizers far from the sensor's angles")
 
 
 def _damaged(path: Path, found: str) -> PolarguideError:

@@ -19,6 +19,8 @@ from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
 
+FARTHEST_ANGLE = np.radians(20.0)
+"""Of a polarizer from the angle that its position has by design."""
 LEAST_DIATTENUATION = 0.3
 """Of a pixel's polarizer; below it, its angle and the correction mean nothing. (Extinction ratio 1.9.)"""
 _AT_ONCE = 16
