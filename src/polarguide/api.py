@@ -246,7 +246,7 @@ def _refuse_with_poses(
     if given:
         more = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
         raise PolarguideError(
-            option_name(given[0]),
+            (shots or ShotOptions()).called(given[0]),
             expected="shots",
             found="a scene with poses",
             remedy=f"Leave it out: the scene has developed pictures and cameras.{more}",

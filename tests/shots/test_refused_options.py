@@ -136,12 +136,9 @@ def test_formats_of_an_earlier_call_do_not_stay(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_options_of_shots_are_refused_for_a_scene_with_poses(tmp_path: Path, given: dict[str, Any]) -> None:
     name = next(iter(given))
-    with (
-        polarguide.demo_scene() as scene,
-        pytest.raises(
-            PolarguideError, match=f"^--{name.replace('_', '-')}: expected shots, found a scene with poses"
-        ),
-    ):
+    where = r"calibration \((order|gains)\)" if name == "calibration" else f"--{name.replace('_', '-')}"
+    expected = f"^{where}: expected shots, found a scene with poses"
+    with polarguide.demo_scene() as scene, pytest.raises(PolarguideError, match=expected):
         polarguide.priors(scene, tmp_path / "x", views="v000", shots=ShotOptions(**given))
     assert not (tmp_path / "x").exists()
 
@@ -153,7 +150,7 @@ def test_noise_counts_for_the_maps_of_a_scene_with_poses(tmp_path: Path) -> None
         record = json.loads((tmp_path / "v000" / "maps.json").read_text())
         assert record["noise"]["source"] == "given"
         wrong = ShotOptions(calibration=Calibration(order=(90, 45, 0, 135)))
-        with pytest.raises(PolarguideError, match="calibration: expected shots"):
+        with pytest.raises(PolarguideError, match=r"calibration \(order\): expected shots"):
             polarguide.priors(scene, tmp_path, views="v000", shots=wrong, formats=["npy"])
 
 
@@ -166,4 +163,20 @@ def test_options_of_scenes_are_refused_for_shots(tmp_path: Path, name: str, give
     paths = write_four(tmp_path / "in", CUP)
     with pytest.raises(PolarguideError, match=f"^--{name}: expected a scene with poses, found shots"):
         polarguide.priors(paths, tmp_path / "out", **given)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "reading"),
+    [
+        ("--black-level", ShotOptions(black_level=5)),
+        ("--no-align", ShotOptions(sensor="IMX250MZR", align=False)),
+    ],
+)
+def test_options_of_a_watch_are_refused_before_it_begins(
+    tmp_path: Path, option: str, reading: ShotOptions
+) -> None:
+    (tmp_path / "in").mkdir()
+    with pytest.raises(PolarguideError, match=f"^{option}: expected"):
+        polarguide.watch_folder(tmp_path / "in", tmp_path / "out", reading=reading, should_stop=lambda: True)
     assert not (tmp_path / "out").exists()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from msgspec import Meta
@@ -111,8 +111,13 @@ class ShotOptions:
 
     def changed(self) -> list[str]:
         """Names of the options that are not as they are by default."""
-        default = ShotOptions()
-        return [f.name for f in fields(self) if getattr(self, f.name) != getattr(default, f.name)]
+        return _changed(self)
+
+    def called(self, name: str) -> str:
+        """What messages call an option; of the calibration, what it states."""
+        if name == "calibration":
+            return f"calibration ({', '.join(_changed(self.calibration))})"
+        return _OPTION_OF.get(name, option_name(name))
 
     def require_kind(self, kind: Kind, name: str) -> None:
         """Refuse options that mean nothing for a kind of shot.
@@ -130,7 +135,7 @@ class ShotOptions:
                 words = " and ".join(_KINDS[owner] for owner in owners)
                 more = " Raw mosaics need --sensor." if owners == ("mosaic",) and self.sensor is None else ""
                 raise PolarguideError(
-                    _OPTION_OF.get(option, option_name(option)),
+                    self.called(option),
                     expected=f"{words}, which it is for",
                     found=here,
                     remedy=f"Leave it out; it changes nothing there.{more}",
@@ -147,3 +152,9 @@ class ShotOptions:
         """The same as settings of ``prepare``, whose readers are used."""
         known = {f.name for f in fields(PrepareSettings)}
         return PrepareSettings(**{f.name: getattr(self, f.name) for f in fields(self) if f.name in known})
+
+
+def _changed(options: Any) -> list[str]:
+    """Names of the fields of a dataclass that are not as they are by default."""
+    default = type(options)()
+    return [f.name for f in fields(options) if getattr(options, f.name) != getattr(default, f.name)]
