@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from camera_files import write_mosaics
 from safetensors.torch import load_file
 
 import polarguide
@@ -241,3 +242,23 @@ def test_examples_run(example: Path, trained: Path, demo_scene: Path, tmp_path: 
     done = subprocess.run([sys.executable, str(example), *given], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout
+
+
+def test_measuring_is_silent_and_gives_the_outcome(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "parts").mkdir()
+    write_mosaics(tmp_path / "parts", 2, color=False, bits=12)
+    heard: list[str] = []
+    options = polarguide.MeasureOptions(roi=("left=0,0,20,48",))
+    reading = polarguide.ShotOptions(sensor="IMX250MZR", bits=12)
+    outcome = polarguide.measure(
+        [tmp_path / "parts"],
+        tmp_path / "line",
+        options,
+        reading,
+        heard=lambda entry: heard.append(entry.shot),
+    )
+    assert (outcome.counts, outcome.exit_status, heard) == ({"measured": 2}, 0, ["v000", "v001"])
+    watching = polarguide.WatchOptions(settle=0.05, idle=0.1)
+    again = polarguide.watch_folder(tmp_path / "parts", tmp_path / "line", options, reading, watching)
+    assert again.counts == {}
+    assert capfd.readouterr() == ("", "")

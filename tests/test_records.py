@@ -118,3 +118,10 @@ def test_a_file_that_no_record_needs_is_not_read(tmp_path: Path) -> None:
         file.truncate(LARGEST_RECORD + 1)
     with pytest.raises(PolarguideError, match="more than 64 MiB"):
         read_record(tmp_path / "run.json", dict[str, Any])
+
+
+def test_names_that_are_no_unicode_come_back(tmp_path: Path) -> None:
+    content = {"name": "v\udcff\udcfe", "text": "\u00e9"}
+    (tmp_path / "a.json").write_bytes(to_json(content))
+    assert read_record(tmp_path / "a.json", dict[str, str]) == content
+    assert "\u00e9".encode() in to_json({"text": "\u00e9"})

@@ -12,13 +12,18 @@ from pathlib import Path
 import pytest
 
 from polarguide import system
+from polarguide.errors import PolarguideError
 from polarguide.system import (
     StopSignals,
     exclusive_lock,
+    free_memory,
     keep_freed_memory,
     peak_memory_mib,
+    process_count,
     process_is_alive,
+    process_rank,
     sigterm_kept,
+    stop_signals,
 )
 
 
@@ -51,7 +56,7 @@ def test_a_process_is_alive_until_it_ends() -> None:
     assert not process_is_alive(process.pid)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_interrupts_before_work_and_asks_it_to_stop_after(number: signal.Signals) -> None:
     before = signal.getsignal(number)
     with StopSignals() as should_stop:
@@ -63,6 +68,32 @@ def test_a_signal_interrupts_before_work_and_asks_it_to_stop_after(number: signa
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(number) is before
+
+
+def test_a_terminal_that_goes_away_is_passed_over_where_it_is_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        assert signal.SIGHUP not in stop_signals()
+        with StopSignals() as should_stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not should_stop()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert signal.SIGHUP in stop_signals()
+
+
+@pytest.mark.parametrize(
+    ("world", "rank"),
+    [("many", "0"), ("", "0"), ("2", "first"), ("2", "2"), ("1000000000", "0"), ("-1", "0"), ("\u0662", "0")],
+)
+def test_variables_of_torchrun_that_are_none_are_named(
+    world: str, rank: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WORLD_SIZE", world)
+    monkeypatch.setenv("RANK", rank)
+    with pytest.raises(PolarguideError, match=r"WORLD_SIZE|RANK"):
+        process_count()
+    assert process_rank() in (0, 2)
 
 
 def test_a_library_that_takes_sigterm_does_not_keep_it() -> None:
@@ -115,3 +146,14 @@ def test_elsewhere_the_allocator_is_left_alone(libc: object, monkeypatch: pytest
 
     monkeypatch.setattr(system.ctypes, "CDLL", load)
     keep_freed_memory()
+
+
+def test_memory_that_holds_files_is_free(tmp_path: Path) -> None:
+    """As of a container in which much has been read."""
+    (tmp_path / "memory.max").write_text("4000000\n")
+    (tmp_path / "memory.current").write_text("3900000\n")
+    (tmp_path / "memory.stat").write_text("anon 100000\ninactive_file 3000000\nactive_file 500000\n")
+    assert free_memory(tmp_path) == 3_600_000
+    (tmp_path / "memory.max").write_text("max\n")
+    whole = free_memory(tmp_path)
+    assert whole is None or whole > 4_000_000

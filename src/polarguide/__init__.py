@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         calibrate,
         demo_scene,
         inspect,
+        measure,
         open_run,
         prepare,
         present,
@@ -23,12 +24,15 @@ if TYPE_CHECKING:
         train,
     )
     from polarguide.capture import Scene, load_scene
-    from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
+    from polarguide.capture.sensor.analyzer_file import read_analyzers
+    from polarguide.capture.sensor.analyzers import AnalyzerCalibration
     from polarguide.errors import PolarguideError, PolarguideWarning
     from polarguide.experiments.ablate import ablate
     from polarguide.experiments.compare import compare
     from polarguide.experiments.options import CompareOptions
     from polarguide.inspection.settings import InspectSettings
+    from polarguide.measurement.options import MeasureOptions, WatchOptions
+    from polarguide.measurement.watch import watch_folder
     from polarguide.options import SceneOptions, SessionOptions
     from polarguide.preparation.settings import PrepareSettings
     from polarguide.progress import Reporter
@@ -45,6 +49,7 @@ _NAMES = {
         "calibrate",
         "demo_scene",
         "inspect",
+        "measure",
         "open_run",
         "prepare",
         "present",
@@ -52,12 +57,15 @@ _NAMES = {
         "train",
     ),
     "capture": ("Scene", "load_scene"),
-    "capture.sensor.analyzers": ("AnalyzerCalibration", "read_analyzers"),
+    "capture.sensor.analyzer_file": ("read_analyzers",),
+    "capture.sensor.analyzers": ("AnalyzerCalibration",),
     "errors": ("PolarguideError", "PolarguideWarning"),
     "experiments.ablate": ("ablate",),
     "experiments.compare": ("compare",),
     "experiments.options": ("CompareOptions",),
     "inspection.settings": ("InspectSettings",),
+    "measurement.options": ("MeasureOptions", "WatchOptions"),
+    "measurement.watch": ("watch_folder",),
     "options": ("SceneOptions", "SessionOptions"),
     "preparation.settings": ("PrepareSettings",),
     "progress": ("Reporter",),
@@ -74,6 +82,7 @@ __all__ = [
     "CalibrateSettings",
     "CompareOptions",
     "InspectSettings",
+    "MeasureOptions",
     "PolarguideError",
     "PolarguideWarning",
     "PrepareSettings",
@@ -87,6 +96,7 @@ __all__ = [
     "ShotOptions",
     "SurfaceMaps",
     "TrainSettings",
+    "WatchOptions",
     "__version__",
     "ablate",
     "calibrate",
@@ -95,6 +105,7 @@ __all__ = [
     "find_shots",
     "inspect",
     "load_scene",
+    "measure",
     "open_run",
     "optics",
     "prepare",
@@ -104,6 +115,7 @@ __all__ = [
     "read_shot",
     "surface_maps",
     "train",
+    "watch_folder",
 ]
 
 

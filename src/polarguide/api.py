@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from polarguide.capture import Scene
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import evaluate
 from polarguide.evaluation.record import read_metrics
@@ -22,10 +23,12 @@ from polarguide.export import formats
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
 from polarguide.inspection.record import write_inspection
 from polarguide.inspection.settings import InspectSettings
+from polarguide.measurement.line import measure_shots
 from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOptions, VisitorOptions
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
+from polarguide.records import option_name
 from polarguide.rendering import film, pictures, relight
 from polarguide.rendering import present as presenting
 from polarguide.rendering.pictures import select_views
@@ -39,6 +42,9 @@ from polarguide.shots.write import FORMATS, WrittenShots, write_shots
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.viewer import watch
+
+_OF_MAPS = ("full_well", "read_noise", "snr")
+"""Options of shots that maps of a scene with poses depend on."""
 
 
 class Run(OpenedRun):
@@ -72,6 +78,7 @@ class Run(OpenedRun):
 
 open_run = Run.open
 calibrate = calibrate_sensor
+measure = measure_shots
 present = presenting.present
 prepare = prepare_scene
 
@@ -146,7 +153,7 @@ def priors(
         out: folder to write.
         run, views, threshold, reading: as ``write_priors`` takes them, for a scene with poses alone.
         refractive_index: of the surfaces.
-        shots, intrinsics: as ``write_shots`` takes them, for shots alone.
+        shots, intrinsics: as ``write_shots`` takes them, for shots alone; noise and ``snr`` for maps of scenes, too.
         formats: of the maps: png, exr, npy, page; None: all of them for shots, none for a scene with poses.
 
     Returns:
@@ -158,23 +165,9 @@ def priors(
     many = (
         [] if isinstance(paths, Scene) else [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     )
-    posed = isinstance(paths, Scene) or (len(many) == 1 and (Path(many[0]) / "sparse").exists())
+    posed = isinstance(paths, Scene) or (len(many) == 1 and os.path.lexists(Path(many[0]) / "sparse"))
     if not posed:
-        for name, given in (("run", run), ("threshold", threshold)):
-            if given is not None:
-                raise PolarguideError(
-                    name,
-                    expected="a scene with poses",
-                    found="shots",
-                    remedy="Leave it out, or name the scene.",
-                )
-        if reading.downscale != 1:
-            raise PolarguideError(
-                "downscale",
-                expected="1 for shots",
-                found=str(reading.downscale),
-                remedy="Use --demosaic quarter.",
-            )
+        _refuse_for_shots(run, views, threshold, reading, shots)
         return write_shots(
             many,
             out,
@@ -184,13 +177,8 @@ def priors(
             refractive_index=refractive_index,
             reporter=reporter,
         )
-    if intrinsics is not None or (shots is not None and shots.sensor is not None):
-        raise PolarguideError(
-            "sensor" if intrinsics is None else "intrinsics",
-            expected="shots",
-            found="a scene with poses",
-            remedy="Leave it out: the scene has developed pictures and cameras.",
-        )
+    _refuse_with_poses(intrinsics, shots, reading, bool(formats))
+    refuse_scene(Path(out))
     scene = paths if isinstance(paths, Scene) else read_scene(many[0], reading, reporter)
     sheet = write_priors(
         scene,
@@ -207,6 +195,62 @@ def priors(
         sets = [found for found in find_shots([scene.root], options) if found.view in chosen]
         write_shots(sets, out, options, formats=formats, refractive_index=refractive_index, reporter=reporter)
     return sheet
+
+
+def _refuse_for_shots(
+    run: OpenedRun | None,
+    views: str,
+    threshold: float | None,
+    reading: SceneOptions,
+    shots: ShotOptions | None,
+) -> None:
+    """Refuse what means something for a scene with poses alone."""
+    default = SceneOptions()
+    for name, given in (
+        ("run", run is not None),
+        ("views", views != "test"),
+        ("threshold", threshold is not None),
+        ("memory", reading.memory != default.memory),
+        ("split", reading.split != default.split),
+        (
+            "transfer",
+            reading.transfer not in (default.transfer, (shots or ShotOptions()).transfer),
+        ),
+    ):
+        if given:
+            raise PolarguideError(
+                option_name(name),
+                expected="a scene with poses",
+                found="shots",
+                remedy="Leave it out, or name the scene.",
+            )
+    if reading.downscale != 1:
+        raise PolarguideError(
+            "downscale",
+            expected="1 for shots",
+            found=str(reading.downscale),
+            remedy="Use --demosaic quarter.",
+        )
+
+
+def _refuse_with_poses(
+    intrinsics: str | None, shots: ShotOptions | None, reading: SceneOptions, maps: bool
+) -> None:
+    """Refuse what means something for shots alone; ``maps``: maps of the views are written, too."""
+    changed = [] if shots is None else shots.changed()
+    if shots is not None and shots.transfer in ("auto", reading.transfer):
+        changed = [name for name in changed if name != "transfer"]
+    given = (["intrinsics"] if intrinsics is not None else []) + [
+        name for name in changed if not (maps and name in _OF_MAPS)
+    ]
+    if given:
+        more = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
+        raise PolarguideError(
+            option_name(given[0]),
+            expected="shots",
+            found="a scene with poses",
+            remedy=f"Leave it out: the scene has developed pictures and cameras.{more}",
+        )
 
 
 def inspect(

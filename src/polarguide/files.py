@@ -125,12 +125,12 @@ def write_whole(path: Path, data: bytes) -> int:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8, completely or not at all.
+    """Write a text file in UTF-8, completely or not at all; halves of characters in it become escapes.
 
     Raises:
         PolarguideError: it cannot be written.
     """
-    write_whole(path, text.encode())
+    write_whole(path, text.encode("utf-8", "backslashreplace"))
 
 
 def make_folder(path: Path) -> None:

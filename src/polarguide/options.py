@@ -15,6 +15,7 @@ from polarguide.errors import PolarguideError
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 Transfer = Literal["linear", "srgb"]
+Split = Literal["directions", "every-8th"]
 ExportFormat = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
@@ -92,11 +93,14 @@ class SceneOptions:
         downscale: Average the pictures over boxes of this many pixels first.
         transfer: How the files encode radiance. Polarization needs linear; srgb undoes the display curve of JPEGs.
         memory: GiB that the pictures may take, as their headers state; 0 is 80 % of what is free.
+        split: Which views are held out to be scored on where the scene has no split.json, one in eight: directions
+            spreads them among the others, every-8th counts through the names.
     """
 
     downscale: int = 1
     transfer: Transfer = "linear"
     memory: float = 0.0
+    split: Split = "directions"
 
     def __post_init__(self) -> None:
         check_count("downscale", self.downscale)

@@ -31,7 +31,8 @@ REMEDY = "Correct it with polarguide present, or remove the file."
 CREDITS = ("title", "author", "license", "provenance")
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 """Meters of each unit of length that is understood."""
-MOST_METERS = 1e9
+LEAST_METERS, MOST_METERS = 1e-9, 1e9
+"""A nanometer, and eighty Earths: single precision of files that are exported ends beyond."""
 WIDEST_CROP = 100.0
 
 Vector = tuple[float, float, float]
@@ -98,7 +99,7 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     white_balance: tuple[Gain, Gain, Gain] | None = None
     up_axis: Vector | None = None
-    meters_per_unit: Annotated[float, Meta(gt=0, le=MOST_METERS)] | None = None
+    meters_per_unit: Annotated[float, Meta(ge=LEAST_METERS, le=MOST_METERS)] | None = None
     crop: Crop | None = None
     title: Text = ""
     author: Text = ""

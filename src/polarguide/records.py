@@ -123,8 +123,11 @@ def check_options(options: Any, name: Callable[[str], str] = option_name) -> Non
 
 
 def to_json(content: Any) -> bytes:
-    """A record as the text of a JSON file."""
-    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
+    """A record as the text of a JSON file; names of files that are no Unicode become escapes in it."""
+    try:
+        return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
+    except UnicodeEncodeError:
+        return (json.dumps(content, indent=1) + "\n").encode()
 
 
 def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:

@@ -8,7 +8,7 @@ import importlib
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -17,6 +17,7 @@ from polarguide.errors import PolarguideError
 
 MEBIBYTE = 1 << 20
 LAST_WORDS_SECONDS = 5.0
+MOST_PROCESSES = 65536
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 
@@ -28,8 +29,16 @@ def _posix(module: str) -> Any | None:
         return None
 
 
+def stop_signals() -> list[int]:
+    """SIGTERM; and SIGHUP, of a terminal that goes away, unless it is ignored (nohup) or there is none."""
+    found = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    return [
+        number for number in found if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGTERM
+    ]
+
+
 class StopSignals:
-    """A context in which Ctrl-C and SIGTERM ask work to stop; the object is what ``should_stop`` of a training is.
+    """A context in which Ctrl-C, SIGTERM and SIGHUP ask work to stop; the object is a training's ``should_stop``.
 
     Before it is called for the first time, and at a second Ctrl-C, they interrupt at once.
     """
@@ -38,7 +47,7 @@ class StopSignals:
         self._asked = self._works = False
 
     def __enter__(self) -> StopSignals:
-        self._old = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._old = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, *stop_signals())}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -65,13 +74,12 @@ class StopSignals:
 
 @contextlib.contextmanager
 def signals_as_interrupts() -> Iterator[None]:
-    """SIGTERM, and SIGHUP where there is one, act like Ctrl-C."""
+    """SIGTERM and SIGHUP act like Ctrl-C."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    old = {number: signal.signal(number, interrupt) for number in (getattr(signal, name) for name in names)}
+    old = {number: signal.signal(number, interrupt) for number in stop_signals()}
     try:
         yield
     finally:
@@ -103,6 +111,26 @@ def exclusive_lock(path: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.set_inheritable(file.fileno(), True)
         yield
+
+
+def hold_folder(folder: Path) -> Callable[[], None]:
+    """Lock a folder itself, without a file in it; returns what lets it go. Does nothing where folders have no locks.
+
+    Raises:
+        BlockingIOError: another process holds it.
+    """
+    fcntl = _posix("fcntl")
+    if fcntl is None:
+        return lambda: None
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise
+    except OSError:  # a disk of the network without locks
+        pass
+    return lambda: os.close(handle)
 
 
 @contextlib.contextmanager
@@ -147,15 +175,19 @@ def keep_freed_memory() -> None:
         libc.mallopt(M_MMAP_THRESHOLD, 1 << 25)  # the most that older versions take
 
 
-def free_memory() -> int | None:
-    """Bytes of memory that this process may still take, as the system and its control group say; None: they do not."""
+def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Bytes of memory that this process may still take, as the system and its control group say; None: they do not.
+
+    What a control group holds of files goes when memory is asked for, and counts as free.
+    """
     found = []
     with contextlib.suppress(OSError, ValueError, IndexError):
         lines = Path("/proc/meminfo").read_text().splitlines()
         found += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     with contextlib.suppress(OSError, ValueError):
-        group = Path("/sys/fs/cgroup")
-        found.append(int((group / "memory.max").read_text()) - int((group / "memory.current").read_text()))
+        free = int((group / "memory.max").read_text()) - int((group / "memory.current").read_text())
+        held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        found.append(free + int(held.get("inactive_file", 0)) + int(held.get("active_file", 0)))
     return max(0, min(found)) if found else None
 
 
@@ -185,10 +217,33 @@ def process_is_alive(pid: int) -> bool:
 
 
 def process_rank() -> int:
-    """The number of this process among those that torchrun started; 0 without it."""
-    return int(os.environ.get("RANK", "0"))
+    """The number of this process among those that torchrun started; 0 without it, or where it is none."""
+    text = os.environ.get("RANK", "")
+    return int(text) if _is_count(text) else 0
 
 
 def process_count() -> int:
-    """How many processes torchrun started for this training; 1 without it."""
-    return int(os.environ.get("WORLD_SIZE", "1"))
+    """How many processes torchrun started for this training; 1 without it.
+
+    Raises:
+        PolarguideError: the variables that torchrun sets hold something else.
+    """
+    counts = {name: os.environ.get(name, default) for name, default in (("WORLD_SIZE", "1"), ("RANK", "0"))}
+    for name, text in counts.items():
+        if not _is_count(text):
+            raise _no_rank(name, f"a whole number up to {MOST_PROCESSES}", repr(text))
+    world, rank = (int(text) for text in counts.values())
+    if not rank < max(1, world) <= MOST_PROCESSES:
+        raise _no_rank(
+            "RANK", f"one of up to {MOST_PROCESSES} processes, counted from 0", f"{rank} of {world}"
+        )
+    return max(1, world)
+
+
+def _is_count(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 10
+
+
+def _no_rank(name: str, expected: str, found: str) -> PolarguideError:
+    remedy = "Unset WORLD_SIZE and RANK, or start the training with torchrun."
+    return PolarguideError(name, expected=expected, found=found[:100], remedy=remedy)

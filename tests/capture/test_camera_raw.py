@@ -93,7 +93,10 @@ def test_raw_is_not_srgb(tmp_path: Path) -> None:
         (lambda path: path.write_bytes(path.read_bytes()[:-2000]), "cannot be developed"),
         (lambda path: path.write_bytes(b"hello" * 100), "cannot be developed"),
         (lambda path: path.unlink(), r"shots of view cup .*found none at 90"),
-        (lambda path: path.with_suffix(".jpg").write_bytes(b""), "one file called cup"),
+        (
+            lambda path: path.with_suffix(".jpg").write_bytes(b""),
+            "one picture of cup at 90 degrees, found cup.dng and cup.jpg",
+        ),
     ],
 )
 def test_damaged_files(tmp_path: Path, change: object, message: str) -> None:

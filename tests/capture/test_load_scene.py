@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import FrozenInstanceError
 from pathlib import Path
@@ -14,6 +15,7 @@ from heard import Heard
 from tiny_capture import NAMES, TinyCapture
 
 from polarguide.capture import load_scene
+from polarguide.capture.split import chosen_views
 from polarguide.errors import PolarguideError
 
 
@@ -58,11 +60,29 @@ def test_cameras_and_points_are_those_of_the_model(capture: TinyCapture) -> None
     assert scene.point_colors.tolist() == [[255, 0, 128], [1, 2, 3], [4, 5, 6], [10, 20, 30]]
 
 
-def test_every_eighth_view_is_held_out_by_default(capture: TinyCapture) -> None:
-    scene = load_scene(capture.root)
+def test_every_eighth_view_is_held_out_where_that_is_asked_for(capture: TinyCapture) -> None:
+    scene = load_scene(capture.root, split="every-8th")
     assert scene.test_names == ("v000", "v008")
     assert [view.name for view in scene.test_views] == ["v000", "v008"]
     assert [view.name for view in scene.train_views] == list(NAMES[1:8])
+
+
+def test_one_view_in_eight_is_held_out_by_its_direction_by_default(capture: TinyCapture) -> None:
+    scene = load_scene(capture.root)
+    cameras = {view.name: view.camera for view in scene.views}
+    assert scene.test_names == chosen_views(cameras, "directions")
+    assert len(scene.test_names) == 2
+
+
+def test_test_views_far_from_training_are_a_warning(capture: TinyCapture) -> None:
+    capture.write_json("split.json", {"test": list(NAMES[:6])})
+    (warning,) = load_scene(capture.root).warnings
+    assert re.search(r"\d of 6 test views are far from every training view \(v000, .*split\.json", warning)
+
+
+def test_a_split_that_there_is_not_is_refused(capture: TinyCapture) -> None:
+    with pytest.raises(PolarguideError, match="split: expected one of directions, every-8th"):
+        load_scene(capture.root, split="odd")  # type: ignore[arg-type]
 
 
 def test_split_file_overrides_the_default(capture: TinyCapture) -> None:
@@ -71,7 +91,7 @@ def test_split_file_overrides_the_default(capture: TinyCapture) -> None:
 
 
 def test_selected_views_keep_the_split_of_the_whole_capture(capture: TinyCapture) -> None:
-    scene = load_scene(capture.root, views=["v008", "v003", "v003"])
+    scene = load_scene(capture.root, views=["v008", "v003", "v003"], split="every-8th")
     assert [view.name for view in scene.views] == ["v003", "v008"]
     assert scene.test_names == ("v008",)
     assert scene.warnings == ()

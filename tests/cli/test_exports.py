@@ -159,6 +159,8 @@ def test_wrong_flags_are_refused(refused, trained: Path, tmp_path: Path) -> None
     assert "Give orbit, spiral, interpolate" in refused("render", trained, "--path", "loop")
     assert "panorama" in refused("render", trained, "--environment", tmp_path / "none.exr")
     assert "--frames" in refused("render", trained, "--path", "orbit", "--frames", 0)
+    assert "--transparent" in refused("render", trained, "--transparent", "--format", "npy")
+    assert "--transparent" in refused("render", trained, "--transparent", "--path", "orbit")
     assert not list(tmp_path.iterdir())
 
 

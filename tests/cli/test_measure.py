@@ -13,6 +13,8 @@ from camera_files import write_mosaics
 
 from polarguide.cli.app import run
 from polarguide.measurement.pictures import diverging
+from polarguide.polarizer import ANGLES
+from tests.shots.test_read import write_four
 
 SENSOR = ("--sensor", "IMX250MZR", "--bits", "12", "--threads", "1")
 
@@ -116,6 +118,7 @@ def test_colors_of_differences() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (("--roi", f"1,2,3,{'9' * 5000}"), "--roi: expected x,y,width,height"),
         (("--roi", "1,2,3"), "--roi: expected x,y,width,height"),
         (("--roi", "a=0,0,1,1", "--roi", "a=0,0,2,2"), "a twice"),
         (("--roi", "60,40,10,10"), "the region roi1 within 64x48 pixels"),
@@ -124,7 +127,7 @@ def test_colors_of_differences() -> None:
         (("--reference", "none.png"), "none.png: expected a file or folder of shots"),
         (
             ("--dark-frame", "none.png"),
-            "none.png: expected a readable file, found nothing. Check --dark-frame.",
+            "none.png: expected a dark frame, found nothing. Check --dark-frame.",
         ),
         (("--watch", "."), "--watch: expected shots to measure, or a folder to watch"),
         (("--settle", "-1"), "--settle"),
@@ -144,3 +147,50 @@ def test_nothing_to_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "found neither" in capsys.readouterr().err
     assert measure("--watch", tmp_path / "none", "--out", tmp_path / "out") == 2
     assert "expected a folder to watch" in capsys.readouterr().err
+
+
+def test_ambiguous_and_incomplete_shots_are_lines_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts, out = tmp_path / "parts", tmp_path / "out"
+    for name in ("cup", "jar", "lid"):
+        write_four(parts, tuple(f"{name}_{angle}.png" for angle in ANGLES))
+    (parts / "cup_45.tif").write_bytes((parts / "cup_45.png").read_bytes())
+    (parts / "jar_135.png").rename(parts / "overview.png")
+    assert run(["measure", str(parts), "--out", str(out), "--transfer", "linear"]) == 2
+    printed = capsys.readouterr()
+    said = printed.err.splitlines()
+    assert len(said) == 3
+    assert "one picture of cup at 45 degrees, found cup_45.png and cup_45.tif" in said[0]
+    assert "shots of view jar at 0, 45, 90 and 135 degrees, found none at 135" in said[1]
+    assert f"{parts / 'overview.png'}: expected raw mosaics with --sensor" in said[2]
+    assert "shots: 1 measured, 3 unread" in printed.out
+    rows = {row["shot"]: row for row in rows_of(out)}
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "cup": "unread", "jar": "unread", "lid": "measured", "overview.png": "unread",
+    }  # fmt: skip
+    assert rows["cup"]["why"] == said[0].removeprefix("error: ")
+    assert "cup_45.tif" in rows["cup"]["files"]
+    (parts / "overview.png").rename(parts / "jar_135.png")
+    (parts / "cup_45.tif").unlink()
+    run(["measure", str(parts), "--out", str(out), "--transfer", "linear"])
+    assert {row["shot"] for row in rows_of(out) if row["status"] == "measured"} == {"cup", "jar", "lid"}
+
+
+def test_a_watch_says_at_its_end_what_never_came(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = tmp_path / "parts"
+    write_four(parts, tuple(f"{angle}/cup.png" for angle in ANGLES))
+    (parts / "90").rename(tmp_path / "90")
+    command = ["measure", "--watch", str(parts), "--out", str(tmp_path / "out"), "--transfer", "linear"]
+    command += ["--settle", "0.05", "--patience", "0.1", "--idle", "0.3"]
+    assert run(command) == 2
+    assert f"error: {parts}: expected four folders" in capsys.readouterr().err
+    (parts / "90").mkdir()
+    assert run(command) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {parts}: expected complete shots, found 1 that are not")
+    assert "(cup)" in line
+    (parts / "90").rmdir()
+    (tmp_path / "90").rename(parts / "90")
+    assert run(command) == 0
+    assert capsys.readouterr().err == ""

@@ -63,3 +63,17 @@ def test_one_of_a_folder_that_cannot_be_read(tmp_path: Path, capsys: pytest.Capt
     assert "expected 2 shots, found 1 that cannot be read (b)" in found.err
     assert "b.png: expected a complete PNG" in found.out
     assert (tmp_path / "out" / "a" / "DoLP.npy").is_file()
+
+
+def test_a_folder_with_ambiguous_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_four(tmp_path / "in", CUP)
+    write_four(tmp_path / "in", tuple(name.replace("cup", "jar") for name in CUP))
+    (tmp_path / "in" / "cup_45.tif").write_bytes((tmp_path / "in" / "cup_45.png").read_bytes())
+    assert run(["priors", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--formats", "npy"]) == 2
+    printed = capsys.readouterr()
+    assert "one picture of cup at 45 degrees, found cup_45.png and cup_45.tif" in " ".join(
+        printed.out.split()
+    )
+    assert "expected 2 shots, found 1 that cannot be read (cup)" in printed.err
+    assert (tmp_path / "out" / "jar" / "DoLP.npy").is_file()
+    assert not (tmp_path / "out" / "cup").exists()

@@ -11,11 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from plyfile import PlyData
 from safetensors.torch import load_file
 
 import polarguide
 from polarguide.cli.app import run
+from polarguide.color import srgb_decode
 from polarguide.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, LOG, PLY
 from polarguide.training.trainer import StepReport, Trainer
@@ -123,6 +125,24 @@ def test_render_of_chosen_views_and_layers(trained: Path, tmp_path: Path) -> Non
     assert run(["render", str(trained), *arguments]) == 0
     names = {f"{view}_{layer}.png" for view in ("v003", "v071") for layer in ("alpha", "final")}
     assert {path.name for path in out.iterdir()} == names | {"contact_sheet.png"}
+
+
+def test_transparent_pictures_over_black_are_the_opaque_ones(trained: Path, tmp_path: Path) -> None:
+    """Read by OpenCV: colors are not darkened by what is not there, and alpha brings the darkness back."""
+    arguments = ["--views", "v000", "--layers", "final,normal", "--threads", "1", "--out"]
+    for name, flags in (("opaque", []), ("clear", ["--transparent"])):
+        assert run(["render", str(trained), *arguments, str(tmp_path / name), *flags]) == 0
+    clear = cv2.imread(str(tmp_path / "clear" / "v000_final.png"), cv2.IMREAD_UNCHANGED)
+    assert clear.shape == (*SIZE, 4)
+    rendered = polarguide.open_run(trained).render("v000", ["alpha"])["alpha"].numpy()
+    np.testing.assert_allclose(clear[..., 3] / 255, rendered, atol=0.51 / 255)
+    seen = clear[..., 3] > 128
+    assert seen.any()
+    linear = srgb_decode(torch.from_numpy(clear[..., :3] / 255)).numpy() * clear[..., 3:] / 255
+    opaque = srgb_decode(torch.from_numpy(picture(tmp_path / "opaque" / "v000_final.png") / 255)).numpy()
+    kept = seen & (clear[..., :3] < 255).all(axis=-1)
+    np.testing.assert_allclose(linear[kept], opaque[kept], atol=0.02)
+    assert cv2.imread(str(tmp_path / "clear" / "v000_normal.png"), cv2.IMREAD_UNCHANGED).shape == (*SIZE, 4)
 
 
 @pytest.mark.parametrize("kind", ["npy", "exr"])

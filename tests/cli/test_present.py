@@ -135,7 +135,7 @@ def demo_scene_copy(scene: Path, beside: Path) -> Path:
         (["--white-balance", "white"], "--white-balance: expected none, gray"),
         (["--up-axis", "up"], "--up-axis: expected none, an axis"),
         (["--up-axis", "0,0,0"], "(up_axis): expected a direction"),
-        (["--meters-per-unit", "-1"], "(meters_per_unit): expected above 0"),
+        (["--meters-per-unit", "-1"], "(meters_per_unit): expected 1e-09"),
         (["--meters-per-unit", "much"], "--meters-per-unit: expected a number above 0"),
         (["--crop", "1,2,3"], "--crop: expected none, or left"),
         (["--crop", "5,1,0,1,0,1"], "(crop): expected a low side less than"),

@@ -108,3 +108,19 @@ def test_files(tmp_path: Path) -> None:
     }
     assert "mean" in (tmp_path / "all" / "results.md").read_text()
     assert "Pictures are in the reports of the parts." in (tmp_path / "all" / "report.html").read_text()
+
+
+def test_a_part_is_not_written_over_by_the_whole(tmp_path: Path) -> None:
+    for name, scene in zip("ab", "xy", strict=True):
+        (tmp_path / name).mkdir()
+        write_results(tmp_path / name / "results.json", _part(scene=scene))
+    before = (tmp_path / "b/results.json").read_bytes()
+    with pytest.raises(PolarguideError, match="would be written over"):
+        join_tables([tmp_path / "a", tmp_path / "b"], tmp_path / "b")
+    assert (tmp_path / "b/results.json").read_bytes() == before
+
+
+def test_half_a_character_in_a_name_is_written_as_its_escape(tmp_path: Path) -> None:
+    write_results(tmp_path / "results.json", results([run("s\ud800", "a", 0, psnr=20.0)]))
+    join_tables([tmp_path / "results.json"], tmp_path / "new")
+    assert "\\ud800" in (tmp_path / "new/results.md").read_text()

@@ -82,7 +82,7 @@ def test_what_polarization_buys_by_object_is_paired_by_seed() -> None:
 
 def test_one_seed_says_nothing_of_noise_by_object() -> None:
     runs = [seen("x", "r", 0, ball=ball(psnr=33.0)), seen("x", FREE, 0, ball=ball(psnr=30.0))]
-    assert rows(object_section(results(runs))) == {("x", "ball", "metal"): ["*33.00", "30.00", "+3.00"]}
+    assert rows(object_section(results(runs))) == {("x", "ball", "metal"): ["*33.00", "30.00", "+3.00?"]}
 
 
 def test_without_objects_there_are_no_tables() -> None:

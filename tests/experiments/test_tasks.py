@@ -9,16 +9,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
+import torch
 
+from polarguide.capture import Scene
 from polarguide.evaluation.evaluate import evaluate
 from polarguide.experiments import compare as comparing
-from polarguide.experiments.collect import BESIDE_OTHERS, _black_share, collect, write_tables
+from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
 from polarguide.experiments.jobs import Job
 from polarguide.experiments.options import CompareOptions
-from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
+from polarguide.experiments.plan import (
+    Comparison,
+    PlannedRun,
+    SceneEntry,
+    black_share,
+    plan_runs,
+    scene_entries,
+)
 from polarguide.experiments.worker import Scoring, Training
 from polarguide.options import ComputeOptions, SceneOptions
 from polarguide.progress import Reporter
@@ -120,14 +127,13 @@ def test_objects_materials_and_black_pixels_are_collected(planned: Planned, trai
     ]  # fmt: skip
 
 
-def test_black_pixels_are_counted_where_there_is_a_picture(tmp_path: Path) -> None:
-    picture = np.zeros((4, 5, 3), np.uint16)
-    picture[1, 2] = (0, 200, 0)  # one pixel is not black
-    (tmp_path / "polar").mkdir()
-    cv2.imwrite(str(tmp_path / "polar" / "v0_000.png"), picture)
-    entry = SceneEntry(tmp_path, "x", "digest", 2, ("v0",))
-    assert _black_share(entry) == pytest.approx(19 / 20)
-    assert _black_share(dataclasses.replace(entry, test_views=("v1",))) is None
+def test_black_pixels_are_counted(tiny_scene: Scene) -> None:
+    view = tiny_scene.views[0]
+    codes = torch.zeros_like(view.codes)
+    codes[0, 1, 2, 1] = 200  # one pixel is not black
+    height, width = codes.shape[1:3]
+    assert black_share(dataclasses.replace(view, codes=codes)) == pytest.approx(1 - 1 / (height * width))
+    assert black_share(view) == 0
 
 
 class Warnings(Reporter):

@@ -65,6 +65,7 @@ def results(
             "threads": 1,
             "jobs": 1,
             "against": against,
+            "background": "auto",
         },
         scenes=[
             {

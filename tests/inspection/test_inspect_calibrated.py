@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from camera_files import write_model
 from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.sensor.analyzers import write_analyzers
+from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.errors import PolarguideError
 from polarguide.inspection.analyzers import analyzer_check, corrected
 from polarguide.inspection.capture import read_capture
@@ -111,3 +112,31 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     turned = scene(tmp_path / "turned", replace(PLAIN, calibration=Calibration(zero=10.0)))
     with pytest.raises(PolarguideError, match="a scene whose zero was turned"):
         corrected(read_capture(turned), tmp_path / "turned" / "camera.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"geometry": {"step": 0}}, "a step of 0"),
+        ({"geometry": {"size": [2, 2]}}, "a size that its pictures have not"),
+        ({"warp": {"model": "NOPE", "parameters": []}}, 'a camera "NOPE"'),
+        ({"warp": {"model": "PINHOLE", "parameters": [1.0]}}, "with 1 parameters"),
+    ],
+)
+def test_a_record_of_prepare_that_was_changed_is_named(tmp_path: Path, change: dict, words: str) -> None:
+    root = scene(tmp_path, PLAIN)
+    record = json.loads((root / "scene.json").read_text())
+    for view in record["prepare"]["views"].values():
+        for key, values in change.items():
+            view[key] = {**(view[key] or {}), **values}
+    (root / "scene.json").write_text(json.dumps(record))
+    with pytest.raises(PolarguideError, match=r"scene\.json.*" + words):
+        corrected(read_capture(root), tmp_path / "camera.safetensors")
+
+
+def test_gains_that_are_none_are_refused(tmp_path: Path) -> None:
+    root = scene(tmp_path, PLAIN)
+    record = json.loads((root / "scene.json").read_text())
+    (root / "scene.json").write_text(json.dumps({**record, "gains": [0, 1, 1, 1]}))
+    with pytest.raises(PolarguideError, match=r"scene\.json.*gains"):
+        corrected(read_capture(root), tmp_path / "camera.safetensors")

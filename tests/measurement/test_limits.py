@@ -21,7 +21,7 @@ def test_regions_with_and_without_names() -> None:
 
 @pytest.mark.parametrize(
     "text", ["", "1,2,3", "1,2,3,4,5", "a=1,2,3", "1,2,3,x", "=1,2,3,4", "a=1,2,0,4", "-1,2,3,4", "a\nb=1,2,3,4",
-             "1.5,2,3,4", "1,2,3,9999999999"],
+             "1.5,2,3,4", "1,2,3,9999999999", f"{'9' * 5000},0,1,1", "٩,0,1,1"],
 )  # fmt: skip
 def test_regions_that_are_none(text: str) -> None:
     with pytest.raises(PolarguideError, match=r"^--roi: expected "):

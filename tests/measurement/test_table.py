@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from polarguide.errors import PolarguideError
 from polarguide.measurement.fields import FORMAT, KEYS
-from polarguide.measurement.table import CSV, LINES, Entry, FileStamp, Table
+from polarguide.measurement.line import measure_shots
+from polarguide.measurement.options import MeasureOptions
+from polarguide.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
+from polarguide.shots import ShotOptions
 
 SETTINGS = {"threshold": 0.05}
 
@@ -95,6 +101,16 @@ def test_one_table_has_one_set_of_options(tmp_path: Path) -> None:
     assert (tmp_path / LINES).read_bytes() == b""
 
 
+def test_which_of_many_options_is_another_is_told(tmp_path: Path) -> None:
+    settings = {"reading": {"order": (0, 45), "bits": 12, **{f"o{k}": 1 for k in range(99)}}}
+    with Table(tmp_path, settings) as table:
+        table.add(entry(0))
+    Table(tmp_path, settings).close()
+    settings["reading"]["o98"] = 2
+    with pytest.raises(PolarguideError, match=r"\(reading.o98\): expected 1, found 2"):
+        Table(tmp_path, settings)
+
+
 def test_a_table_of_nothing_but_failures_is_begun_anew(tmp_path: Path) -> None:
     write(tmp_path, [entry(0, status="unread")])
     Table(tmp_path, {"threshold": 0.1}).close()
@@ -117,3 +133,91 @@ def test_names_are_no_formulas_and_need_not_be_unicode(tmp_path: Path) -> None:
     assert shots == ["=1+10", "a\udcff1", 'b,"c\nd2']
     write(tmp_path, [entry(0, "=1+1"), entry(1, "a\udcff"), entry(2, 'b,"c\nd')])
     assert (tmp_path / LINES).read_bytes().count(b"\n") == 3
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads the memory as Linux states it")
+def test_two_hundred_shots_take_no_more_memory_than_twenty(tmp_path: Path, reading: ShotOptions) -> None:
+    """The maps of one of these shots take 2 MB."""
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    rng = np.random.default_rng(0)
+    cv2.imwrite(str(parts / "s000.png"), rng.integers(200, 3000, (144, 192)).astype(np.uint16))
+    for number in range(1, 200):
+        os.link(parts / "s000.png", parts / f"s{number:03d}.png")
+    taken: list[int] = []
+
+    def heard(_: Entry) -> None:
+        taken.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
+
+    assert measure_shots([parts], tmp_path / "out", reading=reading, heard=heard).counts == {"measured": 200}
+    assert max(taken[20:]) - max(taken[:20]) < 30e6
+
+
+@pytest.mark.parametrize(
+    ("line", "where"),
+    [({"format": FORMAT + 1}, "format"), ({"files": [{"path": "a", "bytes": 1, "modified": 10**30}]}, "modified"),
+     ({"files": [{"path": "a", "bytes": 1, "modified": -(10**20)}]}, "modified")],
+)  # fmt: skip
+def test_a_line_that_this_version_does_not_write_is_named(tmp_path: Path, line: dict, where: str) -> None:
+    write(tmp_path, [entry(0)])
+    written = json.loads((tmp_path / LINES).read_text())
+    (tmp_path / LINES).write_text(json.dumps({**written, **line}) + "\n")
+    with pytest.raises(PolarguideError, match=where):
+        Table(tmp_path, SETTINGS)
+
+
+def test_a_time_of_no_date_is_still_a_line(tmp_path: Path) -> None:
+    """Some disks have times of any 64 bits."""
+    path = tmp_path / "a.png"
+    path.touch()
+    try:
+        os.utime(path, (0, 2**34 - 1))  # the year 2514
+    except OSError:
+        pytest.skip("this disk has no such time")
+    files = stamps([path])
+    folder = tmp_path / "table"
+    write(folder, [Entry(FORMAT, "a", files, "measured", "", (), ({"region": "all"},))])
+    with Table(folder, SETTINGS) as table:
+        assert table.status_of(files) == "measured"
+
+
+@pytest.mark.parametrize("name", [LINES, "measure.json"])
+@pytest.mark.parametrize("how", ["link", "pipe"])
+def test_a_table_writes_nowhere_else_and_waits_for_nothing(tmp_path: Path, name: str, how: str) -> None:
+    folder, victim = tmp_path / "table", tmp_path / "victim.txt"
+    write(folder, [entry(0)])
+    victim.write_bytes((folder / name).read_bytes())
+    before = victim.read_bytes()
+    (folder / name).unlink()
+    (folder / name).symlink_to(victim) if how == "link" else os.mkfifo(folder / name)
+    with pytest.raises(PolarguideError, match=name):
+        Table(folder, SETTINGS)
+    assert victim.read_bytes() == before
+
+
+def test_pictures_of_shots_of_one_name_do_not_replace_each_other(
+    tmp_path: Path, reading: ShotOptions
+) -> None:
+    rng = np.random.default_rng(0)
+    limits = tmp_path / "limits.json"
+    limits.write_text('{"limits": {"s0_mean": {"max": 0.001}}}')
+    out = tmp_path / "out"
+
+    def measured(day: str, name: str) -> dict:
+        (tmp_path / day).mkdir(exist_ok=True)
+        path = tmp_path / day / f"{name}.png"
+        cv2.imwrite(str(path), rng.integers(200, 3000, (48, 64)).astype(np.uint16))
+        options = MeasureOptions(limits=limits, reference=tmp_path / "golden.png")
+        assert measure_shots([path], out, options, reading).counts == {"beyond": 1}
+        return json.loads((out / LINES).read_bytes().splitlines()[-1])
+
+    cv2.imwrite(str(tmp_path / "golden.png"), rng.integers(200, 3000, (48, 64)).astype(np.uint16))
+    assert measured("monday", "part1")["picture"] == "part1"
+    before = {path: path.read_bytes() for path in out.glob("*/part1.png")}
+    assert len(before) == 2
+    assert measured("tuesday", "part1")["picture"] == "part1-2"
+    assert measured("tuesday", "part1")["picture"] == "part1-3"  # written anew
+    assert measured("tuesday", "part1-2")["picture"] == "part1-2-2"
+    assert measured("tuesday", "PART1")["picture"] == "PART1-4"
+    assert {path: path.read_bytes() for path in before} == before
+    assert len(list((out / "beyond").iterdir())) == len(list((out / "differences").iterdir())) == 5

@@ -18,8 +18,10 @@ from polarguide.measurement.line import measure_shots
 from polarguide.measurement.options import MeasureOptions, WatchOptions
 from polarguide.measurement.table import CSV, LINES
 from polarguide.measurement.watch import watch_folder
+from polarguide.polarizer import ANGLES
 from polarguide.progress import Reporter
 from polarguide.shots import ShotOptions
+from tests.shots.test_read import PLAIN, write_four
 
 QUICK = WatchOptions(settle=0.1, patience=0.4, idle=0.2)
 
@@ -148,6 +150,50 @@ def test_of_four_files_the_last_is_waited_for(tmp_path: Path) -> None:
     assert heard[0].startswith("cup: still no picture at")
     shutil.copy(files[3], flat[3])
     assert watch_folder(parts, tmp_path / "out", watching=watching).counts == {"measured": 1}
+
+
+def test_what_is_ambiguous_gets_a_line_when_nothing_has_mended_it(tmp_path: Path) -> None:
+    parts = tmp_path / "in"
+    for name in ("cup", "jar"):
+        write_four(parts, tuple(f"{name}_{angle}.png" for angle in ANGLES))
+    shutil.copy(parts / "cup_0.png", parts / "cup_000.png")
+    shutil.copy(parts / "cup_0.png", parts / "photo.png")
+    patient = WatchOptions(settle=0.1, patience=30, idle=0.3)
+    first = watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=patient)
+    assert first.counts == {"measured": 1}
+    assert first.waiting == ("cup", "photo.png")
+    assert first.exit_status == 2
+    watching = WatchOptions(settle=0.1, patience=0.3, idle=1)
+    done = watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching)
+    assert done.counts == {"unread": 2}
+    assert done.exit_status == 2
+    lines = [json.loads(line) for line in (tmp_path / "out" / LINES).read_bytes().splitlines()]
+    why = {line["shot"]: line["why"] for line in lines}
+    assert "one picture of cup at 0 degrees, found cup_0.png and cup_000.png" in why["cup"]
+    assert "no angle in its name" in why["photo.png"]
+    (parts / "cup_000.png").unlink()
+    (parts / "photo.png").unlink()
+    assert watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching).counts == {"measured": 1}
+    assert watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching).counts == {}
+
+
+def test_a_folder_of_an_angle_that_never_comes_is_told(tmp_path: Path) -> None:
+    parts = tmp_path / "in"
+    write_four(parts, tuple(f"{angle}/cup.png" for angle in ANGLES))
+    (parts / "135").rename(tmp_path / "135")
+    watching = WatchOptions(settle=0.1, patience=0.2, idle=0.4)
+    done = watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching)
+    assert "four folders, for 0, 45, 90 and 135 degrees, found none for 135" in done.trouble
+    assert done.exit_status == 2
+    (tmp_path / "135").rename(parts / "135")
+    done = watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching)
+    assert (done.counts, done.trouble, done.exit_status) == ({"measured": 1}, "", 0)
+
+
+def test_an_empty_folder_is_no_fault(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    done = watch_folder(tmp_path / "in", tmp_path / "out", reading=PLAIN, watching=QUICK)
+    assert (done.counts, done.exit_status) == ({}, 0)
 
 
 def test_the_reference_and_the_dark_frame_are_not_measured(

@@ -12,7 +12,7 @@ from camera_files import read_invalid, read_polar
 from made_sensor import MadeSensor, made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.sensor.analyzers import write_analyzers
+from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import stokes_of_four
 from polarguide.preparation.prepare import prepare_scene

@@ -23,6 +23,8 @@ from polarguide.errors import PolarguideError
 from polarguide.preparation import folder as folder_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
+from polarguide.progress import Reporter
+from polarguide.system import hold_folder
 
 MOSAIC = PrepareSettings(sensor="IMX250MYR", poses="none")
 FILTER = PrepareSettings(poses="none", align=False)
@@ -140,7 +142,7 @@ SHOTS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
     "missing folder": (lambda d: shutil.rmtree(d / "135"), FILTER, "none for 135 degrees"),
     "two folders for an angle": (lambda d: (d / "I-45").mkdir(), FILTER, "one folder for 45 degrees"),
     "duplicate shot": (
-        lambda d: shutil.copy(d / "0" / "a.png", d / "0" / "a.tif"), FILTER, "one file called a"
+        lambda d: shutil.copy(d / "0" / "a.png", d / "0" / "a.tif"), FILTER, "picture of a at 0 degrees, .*a.tif"
     ),
     "truncated": (lambda d: cut(d / "45" / "b.png", 300), FILTER, "b.png: .*cut short"),
     "mixed sizes": (
@@ -405,3 +407,30 @@ def test_no_link_in_an_unfinished_scene_is_written_through(tmp_path: Path, place
     with pytest.raises(PolarguideError, match=f"{re.escape(place)}: expected a place in .*found a link to "):
         prepare_scene(source, out, MOSAIC)
     assert not any(elsewhere.iterdir())
+
+
+def test_one_preparation_at_a_time_writes_a_folder(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "raw", 3)
+    settings = PrepareSettings(sensor="IMX250MYR", bits=16, poses="none")
+    (tmp_path / "out").mkdir()
+    let_go = hold_folder(tmp_path / "out")
+    with pytest.raises(PolarguideError, match="another polarguide prepare at work"):
+        prepare_scene(tmp_path / "raw", tmp_path / "out", settings)
+    assert list((tmp_path / "out").iterdir()) == []
+    let_go()
+    assert prepare_scene(tmp_path / "raw", tmp_path / "out", settings).new
+
+
+def test_four_copies_of_one_shot_are_warned_of(tmp_path: Path) -> None:
+    said: list[str] = []
+
+    class Heard(Reporter):
+        def warn(self, text: str) -> None:
+            said.append(text)
+
+    light = behind(smooth_light())
+    for view, values in (("v000", light), ("v001", light[[0, 0, 0, 0]])):
+        write_shots(tmp_path / "raw", view, values)
+    settings = PrepareSettings(poses="none", align=False, transfer="linear")
+    prepare_scene(tmp_path / "raw", tmp_path / "out", settings, Heard())
+    assert said == ["v001: its four pictures are the same, as copies of one are."]

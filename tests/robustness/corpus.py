@@ -17,6 +17,7 @@ from pathlib import Path
 import spoil
 from base import EVAL, MOSAICS, READ, RESUME, SHOTS, TRAIN
 from corpus_more import more_cases
+from corpus_shots import shot_cases
 from forked import Case
 from options import option_cases
 
@@ -37,6 +38,7 @@ def corpus(first_seed: int = 0, times: int = 1) -> Iterator[Case]:
     yield from option_cases()
     yield from disk_cases()
     yield from more_cases(every=times > 1)
+    yield from shot_cases()
 
 
 def case(

@@ -1,4 +1,4 @@
-"""Cases that are no random choice, with the words that each has to end with: what an audit found, and stays mended."""
+"""Cases that are no random choice, with the words that each has to end with: what was found once, and stays mended."""
 
 from __future__ import annotations
 

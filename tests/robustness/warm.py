@@ -16,6 +16,7 @@ sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "hel
 
 SHELL = 150  # Gaussians far away, of a run that is spoiled: the fewer, the cheaper is every case
 IMPORTED = (
+    "encodings.cp437",  # of zip archives; a child without rights could not import it
     "networkx",
     "pycolmap",
     "scipy.spatial",

@@ -202,7 +202,9 @@ class TestWrong:
     def test_wrong_depth(self, tmp_path: Path) -> None:
         write_mosaic(tmp_path / "a.png")
         self.fails(
-            "values below 256 for 8 bits", [tmp_path / "a.png"], ShotOptions(sensor="IMX250MZR", bits=8)
+            r"a.png \(--bits\): expected values below 256 for 8 bits",
+            [tmp_path / "a.png"],
+            ShotOptions(sensor="IMX250MZR", bits=8),
         )
 
     def test_wrong_size(self, tmp_path: Path) -> None:

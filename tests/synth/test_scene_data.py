@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from polarguide.errors import PolarguideError
+from polarguide.synth.bounds import require_light, require_solid
 from polarguide.synth.cameras import place_cameras
 from polarguide.synth.environment import ENVIRONMENTS, directions, make_environment
 from polarguide.synth.mesh import Mesh, write_ply
@@ -226,3 +227,38 @@ def test_ply_files_hold_the_mesh(tmp_path: Path) -> None:
     assert len(data["vertex"]) == len(mesh.points)
     assert (np.stack(list(data["face"]["vertex_indices"])) == mesh.faces).all()
     assert isinstance(mesh, Mesh)
+
+
+@pytest.mark.parametrize("name", ["../../outside/x", "/tmp/x", "a\\b", "a\n", "", ".x", "x" * 101, "con:"])
+def test_a_thing_is_called_as_a_file_can_be(name: str) -> None:
+    with pytest.raises(PolarguideError, match=r"things\[0\]\.name"):
+        parsed(things=[{"name": name, "shape": {"type": "sphere"}}])
+
+
+@pytest.mark.parametrize(
+    ("changes", "where"),
+    [({"camera": {"rings": [{"radius": 3, "height": 1}], "views": 10**9}}, "views"),
+     ({"camera": {"rings": [{"radius": 0, "height": 1}]}}, "radius"),
+     ({"camera": {"rings": [{"radius": "far", "height": 1}]}}, "radius"),
+     ({"camera": {"rings": [{"radius": 3, "height": 1e300}]}}, "height"),
+     ({"camera": {"rings": [{"radius": 3, "height": 1, "share": 0}]}}, "rings"),
+     ({"depth": 10**9}, "depth"), ({"exposure": 0}, "exposure"),
+     ({"things": [{"name": "a", "shape": {"type": "sphere"}, "scale": 0}]}, "scale"),
+     ({"things": [{"name": "a", "shape": {"type": "sphere", "radius": 1e300}}]}, "shape.radius"),
+     ({"things": [{"name": "a", "shape": {"type": "sphere", "detail": 10**6}}]}, "shape.detail"),
+     ({"things": [{"name": "a", "shape": {"type": "tube", "path": [[0, 0, 0]] * 2000}}]}, "shape.path"),
+     ({"environment": {"type": "uniform", "radiance": [1e30, 1, 1]}}, "environment")],
+)  # fmt: skip
+def test_numbers_out_of_all_bounds_are_named(changes: dict[str, object], where: str) -> None:
+    with pytest.raises(PolarguideError) as refused:
+        parsed(**changes)
+    assert where in str(refused.value)
+
+
+def test_light_that_is_none_and_objects_without_an_extent_are_named() -> None:
+    for wrong in (-np.ones((2, 4, 3)), np.full((2, 4, 3), np.nan), np.ones((2, 4))):
+        with pytest.raises(PolarguideError, match="finite radiance"):
+            require_light(wrong, "test")
+    for points in (np.zeros((0, 3)), np.ones((5, 3)), np.full((5, 3), np.inf)):
+        with pytest.raises(PolarguideError, match="with an extent"):
+            require_solid(points, "test")

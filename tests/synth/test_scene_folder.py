@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 import torch
+from tiny_capture import write_picture
 
 from polarguide import optics
 from polarguide.capture import load_scene
@@ -22,6 +23,7 @@ from polarguide.errors import PolarguideError
 from polarguide.progress import Reporter
 from polarguide.synth import render as runner
 from polarguide.synth import sweep as sweeps
+from polarguide.synth.folder import photograph
 from polarguide.synth.manifest import MANIFEST, scene_digest, verify_scene
 from polarguide.synth.render import synthesize
 from polarguide.synth.schema import SceneSpec, parse_scene
@@ -284,3 +286,13 @@ def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch:
         choose_variant("rgb", threads=1)
     assert slow_estimate(1e8).endswith("hours")
     assert slow_estimate(1e5).endswith("minutes")
+
+
+def test_the_photograph_of_a_gray_scene_has_three_channels(tmp_path: Path) -> None:
+    """Pictures whose channels are alike are written as gray ones."""
+    ramp = np.linspace(0.1, 0.9, 12)[None, :, None].repeat(8, 0)
+    for angle in (0, 45, 90, 135):
+        write_picture(tmp_path / "polar" / f"v000_{angle:03d}.png", ramp[..., 0])
+    shown = photograph(tmp_path, "v000")
+    assert shown.shape == (8, 12, 3)
+    assert (np.diff(shown[0, :, 0].astype(int)) > 0).all()  # and is not mirrored

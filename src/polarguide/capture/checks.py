@@ -27,7 +27,7 @@ _RESIDUAL = 0.05
 # Curvature (see Measures) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
 ENCODED, DECODED = (-0.12, -0.25), (0.1, 0.2)
-"""Curvatures from which files seem encoded, or decoded twice: for a doubt, and for a judgement."""
+"""Curvatures from which files seem encoded, or decoded twice: for a doubt, and for a judgment."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def curvature(measures: Sequence[Measures]) -> float | None:
 def encoding(slope: float | None) -> Literal["linear", "srgb"] | None:
     """How files are encoded that have this curvature when they are read as linear; None where it does not tell.
 
-    The one judgement of ``prepare``, ``inspect`` and the warnings of ``train``.
+    The one judgment of ``prepare``, ``inspect`` and the warnings of ``train``.
     """
     if slope is None or ENCODED[1] <= slope < ENCODED[0]:
         return None

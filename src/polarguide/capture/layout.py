@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,6 +82,18 @@ def find_layout(root: Path) -> Layout:
     return Layout(root, pictures, sides["masks"], sides["invalid"], sides["gt"], tuple(warnings))
 
 
+def refuse_scene(out: Path) -> None:
+    """Refuse to write into a scene: what lies beside its pictures means something.
+
+    Raises:
+        PolarguideError: there is one.
+    """
+    if out.is_dir() and ((out / "polar").is_dir() or len(angle_folders(out)) == len(ANGLES)):
+        raise PolarguideError(
+            out, expected="a folder for what is written", found="a scene", remedy="Give another --out."
+        )
+
+
 def select_views(layout: Layout, views: Sequence[str] | None) -> list[str]:
     """The names to read, sorted: all, or those asked for.
 
@@ -157,6 +169,20 @@ def pictures_of_folders(
     Raises:
         PolarguideError: a folder is missing, or two files share a stem.
     """
+    require_angle_folders(root, folders)
+    pictures: dict[str, dict[int, Path]] = {}
+    for angle, folder in folders.items():
+        for stem, path in index_files(folder, suffixes).items():
+            pictures.setdefault(stem, {})[angle] = path
+    return pictures
+
+
+def require_angle_folders(root: Path, folders: Mapping[int, Path]) -> None:
+    """Check that there is one folder per angle.
+
+    Raises:
+        PolarguideError: one is missing.
+    """
     missing = [angle for angle in ANGLES if angle not in folders]
     if missing:
         raise PolarguideError(
@@ -165,11 +191,6 @@ def pictures_of_folders(
             found=f"none for {missing[0]} degrees beside {', '.join(p.name for p in folders.values())}",
             remedy="Add the folder.",
         )
-    pictures: dict[str, dict[int, Path]] = {}
-    for angle, folder in folders.items():
-        for stem, path in index_files(folder, suffixes).items():
-            pictures.setdefault(stem, {})[angle] = path
-    return pictures
 
 
 def angle_folders(root: Path) -> dict[int, Path]:
@@ -210,16 +231,27 @@ def angle_of_folder(path: Path) -> int | None:
 def index_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     """Stem -> file for the files of a folder with one of the suffixes; empty if there is no such folder."""
     files: dict[str, Path] = {}
-    if not os.path.lexists(folder):
-        return files
-    require_folder(folder, expected="a folder of files called like the views", remedy="Remove or rename it.")
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in suffixes or path.name.startswith("."):
-            continue
+    for path in list_files(folder, suffixes):
         if path.stem in files:
             raise ambiguous(folder, f"one file called {path.stem}", files[path.stem], path)
         files[path.stem] = path
     return files
+
+
+def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """The files of a folder with one of the suffixes, sorted; none if there is no such folder.
+
+    Raises:
+        PolarguideError: it is no folder.
+    """
+    if not os.path.lexists(folder):
+        return []
+    require_folder(folder, expected="a folder of files called like the views", remedy="Remove or rename it.")
+    return [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in suffixes and not path.name.startswith(".")
+    ]
 
 
 def ambiguous(folder: Path, expected: str, first: Path, second: Path) -> PolarguideError:

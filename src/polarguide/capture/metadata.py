@@ -13,8 +13,6 @@ from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
 from polarguide.records import decode
 
-TEST_EVERY = 8
-"""Without ``split.json`` every 8th view is held out, starting with the first."""
 Index = Annotated[float, msgspec.Meta(gt=1.0, lt=10.0)]
 
 
@@ -58,25 +56,22 @@ class _Prepared(msgspec.Struct):
     corrections: list[_Angles] = []
 
 
-def held_out(path: Path, data: bytes | None, names: list[str]) -> tuple[str, ...]:
-    """The names of the test views, sorted.
+def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
+    """The names of the test views that ``split.json`` lists, sorted.
 
     Args:
         path: ``split.json``, for messages.
-        data: its content, or None if there is no such file; then every 8th view is held out.
+        data: its content.
         names: all view names of the capture, sorted.
 
     Raises:
         PolarguideError: the split has another form, names an unknown view, or leaves nothing to train on.
     """
-    if data is None:
-        test = names[::TEST_EVERY]
-    else:
-        remedy = 'List the names of the test views, {"test": ["<view>", ...]}, or remove the file.'
-        test = decode(data, _Split, path, remedy=remedy).test
-        for name in test:
-            if name not in names:
-                raise unknown_view(f"{path} (test)", name, names)
+    remedy = 'List the names of the test views, {"test": ["<view>", ...]}, or remove the file.'
+    test = decode(data, _Split, path, remedy=remedy).test
+    for name in test:
+        if name not in names:
+            raise unknown_view(f"{path} (test)", name, names)
     if len(set(test)) >= len(names):
         raise PolarguideError(
             path,

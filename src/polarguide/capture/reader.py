@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,11 @@ from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.memory import check_memory, stated_size
 from polarguide.capture.metadata import held_out, refractive_index_of
 from polarguide.capture.objects import objects_of
+from polarguide.capture.split import chosen_views, far_from_training
 from polarguide.capture.view import Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, read_view
 from polarguide.errors import PolarguideError
+from polarguide.options import Split, check_choice
 from polarguide.progress import SILENT, Reporter
 
 _THREADS = 4
@@ -54,6 +57,8 @@ def load_scene(
     transfer: str = "linear",
     views: Sequence[str] | None = None,
     memory: float = 0.0,
+    split: Split = "directions",
+    test_views: Sequence[str] | None = None,
     reporter: Reporter = SILENT,
 ) -> Scene:
     """Read a capture.
@@ -71,6 +76,8 @@ def load_scene(
         transfer: how the files are encoded: "linear", or "srgb" for display-encoded pictures.
         views: names of the views to read; all if None. The split is that of the whole capture.
         memory: GiB that the pictures may take; 0: 80 % of what is free.
+        split: which views are held out where there is no ``split.json``, see ``split.chosen_views``.
+        test_views: names of the views to hold out, whatever else says so, as far as there are such views.
         reporter: receives the progress.
 
     Returns:
@@ -88,7 +95,7 @@ def load_scene(
     files = Files()
     for file in model.files:
         files.read(file)
-    tests = held_out(root / "split.json", files.read_if_there(root / "split.json"), layout.names)
+    tests, stray = _held_out(root / "split.json", files, layout, model, split, test_views)
     about = files.read_if_there(root / "scene.json")
     index = refractive_index_of(root / "scene.json", about)
     for name in names:
@@ -115,7 +122,7 @@ def load_scene(
         if camera is not None
     )
     told_apart = any(item.ground_truth and item.ground_truth.object_ids is not None for item in stored.data)
-    warnings = [*layout.warnings, *model.warnings, *_pose_warnings(model, layout.names, stored.data)]
+    warnings = [*layout.warnings, *model.warnings, *stray, *_pose_warnings(model, layout.names, stored.data)]
     return Scene(
         root=root,
         name=root.resolve().name,
@@ -130,6 +137,33 @@ def load_scene(
         warnings=(*warnings, *_picture_warnings(stored, transfer)),
         objects=objects_of(root / "scene.json", about) if told_apart else (),
     )
+
+
+def _held_out(
+    path: Path,
+    files: Files,
+    layout: Layout,
+    model: ColmapModel,
+    split: Split,
+    asked: Sequence[str] | None,
+) -> tuple[tuple[str, ...], list[str]]:
+    """The names of the test views, and a warning where some are far from all that is trained on."""
+    check_choice("split", split, get_args(Split))
+    data, posed = files.read_if_there(path), frozenset(model.names)
+    cameras = {name: model.camera(name) for name in layout.names if name in posed}
+    tests = chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)
+    if asked is not None:
+        tests = tuple(name for name in sorted(asked) if name in layout.names)
+    far = far_from_training(cameras, tests)
+    if asked is not None or not far:  # whoever asks has been told
+        return tests, []
+    other = (
+        "take --split directions" if data is None and split != "directions" else "name others in split.json"
+    )
+    return tests, [
+        f"{len(far)} of {len(tests)} test views are far from every training view ({listed(far)}): scores on them "
+        f"measure extrapolation. If that is not meant, {other}."
+    ]
 
 
 def read_views(

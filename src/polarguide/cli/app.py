@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import importlib
+import os
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any, get_type_hints
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import tyro
 from rich.console import Console
@@ -51,19 +54,16 @@ def function_of(verb: str) -> Callable[..., Any]:
     return tyro.conf.configure(tyro.conf.OmitArgPrefixes)(function)
 
 
-def options_of(function: Callable[..., Any]) -> list[str]:
-    """Names of all parameters, those in dataclasses included."""
-    names = []
+def options_of(function: Callable[..., Any]) -> dict[str, Any]:
+    """Types of all parameters by name, those in dataclasses included."""
+    found: dict[str, Any] = {}
     for name, kind in get_type_hints(function).items():
-        names += (
-            [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else [name]
-        )
-    return names
+        found |= get_type_hints(kind) if dataclasses.is_dataclass(kind) else {name: kind}
+    return found
 
 
 def run(arguments: Sequence[str]) -> int:
     """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input, or what the verb says)."""
-    errors = Console(stderr=True, highlight=False, soft_wrap=True)
     if list(arguments) == ["--version"]:
         print(f"polarguide {__version__}")
         return 0
@@ -72,28 +72,58 @@ def run(arguments: Sequence[str]) -> int:
         with warnings_printed():
             status = _call(verb, arguments)
     except PolarguideError as error:
-        errors.print("[bold red]error:[/] ", end="")
-        errors.print(printable(_as_flag(error, verb)), markup=False)
-        return 2
+        return _failed(_as_flag(error, verb))
     except KeyboardInterrupt:
-        errors.print("stopped.")
+        with contextlib.suppress(OSError):
+            _errors().print("stopped.")
         return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 1
     except OSError as error:  # missing rights, a full disk, a file where a folder should be
-        errors.print("[bold red]error:[/] ", end="")
         said = (
             f"{error.filename or 'files'}: expected to read or write there, found {error.strerror or error}."
         )
-        errors.print(printable(f"{said} Check the name, the rights, and the room on the disk."), markup=False)
-        return 2
+        return _failed(f"{said} Check the name, the rights, and the room on the disk.")
+    except (MemoryError, ImportError, RuntimeError) as error:
+        said = _of_the_machine(error)
+        if not said:
+            raise
+        return _failed(said)
     return status
+
+
+def _errors() -> Console:
+    return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def _failed(text: str) -> int:
+    """Print an error, if anybody can be told; returns the exit status."""
+    with contextlib.suppress(OSError):
+        _errors().print("[bold red]error:[/] ", end="")
+        _errors().print(printable(text), markup=False)
+    return 2
+
+
+def _of_the_machine(error: Exception) -> str:
+    """What to say where memory or threads have run out; empty: it is something else."""
+    if isinstance(error, MemoryError) or any(words in str(error) for words in _RUN_OUT):
+        said = (str(error).splitlines() or ["none is left"])[0]
+        return f"memory: expected enough of it, and of threads, found {said[:200]}. {_MORE_ROOM}"
+    if isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError):
+        return f"packages: expected installed ones that can be loaded, found {str(error)[:200]}. {_MORE_ROOM}"
+    return ""
+
+
+_RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
+_MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --threads 1 takes less."
 
 
 def _call(verb: str | None, arguments: Sequence[str]) -> int:
     """Call a verb; returns the exit status that it gives, 0 where it gives none."""
     if verb is not None:
+        _require_place()
+        _refuse_empty_paths(verb, arguments[1:])
         found = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=arguments[1:])
         return found if isinstance(found, int) else 0
     if arguments and not arguments[0].startswith("-"):
@@ -108,6 +138,54 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
         verbs, prog="polarguide", description=DESCRIPTION, args=arguments, sort_subcommands=False
     )
     return 0
+
+
+def _require_place() -> None:
+    """Refuse a current folder that is no more: some packages end the process there, without a word."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise PolarguideError(
+            "the current folder",
+            expected="one that exists",
+            found="that it was removed or renamed",
+            remedy="Change to another folder (cd), and repeat the command.",
+        ) from None
+
+
+def _refuse_empty_paths(verb: str, words: Sequence[str]) -> None:
+    """Refuse empty names of files and folders, as unset variables of a shell leave them: they would mean this folder.
+
+    Raises:
+        PolarguideError: there is one.
+    """
+    paths = {
+        _flag(name) for name, kind in options_of(function_of(verb)).items() if Path in (kind, *get_args(kind))
+    }
+    for place in _empty_words(words):
+        if place in paths or not place.startswith("--"):
+            raise PolarguideError(
+                place or "the command line",
+                expected="the name of a file or folder",
+                found="an empty one",
+                remedy="Name it; . is the current folder.",
+            )
+
+
+def _empty_words(words: Sequence[str]) -> Iterator[str]:
+    """The options that are given nothing; an empty text for a word that follows none."""
+    before = ""
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not word:
+            yield before if before.startswith("--") else ""
+        elif equals and not value and name.startswith("--"):
+            yield name
+        before = word
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _near(word: str) -> str:
@@ -130,5 +208,5 @@ def _as_flag(error: PolarguideError, verb: str | None) -> str:
     """The message; a parameter that is at fault is called as on the command line."""
     text = str(error)
     if verb is not None and error.where in options_of(function_of(verb)):
-        return f"--{error.where.replace('_', '-')}{text.removeprefix(error.where)}"
+        return f"{_flag(error.where)}{text.removeprefix(error.where)}"
     return text

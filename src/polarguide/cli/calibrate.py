@@ -25,8 +25,8 @@ def calibrate(
 ) -> None:
     """Calibrate a polarization camera: what each of its polarizers really measures, from shots of one before the lens.
 
-    The file corrects extinction ratio, angle and throughput of every position; prepare and inspect take it as
-    --calibration. docs/how-to/calibrate.md says how to take the shots.
+    The file corrects extinction ratio, angle and throughput of every position; prepare, priors, measure and inspect
+    take it as --calibration. docs/how-to/calibrate.md says how to take the shots.
 
     Args:
         shots: Folder of raw mosaics of a linear polarizer before a uniform light, at five or more angles.

@@ -13,16 +13,18 @@ from polarguide.cli.job_progress import JobReporter
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
 from polarguide.system import signals_as_interrupts
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import Background, TrainSettings
 
 if TYPE_CHECKING:
     from polarguide.experiments.results import Results
 
 
 def compared_settings(
-    steps: int = TrainSettings.steps, refractive_index: float = TrainSettings.refractive_index
+    steps: int = TrainSettings.steps,
+    refractive_index: float = TrainSettings.refractive_index,
+    background: Background = TrainSettings.background,
 ) -> TrainSettings:
-    return TrainSettings(steps=steps, refractive_index=refractive_index)
+    return TrainSettings(steps=steps, refractive_index=refractive_index, background=background)
 
 
 # Of these options; the seeds are counted, the others are fixed.

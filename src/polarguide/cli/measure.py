@@ -64,8 +64,21 @@ def measure(
                 should_stop=should_stop, heard=said, reporter=ConsoleReporter(),
             )  # fmt: skip
     _print_outcome(outcome)
+    _print_what_never_came(outcome, watching.watch)
     status: int = outcome.exit_status
     return status
+
+
+def _print_what_never_came(outcome: Any, folder: Path | None) -> None:
+    """Why nothing was found in a watched folder, and which shots were not complete when the watch ended."""
+    said = _Lines()
+    if outcome.trouble:
+        said.error(outcome.trouble)
+    if outcome.waiting:
+        names = ", ".join(outcome.waiting[:4]) + (", ..." if len(outcome.waiting) > 4 else "")
+        found = f"{len(outcome.waiting)} that are not, and were not measured ({names})"
+        remedy = "Complete, rename or remove their files; the same command goes on."
+        said.error(str(PolarguideError(folder, expected="complete shots", found=found, remedy=remedy)))
 
 
 class _Lines:
@@ -78,14 +91,18 @@ class _Lines:
 
     def __call__(self, entry: Any) -> None:
         if entry.status == "unread":
-            self._errors.print("[bold red]error:[/] ", end="")
-            self._errors.print(entry.why, markup=False)
+            self.error(entry.why)
         elif entry.status == "beyond":
             console.print("[bold red]beyond:[/] ", end="")
             faults = (f"{row['region']} {row['why']}" for row in entry.regions if row["why"])
             console.print(f"{entry.shot}: {'; '.join(faults)}", markup=False)
         elif self.all:
             console.print(f"{entry.status}: {entry.shot}", markup=False)
+
+    def error(self, text: str) -> None:
+        """Print an error."""
+        self._errors.print("[bold red]error:[/] ", end="")
+        self._errors.print(text, markup=False)
 
 
 def _print_outcome(outcome: Any) -> None:
@@ -97,7 +114,5 @@ def _print_outcome(outcome: Any) -> None:
     )
     before = f" ({outcome.earlier} of them earlier)" if outcome.earlier else ""
     console.print(f"shots: {shots or 'none'}{before}", markup=False)
-    if outcome.waiting:
-        console.print(f"not complete, and not measured: {', '.join(outcome.waiting)}", markup=False)
     pictures = f"   pictures: {outcome.folder}/beyond" if counts["beyond"] else ""
     console.print(f"table: {outcome.folder}/table.csv, .jsonl{pictures}", markup=False)

@@ -20,6 +20,7 @@ def render(
     frames: int = 120,
     video: Path | None = None,
     format: PictureFormat = "png",
+    transparent: bool = False,
     environment: Path | None = None,
     rotate_environment: float = 0.0,
     out: Path | None = None,
@@ -39,6 +40,7 @@ def render(
         video: MP4 file to write of the path, layers side by side; PNG files if not given.
         format: Of the layers of views: png as a display shows them, or exr and npy with the linear numbers, whose units
             layers.json states. The contact sheet is PNG.
+        transparent: PNG files of views are transparent where nothing is, without a dark rim around the subject.
         environment: Panorama of linear radiance (.hdr, .exr) to be reflected in place of the learned environment.
         rotate_environment: Degrees by which to turn the environment, counter-clockwise seen from above.
         out: Folder to write; RUN/render by default.
@@ -61,6 +63,13 @@ def render(
         raise PolarguideError(
             "format", expected="png along a --path", found=format, remedy="Name views in place of a path."
         )
+    if transparent and (path or format != "png"):
+        raise PolarguideError(
+            "transparent",
+            expected="PNG files of views",
+            found=f"--path {path}" if path else f"--format {format}",
+            remedy="Leave one of the two out.",
+        )
     names = [name.strip() for name in layers.split(",") if name.strip()]
     trained, reporter = opened(run, compute)
     trained.relight(environment, rotate_environment, reporter=reporter)
@@ -69,5 +78,7 @@ def render(
             video or out or run / "render", path=path, layers=names, frames=frames, reporter=reporter
         )
         return
-    sheet = trained.write_pictures(out, views=views, layers=names, format=format, reporter=reporter)
+    sheet = trained.write_pictures(
+        out, views=views, layers=names, format=format, transparent=transparent, reporter=reporter
+    )
     console.print(f"pictures: {sheet.parent}   contact sheet: {sheet}")

@@ -16,7 +16,7 @@ from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.evaluation.target import jumps
-from polarguide.rendering.fusion import Surface, seen_points
+from polarguide.rendering.fusion import NoSurfaceError, Surface, seen_points
 from polarguide.rendering.mesh import RESOLUTION, fused_surface
 from polarguide.shading.result import RenderResult
 from polarguide.shading.visibility import seen_at
@@ -54,7 +54,7 @@ def mesh_scores(
         return {}
     try:
         surface, _, _ = fused_surface(cameras, render, resolution=RESOLUTION)
-    except PolarguideError:  # there is nothing that several views see
+    except NoSurfaceError:
         return {
             f"mesh_{name}_{end}": 0.0 for end in THRESHOLDS for name in ("accuracy", "completeness", "fscore")
         }

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
-
-import cv2
-import numpy as np
 
 from polarguide import __version__
 from polarguide.evaluation.sources import commit, scoring_digest
@@ -24,8 +20,6 @@ BESIDE_OTHERS = "beside_others.txt"
 """Marks a run folder whose training shared the machine, so that its seconds do not count."""
 
 TITLE = "# Comparison\n\n"
-BLACK = 0.002
-"""Share of full scale under which a pixel is black."""
 
 
 def collect(
@@ -60,6 +54,7 @@ def collect(
             "threads": comparison.options.threads,
             "jobs": comparison.options.parallel,
             "against": comparison.options.against,
+            "background": comparison.settings.background,
         },
         scenes=[
             {
@@ -67,7 +62,7 @@ def collect(
                 "digest": s.digest,
                 "views": s.views,
                 "test_views": list(s.test_views),
-                "black_share": _black_share(s),
+                "black_share": s.black_share,
             }
             for s in scenes
         ],
@@ -121,16 +116,6 @@ def _parts(found: Mapping[str, Mapping[str, Any]] | None) -> dict[str, PartScore
         }
         for name, scores in (found or {}).items()
     }
-
-
-@lru_cache
-def _black_share(scene: SceneEntry) -> float | None:
-    """The share of black pixels in the first test view; None where its picture is not at hand."""
-    picture = cv2.imread(str(scene.path / "polar" / f"{scene.test_views[0]}_000.png"), cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        return None
-    brightest = np.atleast_3d(picture).max(axis=-1)
-    return float(np.mean(brightest < BLACK * np.iinfo(brightest.dtype).max))
 
 
 def write_tables(out: Path, results: Results) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,13 +45,22 @@ def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None
         The record as written.
 
     Raises:
-        PolarguideError: a record that is none; records of other code, settings, scenes or recipes than the first; a run
-            that two of them have; an unknown ``against``.
+        PolarguideError: a record that is none, or would be written over; records of other code, settings, scenes or
+            recipes than the first; a run that two of them have; an unknown ``against``.
     """
     paths = [Path(part) / RECORD if Path(part).is_dir() else Path(part) for part in parts]
     if not paths:
         raise PolarguideError(
             "tables", expected="a record", found="none", remedy="Name at least one results.json."
+        )
+    if len(paths) > 1 and any(
+        os.path.realpath(path) == os.path.realpath(Path(out) / RECORD) for path in paths
+    ):
+        raise PolarguideError(
+            out,
+            expected="a folder of its own",
+            found=f"that of a part, whose {RECORD} would be written over",
+            remedy="Give another --out.",
         )
     joined = join_results(
         [read_results(path) for path in paths], [str(path) for path in paths], against=against

@@ -115,4 +115,4 @@ def _gains(
             continue
         estimate, noise = judged(found.by_scene, {})
         better = (estimate.mean > 0) == (column.better == "higher")
-        yield ShownCell(difference_text(estimate.mean, bool(noise), column), "", noise is False and better)
+        yield ShownCell(difference_text(estimate.mean, noise, column), "", noise is False and better)

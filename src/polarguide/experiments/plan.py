@@ -15,6 +15,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from polarguide import __version__
+from polarguide.capture import View
+from polarguide.capture.background import without_surroundings
+from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import model_digest, scoring_digest, training_digest
@@ -28,6 +31,8 @@ from polarguide.training.settings import TrainSettings
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
+BLACK = 0.002
+"""Share of full scale under which a pixel is black."""
 KEY_DIGITS = 10
 
 
@@ -68,6 +73,7 @@ class Comparison:
         words += ["--steps", str(settings.steps), "--seeds", str(options.seeds), "--out", str(self.out)]
         words += ["--downscale", str(options.downscale), "--transfer", options.transfer]
         words += ["--refractive-index", str(settings.refractive_index)]
+        words += ["--background", settings.background, "--split", options.split]
         return shlex.join(words)
 
 
@@ -80,6 +86,7 @@ class SceneEntry:
     digest: str
     views: int
     test_views: tuple[str, ...]
+    black_share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -129,8 +136,8 @@ class PlannedRun:
             found.scene_digest == self.scene.digest
             and found.recipe_data == self.recipe.data()
             and found.settings == self.settings
-            and (found.recipe, found.downscale, found.transfer)
-            == (self.recipe.name, self.reading.downscale, self.reading.transfer)
+            and (found.recipe, found.downscale, found.transfer, found.test_views)
+            == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
         )
         return found if same else None
 
@@ -144,6 +151,8 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
     entries: list[SceneEntry] = []
     for path in comparison.scenes:
         scene = read_scene(path, comparison.options, reporter)
+        if comparison.settings.background == "masked":
+            scene = without_surroundings(scene)
         if scene.name in [entry.name for entry in entries]:
             raise PolarguideError(
                 path,
@@ -155,8 +164,15 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
             raise PolarguideError(
                 path, expected="test views", found="none", remedy="Name some in split.json to score on."
             )
-        entries.append(SceneEntry(path, scene.name, scene.digest, len(scene.views), scene.test_names))
+        share = black_share(scene.test_views[0])
+        entries.append(SceneEntry(path, scene.name, scene.digest, len(scene.views), scene.test_names, share))
     return entries
+
+
+def black_share(view: View) -> float:
+    """The share of a view's pixels that are black, as it is scored."""
+    brightest = view.codes[0].float().amax(dim=-1)
+    return float((brightest < BLACK * FULL_CODE).float().mean())
 
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:
@@ -173,7 +189,7 @@ def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[Plan
 
 def _planned(comparison: Comparison, scene: SceneEntry, recipe: Recipe, seed: int) -> PlannedRun:
     settings, options = replace(comparison.settings, seed=seed), comparison.options
-    reading = SceneOptions(options.downscale, options.transfer)
+    reading = SceneOptions(options.downscale, options.transfer, split=options.split)
     code = f"{__version__} {training_digest()}{model_digest(type(recipe.shading))}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     folder = comparison.out / RUNS / scene.name / recipe.name.replace(":", "__") / f"{seed}-{key}"

@@ -45,6 +45,7 @@ class Settings(TypedDict):
     threads: int
     jobs: int
     against: str | None
+    background: str
 
 
 class SceneRecord(TypedDict):
@@ -97,6 +98,9 @@ def read_results(path: Path) -> Results:
         PolarguideError: there is none, or it is not what ``write_results`` writes.
     """
     record = read_record(path, dict[str, Any], remedy=_REMEDY)
+    settings = record.get("settings")
+    if isinstance(settings, dict):  # the first records lack it: all took surroundings to be there
+        record["settings"] = {"background": "scene", **settings}
     if record.get("format") != FORMER:
         return validate_results(record, path)
     results = validate_results(_completed(record), path)

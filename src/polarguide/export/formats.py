@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import read_model
-from polarguide.errors import PolarguideError
+from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.evaluation.table import shown_metrics
 from polarguide.export.cameras import write_colmap, write_transforms
@@ -174,11 +175,17 @@ def _ply(run: OpenedRun, shown: _Shown, path: Path, placement: Placement | None 
 
 
 def _camera_centers(run: OpenedRun) -> Tensor | None:
-    """Centers of the scene's cameras [M, 3], which tell on what side surfaces are seen; None if it is not there."""
+    """Centers of the scene's cameras [M, 3], which tell on what side surfaces are seen; warns if it is not there."""
     try:
-        model = read_model(Path(run.configuration.scene))
+        model = read_model(run.scene_folder)
         return torch.stack([model.camera(name).center for name in model.names])
     except PolarguideError:
+        warnings.warn(
+            f"The scene of {run.folder} is not at {run.scene_folder} any more: normals are turned away from the "
+            "middle of the Gaussians, not to the nearest camera.",
+            PolarguideWarning,
+            stacklevel=2,
+        )
         return None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -15,14 +15,18 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
 from polarguide.capture.colmap.undistort import Geometry, undistortion
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
+from polarguide.capture.colmap.write import MODELS
+from polarguide.capture.sensor.analyzer_file import read_analyzers
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
 from polarguide.inspection.capture import Capture, InspectedView
 from polarguide.inspection.verdict import Check
-from polarguide.records import decode
+from polarguide.records import decode, shortened
 
+STEPS = (1, 2, 4)
+"""Pixels of the sensor for each of the picture, that ``prepare`` makes."""
 _REMEDY = "Prepare the mosaics with it: polarguide prepare RAW --out SCENE --calibration FILE."
 
 
@@ -35,6 +39,9 @@ class _Analyzers(msgspec.Struct):
 class _Warp(msgspec.Struct):
     model: str
     parameters: list[float]
+
+
+_Gain = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
 
 class _View(msgspec.Struct):
@@ -60,7 +67,7 @@ class _Scene(msgspec.Struct):
     """What is read of ``scene.json``."""
 
     sensor: str | None = None
-    gains: tuple[float, float, float, float] | None = None
+    gains: tuple[_Gain, _Gain, _Gain, _Gain] | None = None
     analyzers: _Analyzers | None = None
     prepare: _Prepared | None = None
 
@@ -109,10 +116,34 @@ def corrected(capture: Capture, path: Path) -> Capture:
         said = None if about.prepare is None else about.prepare.views.get(view.name)
         key = None if said is None else msgspec.json.encode(said)
         if key not in known:
+            if said is not None:
+                _require_geometry(capture, view, said)
             matrices = _matrices(calibration, about, said, capture.size)
             known[key] = _averaged(_as_named(matrices, applied, about.gains), capture.factor)
+            if known[key].shape[2:4] != view.codes.shape[1:3]:
+                raise _changed(capture, view.name, "a size that its pictures have not")
         views.append(_corrected_view(view, known[key]))
     return replace(capture, views=tuple(views))
+
+
+def _changed(capture: Capture, view: str, found: str) -> PolarguideError:
+    return PolarguideError(
+        f"{capture.root / 'scene.json'} (prepare.views.{view})",
+        expected="what prepare wrote",
+        found=found,
+        remedy="Prepare the scene again.",
+    )
+
+
+def _require_geometry(capture: Capture, view: InspectedView, said: _View) -> None:
+    """Refuse a geometry or a camera that ``prepare`` cannot have written."""
+    if said.geometry.step not in STEPS:
+        raise _changed(capture, view.name, f"a step of {said.geometry.step}")
+    if said.warp is not None:
+        model, parameters = said.warp.model, said.warp.parameters
+        if model not in MODELS or len(parameters) != MODELS[model][1]:
+            found = f"a camera {shortened(model)} with {len(parameters)} parameters"
+            raise _changed(capture, view.name, found)
 
 
 def analyzer_check(capture: Capture, path: Path | None) -> Check | None:

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, require_file
+from polarguide.files import make_folder, require_inside
 from polarguide.measurement.fields import FORMAT
 from polarguide.measurement.limits import NO_LIMITS, faults, read_limits
 from polarguide.measurement.options import MeasureOptions
@@ -23,17 +23,15 @@ from polarguide.measurement.regions import WHOLE, Region, parse_regions, placed
 from polarguide.measurement.table import Entry, FileStamp, Status, Table, stamps
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
-from polarguide.records import option_name
+from polarguide.shots.develop import check_files
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import ShotMaps
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide.shots.read import UNREADABLE, fault_of, read_shot
 from polarguide.visualization.figures import write_png
 
 BEYOND, DIFFERENCES = "beyond", "differences"
 """Folders of pictures beside the table."""
-UNREADABLE = (PolarguideError, OSError, MemoryError)
-"""What one bad file may raise; others come after it."""
 Heard = Callable[[Entry], None]
 
 
@@ -47,22 +45,25 @@ class Outcome:
 
     Attributes:
         folder: of the table.
-        counts: shots by status, those included that were in the table before.
-        earlier: how many these are.
+        counts: shots by status. Of ``measure_shots`` these are all it was given, those included that were in the table
+            before; of ``watch_folder`` those that came while it watched.
+        earlier: how many were in the table before; 0 of ``watch_folder``.
         waiting: shots of a watched folder that were not complete when it stopped.
+        trouble: why no shot was found in a watched folder in the end, though it is not empty; else "".
     """
 
     folder: Path
     counts: Counter[str]
     earlier: int = 0
     waiting: tuple[str, ...] = ()
+    trouble: str = ""
 
     @property
     def exit_status(self) -> int:
         """3 if a shot is beyond a limit, else 2 if one was not read, else 0."""
         if self.counts["beyond"]:
             return 3
-        return 2 if self.counts["unread"] or self.waiting else 0
+        return 2 if self.counts["unread"] or self.waiting or self.trouble else 0
 
 
 class ChangedWhileRead(PolarguideError):
@@ -79,6 +80,7 @@ class Line:
             PolarguideError: one of them is wrong.
         """
         self._reading = reading.checked()
+        check_files(self._reading)
         self._options = options
         self._regions = parse_regions(options.roi)
         names = [region.name for region in self._regions] or [WHOLE]
@@ -90,6 +92,7 @@ class Line:
             self._reference = Reference.read(options.reference, self._reading)
             placed(self._regions, self._reference.size, options.reference)
         self.out = out
+        require_inside(out, out / BEYOND, out / DIFFERENCES)
         self.table = Table(out, self._settings(), overwrite=options.overwrite)
 
     def __enter__(self) -> Line:
@@ -128,17 +131,16 @@ class Line:
         status: Status = (
             "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
         )
-        self._draw(maps, differences, [(r, beyond) for r, _, beyond in found] if status == "beyond" else [])
-        entry = Entry(
-            FORMAT, shot.name, files, status, "", maps.notes, tuple(figures for _, figures, _ in found)
-        )
+        beyond = [(region, which) for region, _, which in found] if status == "beyond" else []
+        picture = self._draw(maps, differences, beyond)
+        measured = tuple(figures for _, figures, _ in found)
+        entry = Entry(FORMAT, shot.name, files, status, "", maps.notes, measured, picture)
         self.table.add(entry)
         return entry
 
     def unread(self, shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseException) -> Entry:
         """Write the line of a shot that cannot be measured."""
-        why = str(error) if isinstance(error, PolarguideError) else f"{shot.paths[0]}: {_words(error)}."
-        entry = Entry(FORMAT, shot.name, files, "unread", why, (), ())
+        entry = Entry(FORMAT, shot.name, files, "unread", str(fault_of(shot, error)), (), ())
         self.table.add(entry)
         return entry
 
@@ -168,26 +170,28 @@ class Line:
         maps: ShotMaps,
         differences: Differences | None,
         beyond: Sequence[tuple[Region, Sequence[str]]],
-    ) -> None:
-        """Write pictures before the line of the table: where that is, they are."""
+    ) -> str:
+        """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
+        if not beyond and differences is None:
+            return ""
+        name = self.table.picture_name(maps.name)
         if beyond:
             make_folder(self.out / BEYOND)
-            write_png(self.out / BEYOND / f"{maps.name}.png", regions_picture(maps, beyond))
+            write_png(self.out / BEYOND / f"{name}.png", regions_picture(maps, beyond))
         if differences is not None and self._reference is not None:
             make_folder(self.out / DIFFERENCES)
             picture = difference_picture(differences, maps.name, self._reference.name)
-            write_png(self.out / DIFFERENCES / f"{maps.name}.png", picture)
+            write_png(self.out / DIFFERENCES / f"{name}.png", picture)
+        return name
 
     def _settings(self) -> dict[str, Any]:
         """What the figures depend on, as JSON."""
         reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
-        named = {name: value for name, value in reading.items() if isinstance(value, Path)}
-        for name, path in named.items():
-            require_file(path, expected="a readable file", remedy=f"Check {option_name(name)}.")
+        named = [value for value in reading.values() if isinstance(value, Path)]
         made: dict[str, Any] = msgspec.to_builtins(
             {
                 "reading": reading,
-                "read_files": stamps(tuple(named.values())),
+                "read_files": stamps(tuple(named)),
                 "regions": self._regions,
                 "threshold": self._options.threshold,
                 "limits": self._limits,
@@ -196,12 +200,6 @@ class Line:
             enc_hook=str,
         )
         return made
-
-
-def _words(error: BaseException) -> str:
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    return "it needs more memory than there is" if isinstance(error, MemoryError) else str(error)
 
 
 def measure_shots(

@@ -22,7 +22,7 @@ def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str
 
     Means and standard deviations (over n, not n - 1) are computed in float64. AoLP is axial: with doubled angles,
     C = mean cos 2a and S = mean sin 2a over usable pixels, R = sqrt(C^2 + S^2), the mean is atan2(S, C) / 2, the
-    standard deviation sqrt(-2 ln R) / 2 (Mardia and Jupp 2000, "Directional Statistics", sections 2.2 to 2.4).
+    standard deviation sqrt(-2 ln R) / 2 (Mardia and Jupp 2000, "Directional Statistics").
 
     Args:
         maps: the shot. region: within its size.

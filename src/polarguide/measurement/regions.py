@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polarguide.errors import PolarguideError
+from polarguide.records import shortened
 
 WHOLE = "all"
 """The region that is measured where none is given."""
-_FORM = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<numbers>-?\d+(?:,-?\d+){3})")
+_FORM = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<numbers>-?[0-9]{1,9}(?:,-?[0-9]{1,9}){3})")
 _LONGEST_NAME = 64
 _MOST = 1_000_000
 
@@ -62,7 +63,7 @@ def parse_regions(texts: Sequence[str]) -> tuple[Region, ...]:
 def _parse(text: str, number: int) -> Region:
     match = _FORM.fullmatch(text.strip())
     if match is None:
-        raise _wrong("x,y,width,height or name=x,y,width,height in whole pixels", repr(text))
+        raise _wrong("x,y,width,height or name=x,y,width,height in whole pixels", shortened(text))
     name = f"roi{number}" if match["name"] is None else match["name"].strip()
     if not name or len(name) > _LONGEST_NAME or not name.isprintable():
         raise _wrong(f"a name of 1 to {_LONGEST_NAME} printable characters", repr(name))
@@ -73,7 +74,12 @@ def _parse(text: str, number: int) -> Region:
 
 
 def _wrong(expected: str, found: str) -> PolarguideError:
-    return PolarguideError("--roi", expected=expected, found=found, remedy="Correct the region.")
+    return PolarguideError(
+        "--roi",
+        expected=expected,
+        found=found if len(found) <= 100 else f"{found[:100]}...",
+        remedy="Correct the region.",
+    )
 
 
 def placed(regions: Sequence[Region], size: tuple[int, int], where: Path) -> tuple[Region, ...]:

@@ -16,12 +16,21 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO, Literal
 
 import msgspec
+from msgspec import Meta
 
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, check_out, make_folder, write_whole, writing
+from polarguide.files import (
+    atomic,
+    check_out,
+    make_folder,
+    require_file,
+    require_inside,
+    write_whole,
+    writing,
+)
 from polarguide.measurement.fields import FORMAT, KEYS
 from polarguide.measurement.region_figures import Value
 from polarguide.records import decode, read_record, shortened, to_json
@@ -29,6 +38,8 @@ from polarguide.spreadsheet import csv_lines
 from polarguide.system import only_writer
 
 LINES, CSV, SETTINGS, LOCK = "table.jsonl", "table.csv", "measure.json", ".lock"
+_LAST = 2**63 - 1
+"""Of the nanoseconds that a time may lie from 1970, 292 years; some disks have later ones."""
 Status = Literal["measured", "within", "beyond", "unread"]
 _ANEW = "Give another --out, or --overwrite to begin this table anew."
 
@@ -38,7 +49,7 @@ class FileStamp(msgspec.Struct, frozen=True):
 
     path: str
     bytes: int
-    modified: int
+    modified: Annotated[int, Meta(ge=-_LAST, le=_LAST)]
 
 
 def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
@@ -48,7 +59,9 @@ def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
         OSError: one is not there.
     """
     about = ((os.path.abspath(path), os.stat(path)) for path in paths)
-    return tuple(FileStamp(path, state.st_size, state.st_mtime_ns) for path, state in about)
+    return tuple(
+        FileStamp(path, state.st_size, min(max(state.st_mtime_ns, -_LAST), _LAST)) for path, state in about
+    )
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -62,6 +75,7 @@ class Entry(msgspec.Struct, frozen=True):
         why: then, the reason.
         notes: what was assumed about it.
         regions: by ``Field.key``, from ``region`` on.
+        picture: name of its pictures without suffix, "" where none was drawn.
     """
 
     format: int
@@ -71,6 +85,7 @@ class Entry(msgspec.Struct, frozen=True):
     why: str
     notes: tuple[str, ...]
     regions: tuple[dict[str, Value], ...]
+    picture: str = ""
 
     def rows(self) -> Iterator[list[Value]]:
         """The lines of the CSV table."""
@@ -103,6 +118,7 @@ class Table:
         make_folder(folder)
         self.folder = folder
         self._done: dict[bytes, Status] = {}
+        self._pictures: set[str] = set()
         self._files: list[BinaryIO] = []
         self._stack = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
@@ -138,6 +154,14 @@ class Table:
         """The status in the line of these files as they are, None where there is no such line."""
         return self._done.get(_key(files))
 
+    def picture_name(self, shot: str) -> str:
+        """A name for the pictures of a shot that those of no other have, upper and lower case taken alike."""
+        name, number = shot, 1
+        while name.casefold() in self._pictures:
+            number += 1
+            name = f"{shot}-{number}"
+        return name
+
     def add(self, entry: Entry) -> None:
         """Write the lines of a shot; when this returns, they are on disk.
 
@@ -147,20 +171,30 @@ class Table:
         lines, rows = self._files
         # JSON's escapes keep names that are no Unicode.
         _append(self.folder / LINES, lines, json.dumps(msgspec.to_builtins(entry)).encode() + b"\n")
-        self._done[_key(entry.files)] = entry.status
+        self._note(entry)
         _append(self.folder / CSV, rows, _csv(entry.rows()))
+
+    def _note(self, entry: Entry) -> None:
+        self._done[_key(entry.files)] = entry.status
+        if entry.picture:
+            self._pictures.add(entry.picture.casefold())
 
     def _begin(self, settings: dict[str, Any], overwrite: bool) -> None:
         """Make what there is whole again, or begin anew."""
         path = self.folder / SETTINGS
         lines = self.folder / LINES
+        for place in (path, lines):
+            if os.path.lexists(place):  # somebody else may have made the folder
+                require_inside(self.folder, place)
+                require_file(place, expected="a file of a table", remedy=_ANEW)
         if path.exists() and lines.exists():
             before = read_record(path, dict[str, Any], remedy=_ANEW) if not overwrite else None
-            if before == json.loads(to_json(settings)):
+            now: dict[str, Any] = json.loads(to_json(settings))
+            if before == now:
                 self._mend()
                 return
             if before is not None and _holds_measurements(lines):
-                raise _other_settings(path, before, settings)
+                raise _other_settings(path, before, now)
         elif lines.exists() and not overwrite:
             raise PolarguideError(
                 path, expected="the options that this table was made with", found="nothing", remedy=_ANEW
@@ -178,7 +212,10 @@ class Table:
                 if not line.endswith(b"\n"):
                     break
                 entry = decode(line, Entry, f"{path} (line {number})", remedy=_ANEW)
-                self._done[_key(entry.files)] = entry.status
+                if entry.format != FORMAT:
+                    place, found = f"{path} (line {number}, format)", str(entry.format)
+                    raise PolarguideError(place, expected=str(FORMAT), found=found, remedy=_ANEW)
+                self._note(entry)
                 rows.write(_csv(entry.rows()))
                 whole += len(line)
         if whole < path.stat().st_size:
@@ -217,9 +254,13 @@ def _holds_measurements(path: Path) -> bool:
 
 def _other_settings(path: Path, before: dict[str, Any], now: dict[str, Any]) -> PolarguideError:
     name = next(name for name in {**before, **now} if before.get(name) != now.get(name))
+    was, is_now = before.get(name), now.get(name)
+    while isinstance(was, dict) and isinstance(is_now, dict):
+        inner = next(key for key in {**was, **is_now} if was.get(key) != is_now.get(key))
+        name, was, is_now = f"{name}.{inner}", was.get(inner), is_now.get(inner)
     return PolarguideError(
         f"{path} ({name})",
-        expected=shortened(before.get(name), 200),
-        found=shortened(now.get(name), 200),
+        expected=shortened(was, 200),
+        found=shortened(is_now, 200),
         remedy=f"One table has one set of options. {_ANEW}",
     )

@@ -15,13 +15,14 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
-from polarguide.measurement.line import UNREADABLE, ChangedWhileRead, Heard, Line, Outcome, ignore
+from polarguide.measurement.line import ChangedWhileRead, Heard, Line, Outcome, ignore
 from polarguide.measurement.options import MeasureOptions, WatchOptions
 from polarguide.measurement.table import Entry, FileStamp, stamps
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.exposures import ExposureSet, list_shots, mosaics
 from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import UNREADABLE
 
 _POLL = (0.05, 0.5)
 """Seconds between two looks, at least and at most, unless a look takes long itself."""
@@ -58,10 +59,10 @@ class _Folder:
         """The shots that are there, the oldest first; of those of four files, parts, too."""
         try:
             found = (
-                self._mosaics() if self.reading.sensor is not None else find_shots([self.root], self.reading)
+                self._mosaics() if self.reading.sensor is not None else list_shots([self.root], self.reading)
             )
         except (PolarguideError, OSError) as error:
-            # Perhaps only the first of four files is there, or the network is gone: this may pass.
+            # Perhaps only the first of four folders is there, or the network is gone: this may pass.
             self._worry(str(error))
             return []
         self._trouble = ("", 0.0)
@@ -76,9 +77,11 @@ class _Folder:
                 and not entry.name.startswith(".")
                 and entry.is_file()
             ]
-        stems = Counter(path.stem for path in files)
-        names = ((path.stem if stems[path.stem] == 1 else path.name, path) for path in sorted(files))
-        return [ExposureSet(name, "mosaic", {0: path}) for name, path in names]
+        return mosaics(sorted(files))
+
+    def trouble(self) -> str:
+        """Why nothing can be found in the folder, where that is so and there is something in it."""
+        return self._trouble[0] if self._trouble[0] and self._not_empty() else ""
 
     def _worry(self, text: str) -> None:
         """Warn of what does not pass, once."""
@@ -111,8 +114,10 @@ def watch_folder(
 
     A shot is measured when none of its files has changed for ``settle`` seconds and all are whole. One that cannot be
     read is tried again as long as its format says that it is not whole; after ``patience`` seconds without a change it
-    gets a line that says why. A file that is written anew is another shot. The table is the memory: the same call after
-    a stop or a kill goes on with what is not in it.
+    gets a line that says why, and so does what is ambiguous or has no angle in its name. A shot of fewer than four
+    files is waited for: after ``patience`` seconds a warning says so, and it is among those ``waiting`` at the end. A
+    file that is written anew is another shot. The table is the memory: the same call after a stop or a kill goes on
+    with what is not in it.
 
     Args:
         folder: of mosaics, or of shots of four files, as ``shots.find_shots`` takes it.
@@ -126,6 +131,7 @@ def watch_folder(
     """
     root = Path(folder)
     require_folder(root, expected="a folder to watch", remedy="Check --watch.")
+    reading.require_kind("filter" if reading.sensor is None else "mosaic", root.name)
     counts: Counter[str] = Counter()
     with Line(Path(out), options, reading) as line:
         ignored = [*line.reference_files, *([reading.dark_frame] if reading.dark_frame else [])]
@@ -142,7 +148,7 @@ def watch_folder(
                 if should_stop():
                     break
             time.sleep(max(step, 4 * took))
-        return Outcome(Path(out), counts, 0, watch.waiting())
+        return Outcome(Path(out), counts, 0, watch.waiting(), there.trouble())
 
 
 class _Watch:
@@ -184,6 +190,8 @@ class _Watch:
         if age < self._options.settle:
             return False
         late = age >= self._options.patience
+        if shot.fault is not None:  # names may still change, and a file that is too many may go
+            return late
         if shot.kind != "mosaic" and len(shot.files) < len(ANGLES):
             if late and not state.said:
                 state.said = True

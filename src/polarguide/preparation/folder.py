@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +23,7 @@ from polarguide.capture.write import EXACT, intensity_codes, picture_name, write
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, holds_files, make_folder, read_file, require_inside, write_whole
 from polarguide.records import decode, read_record, shortened, to_json
+from polarguide.system import hold_folder
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
@@ -141,8 +142,30 @@ class SceneFolder:
             )
         self.measured, self.views = state.get("measured"), state.get("views", {})
 
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Create the folder, and keep other calls out of it.
+
+        Raises:
+            PolarguideError: one is at work in it, or it cannot be created.
+        """
+        make_folder(self.root)
+        try:
+            let_go = hold_folder(self.root)
+        except BlockingIOError:
+            raise PolarguideError(
+                self.root,
+                expected="a folder that nobody else writes",
+                found="another polarguide prepare at work on it",
+                remedy="Wait for it, or give another --out.",
+            ) from None
+        try:
+            yield
+        finally:
+            let_go()
+
     def start(self) -> None:
-        """Create the folder and take note of the request."""
+        """Take note of the request."""
         work = self.root / SFM
         require_inside(self.root, *(self.root / name for name in (*FOLDERS, PARTIAL, SFM)), *work.rglob("*"))
         if (self.root / SCENE).exists():

@@ -14,7 +14,8 @@ from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_g
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.layout import index_files
-from polarguide.capture.sensor.analyzers import read_analyzers, spread_to_cells
+from polarguide.capture.sensor.analyzer_file import read_analyzers
+from polarguide.capture.sensor.analyzers import spread_to_cells
 from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.pattern import tiled

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
@@ -109,6 +110,19 @@ def prepare_scene(
             folder.measured = pictures.measure(advance)
         for note in folder.measured["notes"]:
             reporter.say(note)
+    with folder.held():
+        return _write_scene(root, folder, pictures, settings, poses, reporter)
+
+
+def _write_scene(
+    root: Path,
+    folder: SceneFolder,
+    pictures: Source,
+    settings: PrepareSettings,
+    poses: Poses | None,
+    reporter: Reporter,
+) -> Prepared:
+    """Write what is missing of a scene that has been measured."""
     folder.start()
     work = Workshop(folder, pictures, settings, reporter)
     points: dict[str, Any] | None = None
@@ -137,7 +151,7 @@ def prepare_scene(
     if poses is not None:
         _write_model(folder, poses)
     folder.finish(_summary(folder, pictures, settings, points))
-    shutil.rmtree(target / SFM, ignore_errors=True)
+    shutil.rmtree(folder.root / SFM, ignore_errors=True)
     return _outcome(folder, pictures, settings, new=True)
 
 
@@ -247,6 +261,8 @@ def _write_view(
         faults.append(f"{view}: {record['clipped_share']:.0%} of its pixels are saturated.")
     elif not all(picture.any() for picture in intensities):
         faults.append(f"{view}: a picture of it is black throughout.")
+    elif all(np.array_equal(intensities[0], other) for other in intensities[1:]):
+        faults.append(f"{view}: its four pictures are the same, as copies of one are.")
     return faults, done.notes
 
 

@@ -14,7 +14,7 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
-from polarguide.capture.sensor.analyzers import is_analyzer_file
+from polarguide.capture.sensor.analyzer_file import is_analyzer_file
 from polarguide.errors import PolarguideError
 from polarguide.records import check_options, option_name
 

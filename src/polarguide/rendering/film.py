@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 
 from polarguide.camera import Camera
+from polarguide.capture.memory import require_memory
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
 from polarguide.options import PathLike, check_range
@@ -21,6 +23,8 @@ from polarguide.visualization.layers import Picture, layer_picture
 
 PATHS = {"orbit": orbit, "spiral": spiral}
 FRAMES_PER_SECOND = 30.0
+RENDERED = 160
+"""Bytes that a pixel takes at least while it is rendered: layers, and what they are made of."""
 
 
 def path_cameras(run: OpenedRun, path: str, frames: int) -> tuple[list[Camera], float]:
@@ -65,6 +69,9 @@ def write_film(
     """
     out, names = Path(out), checked_layers(list(layers))
     cameras, speed = path_cameras(run, path, frames)
+    width, height = max(((c.width, c.height) for c in cameras), key=math.prod)
+    remedy = "Give the cameras of the path a smaller width and height."
+    require_memory(Path(path), RENDERED * width * height, f"pictures of {width}x{height}", remedy=remedy)
     pictures = _pictures(run, names, cameras, reporter)
     if out.suffix.lower() == ".mp4":
         make_folder(out.parent)

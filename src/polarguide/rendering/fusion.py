@@ -19,6 +19,10 @@ TRUNCATION = 4.0  # voxels
 _SLAB = 1 << 21  # voxels at a time
 
 
+class NoSurfaceError(PolarguideError):
+    """There is nothing that several views see."""
+
+
 @dataclass(frozen=True, eq=False)
 class Box:
     """A grid of voxels: ``low`` [3] is its corner, ``size`` a voxel's side, ``counts`` how many there are each way."""
@@ -52,7 +56,7 @@ def box_around(points: Sequence[Tensor], center: Tensor, reach: float, resolutio
     """
     near = torch.cat([p[(p - center).norm(dim=1) < reach] for p in points])
     if len(near) < 100:
-        raise PolarguideError(
+        raise NoSurfaceError(
             "mesh", expected="surfaces before the cameras", found="none", remedy="Train for more steps."
         )
     values = near.numpy()
@@ -122,7 +126,7 @@ def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, small
             field.numpy(), 0.0, mask=known, gradient_direction="descent"
         )
     except (RuntimeError, ValueError):
-        raise PolarguideError(
+        raise NoSurfaceError(
             "mesh", expected="a surface that several views see", found="none", remedy="Train for more steps."
         ) from None
     world = vertices.astype(np.float64) * box.size + box.low.numpy() + 0.5 * box.size

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
@@ -17,6 +19,7 @@ from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
 from polarguide.rendering.relight import write_exr
 from polarguide.runs.opened import OpenedRun, checked_layers
+from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture, true_depth_range
 from polarguide.visualization.sheet import contact_sheet
@@ -58,6 +61,7 @@ def write_pictures(
     views: str = "test",
     layers: Sequence[str] | None = None,
     format: PictureFormat = "png",
+    transparent: bool = False,
     reporter: Reporter = SILENT,
 ) -> Path:
     """Write layers of some views, one file each, and a contact sheet of them and the ground truth.
@@ -70,6 +74,8 @@ def write_pictures(
             the reporter.
         format: png as a display shows layers, with the white balance of the run's presentation; exr and npy hold their
             linear numbers, in the units that ``layers.json`` beside them states. The contact sheet is PNG.
+        transparent: PNG files are transparent where nothing is, by alpha; their colors are those of what is there, so
+            that no dark rim shows on another background. Not on the contact sheet.
 
     Returns:
         The path of the contact sheet.
@@ -77,13 +83,17 @@ def write_pictures(
     Raises:
         PolarguideError: there is no such view or layer.
     """
+    check_choice("format", format, get_args(PictureFormat))
+    if transparent and format != "png":
+        raise PolarguideError(
+            "transparent", expected="format png", found=format, remedy="Leave one of the two out."
+        )
     folder = run.folder / "render" if out is None else Path(out)
     if out is None:
         require_inside(run.folder, folder)
     names = checked_layers(list(run.layers if layers is None else layers))
     chosen = select_views(run.scene, views)
     make_folder(folder)
-    check_choice("format", format, get_args(PictureFormat))
     shown: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
     gains = run.presentation.gains
@@ -100,6 +110,12 @@ def write_pictures(
             for name, picture in pictures.items():
                 if picture is None:
                     missing.add(name)
+                elif format == "png" and transparent:
+                    rendered = _unblended(result)
+                    exposed = name == "reflection"
+                    whole = layer_picture(rendered, name, view.camera, depths, exposed=exposed, gains=gains)
+                    assert whole is not None
+                    figures.write_png(folder / f"{view.name}_{name}.png", whole, _opacity(result))
                 elif format == "png":
                     figures.write_png(folder / f"{view.name}_{name}.png", picture)
                 else:
@@ -128,6 +144,18 @@ def _sheet(shown: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str]
     columns = [column for column in wanted if all(column in cells for _, cells in shown)]
     rows = [[cells[column] for column in columns] for _, cells in shown]
     return contact_sheet(rows, [name for name, _ in shown], columns)
+
+
+def _unblended(result: RenderResult) -> RenderResult:
+    """Layers of radiance as of what is there alone: over alpha, where anything is."""
+    alpha = result.alpha.clamp(min=1e-3)[..., None]
+    layers = {name: getattr(result, name) for name in ("final", "base", "specular", "diffuse")}
+    return replace(result, **{name: t / alpha for name, t in layers.items() if t is not None})
+
+
+def _opacity(result: RenderResult) -> Picture:
+    """Alpha [H, W] as uint8."""
+    return (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 def _write_numbers(path: Path, values: Tensor) -> None:

@@ -55,6 +55,7 @@ class RunConfiguration:
         settings: steps, seed, refractive index.
         downscale: side of the averaged pixel boxes. transfer: how the files were read.
         device: what it trained on. version: of the program.
+        test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
     """
 
     scene: str
@@ -66,6 +67,7 @@ class RunConfiguration:
     transfer: Transfer
     device: str
     version: str = __version__
+    test_views: tuple[str, ...] | None = None
 
     @classmethod
     def of(
@@ -81,6 +83,7 @@ class RunConfiguration:
             downscale=scene.downscale,
             transfer="srgb" if scene.transfer == "srgb" else "linear",
             device=str(device),
+            test_views=scene.test_names,
         )
 
     def save(self, run: Path) -> None:

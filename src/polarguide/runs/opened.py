@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene, read_model
+from polarguide.capture.background import without_surroundings
 from polarguide.capture.layout import find_layout
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
@@ -189,9 +190,11 @@ class OpenedRun:
             PolarguideError: it is not there any more, cannot be read, or was read otherwise than for the training.
         """
         configuration, found = self.configuration, self._scene_source
-        options = SceneOptions(configuration.downscale, configuration.transfer)
+        options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
+        recorded = configuration.test_views
         if not isinstance(found, Scene):
-            found = read_scene(configuration.scene if found is None else found, options, self._reporter)
+            folder = configuration.scene if found is None else found
+            found = read_scene(folder, options, self._reporter, recorded)
         if (found.downscale, found.transfer) != (options.downscale, options.transfer):
             expected = (
                 f"downscale {options.downscale}, transfer {options.transfer}, as {self.folder} was trained"
@@ -200,7 +203,10 @@ class OpenedRun:
             raise PolarguideError("scene", expected=expected, found=given, remedy="Load it like that.")
         if found.digest != configuration.scene_digest:
             _warn(f"{found.root} has changed since {self.folder} was trained on it.")
-        return found
+        if recorded is not None and recorded != found.test_names:
+            names = {view.name for view in found.views}
+            found = replace(found, test_names=tuple(name for name in recorded if name in names))
+        return without_surroundings(found) if configuration.settings.background == "masked" else found
 
     @property
     def scene_folder(self) -> Path:
@@ -301,9 +307,16 @@ def checked_layers(names: list[str]) -> list[str]:
 
 
 def read_scene(
-    folder: PathLike, options: SceneOptions = SceneOptions(), reporter: Reporter = SILENT
+    folder: PathLike,
+    options: SceneOptions = SceneOptions(),
+    reporter: Reporter = SILENT,
+    test_views: tuple[str, ...] | None = None,
 ) -> Scene:
     """Load a scene, with progress, and hand on its warnings.
+
+    Args:
+        folder: of the scene. options: how it is read. reporter: told how far it is.
+        test_views: as for ``load_scene``.
 
     Raises:
         PolarguideError: it cannot be read.
@@ -313,6 +326,8 @@ def read_scene(
         downscale=options.downscale,
         transfer=options.transfer,
         memory=options.memory,
+        split=options.split,
+        test_views=test_views,
         reporter=reporter,
     )
     for warning in scene.warnings:

@@ -13,6 +13,8 @@ from pathlib import Path
 import torch
 
 from polarguide.capture import Scene
+from polarguide.capture.background import without_surroundings
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
@@ -102,6 +104,8 @@ def train(
         )
         backend = backend_of(ranks, session.device, reporter)
         loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
+        if settings.background == "masked":
+            loaded = without_surroundings(loaded)
         _check_scene(loaded)
         configuration = RunConfiguration.of(loaded, chosen, settings, backend.device)
         state = None
@@ -113,6 +117,8 @@ def train(
                 state = load_checkpoint(out, chosen, backend.device)
                 _check_slots(state, settings, out)
         trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
+        if trainer.black and settings.background == "auto":
+            reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
@@ -265,6 +271,10 @@ def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
 
 
 def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
+    try:
+        refuse_scene(out)
+    except PolarguideError as error:
+        return error
     if (out / CONFIGURATION).exists() == resume:
         return None
     expected, found, remedy = (
@@ -288,7 +298,14 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _check_slots(state: TrainingState, settings: TrainSettings, out: Path) -> None:
-    """Refuse sums of the density control for another number of views a step than ``run.json`` states."""
+    """Refuse a later step than ``run.json`` states, and sums of the density control for other views a step."""
+    if state.step > settings.steps:
+        raise PolarguideError(
+            out / CHECKPOINT,
+            expected=f"the state of a training of {settings.steps} steps",
+            found=f"one after step {state.step}",
+            remedy="Train again into a new folder.",
+        )
     sums = state.statistics.gradient
     found = sums.shape[0] if sums.ndim == 2 else 1
     if found != settings.views_per_step:
@@ -309,9 +326,9 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
             remedy="The stages of a training are shares of its steps, so that it cannot be made longer or shorter: "
             f"give --steps {old.settings.steps}, or train with --steps {new.settings.steps} into a new folder.",
         )
-    for field in ("scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer"):
+    for field in ("scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer", "test_views"):
         a, b = getattr(old, field), getattr(new, field)
-        if a != b:
+        if a != b and a is not None:
             if isinstance(a, dict):  # a recipe: show what differs
                 keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
                 a, b = ({key: values.get(key) for key in keys} for values in (a, b))

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from polarguide.capture.sensor.analyzers import SUFFIX, AnalyzerCalibration, write_analyzers
+from polarguide.capture.sensor.analyzer_file import SUFFIX, write_analyzers
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
 from polarguide.progress import SILENT, Reporter

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.sensor.analyzers import LEAST_DIATTENUATION, grid_shape
+from polarguide.capture.sensor.analyzers import FARTHEST_ANGLE, LEAST_DIATTENUATION, grid_shape
 from polarguide.capture.sensor.pattern import Pattern
 
 BLOCK = 32
@@ -18,8 +18,7 @@ BLOCK = 32
 NEIGHBORHOOD = 31
 """Cells of one color, each way, whose mean brightness is that of a uniform light at the middle one."""
 LEAST_THROUGHPUT, MOST_THROUGHPUT, MOST_DIATTENUATION = 0.5, 1.5, 1.3
-FARTHEST_ANGLE = np.radians(20.0)
-"""What deviates more than these is a defect of the sensor, not a polarizer."""
+"""What deviates more than these, or than ``FARTHEST_ANGLE``, is a defect of the sensor, not a polarizer."""
 
 Array = NDArray[np.float32]
 

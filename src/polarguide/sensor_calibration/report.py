@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,21 +117,3 @@ def _cell(values: Array, form: str) -> str:
 
     middle, low, high = spread(values)
     return text(middle) if values.size == 1 else f"{text(middle)} ({text(low)} to {text(high)})"
-
-
-def worst_angle(said: list[Position]) -> float:
-    """The largest median angle error, in degrees."""
-    return max(abs(spread(position.angle_error)[0]) for position in said)
-
-
-def plain(said: list[Position]) -> list[dict[str, Any]]:
-    """The medians as JSON types."""
-    return [
-        {
-            "position": position.name,
-            "throughput": spread(position.throughput)[0],
-            "extinction_ratio": spread(position.extinction)[0],
-            "angle_error_degrees": spread(position.angle_error)[0],
-        }
-        for position in said
-    ]

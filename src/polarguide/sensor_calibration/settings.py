@@ -17,7 +17,9 @@ from polarguide.errors import PolarguideError
 from polarguide.records import check_options
 
 NAMES = "names"
-_NUMBER = re.compile(r"(\d+(?:\.\d+)?)(?:deg)?$")
+_NUMBER = re.compile(r"(?:^|.*[_ ])(\d+(?:\.\d+)?)(?:deg)?")
+_SIGNED = re.compile(r".*[-+\u2212]\d+(?:\.\d+)?(?:deg)?")
+_IN_DEGREES = re.compile(r"\d ?deg(?![a-z])")
 _NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
 _Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 
@@ -30,7 +32,7 @@ class CalibrateSettings:
         sensor: Sensor of the mosaics: MYR are color, MZR is monochrome.
         lens: Name of the lens, for the file; its own polarization is part of what is calibrated.
         angles: Angles of the polarizer in degrees, in the order of the files' names, such as 0,15,30; names if the
-            files' names end in them; without it they are estimated.
+            files' names end in them, after _ or a space; without it they are estimated.
         sense: How given angles count, as the picture is displayed.
         reference: What the zero of the angles is: angles, that of the angles given; or mean, the mean deviation of the
             sensor's positions from their names is zero. Without it angles where they are given, else mean.
@@ -50,7 +52,7 @@ class CalibrateSettings:
     """
 
     sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"]
-    lens: str = ""
+    lens: Annotated[str, Meta(max_length=200)] = ""
     angles: str | None = None
     sense: Sense = "ccw"
     reference: Literal["angles", "mean"] | None = None
@@ -74,6 +76,9 @@ class CalibrateSettings:
             PolarguideError: a value is out of range, or does not fit another.
         """
         check_options(self)
+        if not self.lens.isprintable():
+            found = repr(self.lens)
+            raise PolarguideError("--lens", expected="one line of text", found=found, remedy="Correct it.")
         period = sensor_pattern(self.sensor).period
         if self.block is not None and self.block != 1 and self.block % period:
             raise PolarguideError(
@@ -120,13 +125,19 @@ class CalibrateSettings:
 
 
 def _angle_of(path: Path) -> float:
-    found = _NUMBER.search(path.stem)
-    if found is None:
+    name, found = path.stem, _NUMBER.fullmatch(path.stem)
+    why = ""
+    if _SIGNED.fullmatch(name):
+        why = ", a sign or a hyphen before the number"
+    elif found is not None and _IN_DEGREES.search(name[: found.start(1)]):
+        why = ", an angle in degrees before the last number"
+    if found is None or why:
         raise PolarguideError(
             path,
-            expected="a name that ends in the angle of the polarizer, such as shot_022.5.png",
-            found=repr(path.stem),
-            remedy="Rename it, or list the angles: --angles 0,15,30,...",
+            expected="a name that ends in the angle of the polarizer from 0 on, after _ or a space, such as "
+            "shot_022.5.png",
+            found=f"{name!r}{why}",
+            remedy="Rename it (150 for -30), or list the angles: --angles 150,0,30,...",
         )
     return float(found[1])
 

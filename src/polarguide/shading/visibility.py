@@ -10,12 +10,14 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.raster import Rasterize
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import render, splats
 from polarguide.shading.model import Parameters
 from polarguide.vectors import unit
 
 # A Gaussian at most this much behind the rendered surface, relative to its depth, is seen.
 DEPTH_SLACK = 0.02
+# Pixels that a Gaussian has to fill, counted by its blending weights, to add to a picture.
+LEAST_PIXELS = 0.05
 
 
 def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
@@ -56,3 +58,25 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
         seen = inside & (z < depth[pixel] * (1 + DEPTH_SLACK))
         total += seen[:, None] * unit(center - means)
     return total
+
+
+def touching_views(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> Tensor:
+    """To how many pictures each Gaussian adds something: its blending weights there add up to ``LEAST_PIXELS``.
+
+    Args:
+        gaussians: the Gaussians. cameras: of the pictures. rasterize: of the backend.
+
+    Returns:
+        [N] float32 counts.
+    """
+    given = splats(gaussians)
+    counts = torch.zeros(len(given.means), device=given.means.device)
+    for camera in cameras:
+        # The gradient of the summed weights with respect to a feature is the sum of its Gaussian's weights.
+        with torch.enable_grad():
+            features = torch.ones_like(given.features).requires_grad_()
+            fixed = type(given)(*(tensor.detach() for tensor in given))
+            rasterize(fixed._replace(features=features), camera).features.sum().backward()
+        assert features.grad is not None
+        counts += (features.grad[:, 0] >= LEAST_PIXELS).float()
+    return counts

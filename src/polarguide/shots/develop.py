@@ -16,7 +16,8 @@ from polarguide.capture.filter.exif import apply_orientation, orientation_calibr
 from polarguide.capture.filter.shots import read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
 from polarguide.capture.layout import find_layout, select_views
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers, spread_to_cells
+from polarguide.capture.sensor.analyzer_file import read_analyzers
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
 from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import demosaic
 from polarguide.capture.sensor.pattern import SENSOR_SIZE, tiled
@@ -64,16 +65,34 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
     Raises:
         PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
     """
+    if shot.fault is not None:
+        raise shot.fault
+    options.require_kind(shot.kind, shot.name)
     if shot.kind == "mosaic":
-        return _mosaic(shot, options)
-    if options.analyzers is not None:
-        raise PolarguideError(
-            options.analyzers,
-            expected="raw mosaics, whose samples it corrects",
-            found=f"{shot.name}, {'shots through a filter' if shot.kind == 'filter' else 'a view of a scene'}",
-            remedy="Leave it out, or give --sensor and the mosaics; prepare --calibration corrects a scene.",
-        )
+        try:
+            return _mosaic(shot, options)
+        except PolarguideError as error:
+            path = shot.files[0]
+            if error.where.startswith(str(path)):
+                raise
+            # An option or the dark frame does not fit this file; of many, it has to be named.
+            where = f"{path} ({error.where})"
+            raise PolarguideError(
+                where, expected=error.expected, found=error.found, remedy=error.remedy
+            ) from error
     return _filter(shot, options) if shot.kind == "filter" else _scene_view(shot, options)
+
+
+def check_files(options: ShotOptions) -> None:
+    """Check once, before many shots, the files that all of them are developed with.
+
+    Raises:
+        PolarguideError: there is none, or the calibration is damaged or of another sensor.
+    """
+    if options.dark_frame is not None:
+        require_file(options.dark_frame, expected="a dark frame", remedy="Check --dark-frame.")
+    if options.analyzers is not None:
+        _calibration(options.analyzers).require_sensor(options.sensor, options.analyzers)
 
 
 def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
@@ -145,12 +164,16 @@ def _analyzers(shape: tuple[int, ...], options: ShotOptions) -> AnalyzerCalibrat
     path = options.analyzers
     if path is None:
         return None
-    require_file(path, expected="a file of polarguide calibrate", remedy="Check --calibration.")
-    state = path.stat()
-    found = _read(path, state.st_mtime_ns, state.st_size)
+    found = _calibration(path)
     found.require_sensor(options.sensor, path)
     found.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
     return found
+
+
+def _calibration(path: Path) -> AnalyzerCalibration:
+    require_file(path, expected="a file of polarguide calibrate", remedy="Check --calibration.")
+    state = path.stat()
+    return _read(path, state.st_mtime_ns, state.st_size)
 
 
 @lru_cache(maxsize=1)

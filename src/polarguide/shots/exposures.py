@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.layout import (
@@ -14,14 +14,14 @@ from polarguide.capture.layout import (
     angle_of_folder,
     describe_contents,
     find_layout,
-    index_files,
+    list_files,
 )
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
-from polarguide.capture.view import ANGLES, listed
+from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import Kind, ShotOptions
 
-Kind = Literal["mosaic", "filter", "scene"]
+_EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
     "Raw mosaics need --sensor (IMX250MYR is color, IMX250MZR monochrome); four shots need their angles in the names, "
     "<shot>_0, _45, _90 and _135, or folders 0, 45, 90 and 135."
@@ -38,6 +38,8 @@ class ExposureSet:
         files: by angle; a mosaic's under 0. Angles may be missing: ``read_shot`` says so.
         root: folder of the scene; else None.
         view: its name in the scene.
+        fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
+        others: where there is a fault, files that ``files`` has no place for; or the folder that it is in.
     """
 
     name: str
@@ -45,11 +47,13 @@ class ExposureSet:
     files: dict[int, Path]
     root: Path | None = None
     view: str = ""
+    fault: PolarguideError | None = None
+    others: tuple[Path, ...] = ()
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files, by angle."""
-        return tuple(path for _, path in sorted(self.files.items()))
+        """The files, by angle; at least one."""
+        return (*(path for _, path in sorted(self.files.items())), *self.others)
 
 
 def find_shots(
@@ -61,15 +65,43 @@ def find_shots(
     ``I0.png`` ... in one folder; ``0/cup.png`` ...). A folder is a scene (``polar/``, or four folders of angles with a
     ``sparse``), or holds mosaics or shots; one without any is looked for in its folders, one level down.
 
+    What is ambiguous or tells no angle does not hide the shots beside it: it is a set with a ``fault``.
+
     Raises:
-        PolarguideError: a path does not exist or holds nothing that can be read, or two sets have one name.
+        PolarguideError: there are no paths, one does not exist, there is nothing but files and folders that are no
+            shot, or an option means nothing for the kind of shots found.
+    """
+    options = options or ShotOptions()
+    if not paths:
+        raise PolarguideError(
+            "paths", expected="at least one file or folder of shots", found="none", remedy="Name some."
+        )
+    found = list_shots(paths, options)
+    faults = [shot.fault for shot in found if shot.fault is not None and not shot.files]
+    if len(faults) < len(found):
+        for kind, shot in {shot.kind: shot for shot in reversed(found) if shot.fault is None}.items():
+            options.require_kind(kind, shot.name)
+        return found
+    root = Path(paths[0])
+    if len(paths) == 1 and len(faults) > 1:
+        raise PolarguideError(root, expected=_EXPECTED, found=describe_contents(root), remedy=_REMEDY)
+    raise faults[0]
+
+
+def list_shots(
+    paths: Sequence[str | os.PathLike[str]], options: ShotOptions | None = None
+) -> list[ExposureSet]:
+    """As ``find_shots``, but where there are only faults, these are what is found.
+
+    Raises:
+        PolarguideError: a path does not exist, or the only one is an empty folder, or one that lacks those of angles.
     """
     options = options or ShotOptions()
     found: list[ExposureSet] = []
     files: list[Path] = []
-    for path in map(Path, paths):
+    for path in map(Path, dict.fromkeys(paths)):
         if path.is_dir():
-            found += _in_folder(path, options)
+            found += _in_folder(path, options) if len(paths) == 1 else _or_fault(path, options, _in_folder)
         elif path.is_file():
             files.append(path)
         else:
@@ -79,38 +111,80 @@ def find_shots(
     return _named_apart(_of_files(files, options) + found)
 
 
+def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
+    """Raw mosaics as sets; two of one folder and stem are called by their suffix, too."""
+    stems = Counter(path.with_suffix("") for path in files)
+    return [
+        ExposureSet(path.stem if stems[path.with_suffix("")] == 1 else path.name, "mosaic", {0: path})
+        for path in files
+    ]
+
+
 def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
     if options.sensor is not None:
-        return [_mosaic(path) for path in files]
-    grouped: dict[str, dict[int, Path]] = {}
+        return mosaics(files)
+    by_root: dict[Path, filter_shots.Candidates] = {}
     for path in files:
-        angle = angle_of_folder(path.resolve().parent)
-        if angle is not None and angle not in grouped.setdefault(path.stem, {}):
-            grouped[path.stem][angle] = path
-    if any(len(shot) == 1 for shot in grouped.values()):  # folders that are called so by chance
-        grouped = {}
-    grouped = grouped or filter_shots.group_shots(files)
-    strangers = [path.name for path in files if not any(path in shot.values() for shot in grouped.values())]
-    if strangers:
-        raise PolarguideError(
-            files[0].parent,
-            expected="raw mosaics with --sensor, or shots with angles in their names",
-            found=listed(sorted(strangers)),
-            remedy=_REMEDY,
+        folder = path.resolve().parent
+        angle = angle_of_folder(folder)
+        if angle is not None:
+            shots = by_root.setdefault(folder.parent, {})
+            shots.setdefault(path.stem, {}).setdefault(angle, []).append(path)
+    # Files of one angle are in folders that are called so by chance.
+    in_folders = [c for c in by_root.values() if all(len(angles) > 1 for angles in c.values())]
+    placed = {path for c in in_folders for angles in c.values() for same in angles.values() for path in same}
+    by_name, others = filter_shots.group_files([path for path in files if path not in placed])
+    found = [shot for candidates in (*in_folders, by_name) for shot in _filter_sets(candidates)]
+    return found + _strangers(others)
+
+
+def _filter_sets(shots: filter_shots.Candidates) -> list[ExposureSet]:
+    return [
+        ExposureSet(
+            view,
+            "filter",
+            {angle: first for angle, (first, *_) in files.items()},
+            fault=filter_shots.ambiguity(view, files),
+            others=tuple(path for _, *more in files.values() for path in more),
         )
-    return [ExposureSet(name, "filter", shot) for name, shot in grouped.items()]
+        for view, files in sorted(shots.items())
+    ]
 
 
-def _mosaic(path: Path) -> ExposureSet:
-    return ExposureSet(path.stem, "mosaic", {0: path})
+def _strangers(files: Sequence[Path]) -> list[ExposureSet]:
+    """A fault for each picture whose name tells no angle."""
+    return [
+        ExposureSet(
+            path.name,
+            "filter",
+            {},
+            fault=PolarguideError(path, expected=_EXPECTED, found="no angle in its name", remedy=_REMEDY),
+            others=(path,),
+        )
+        for path in files
+    ]
+
+
+def _or_fault(
+    folder: Path, options: ShotOptions, look: Callable[[Path, ShotOptions], list[ExposureSet]]
+) -> list[ExposureSet]:
+    """The shots of a folder, or its fault."""
+    try:
+        return look(folder, options)
+    except PolarguideError as error:
+        fault = error
+    except OSError as error:
+        found, remedy = error.strerror or str(error), "Check its permissions."
+        fault = PolarguideError(folder, expected="a folder that can be read", found=found, remedy=remedy)
+    return [ExposureSet(folder.resolve().name, "filter", {}, fault=fault, others=(folder,))]
 
 
 def _in_folder(root: Path, options: ShotOptions) -> list[ExposureSet]:
     found = _directly_in(root, options)
-    if not found:
+    if not any(shot.files for shot in found):
         folders = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
         for folder in folders:
-            inside = _directly_in(folder, options)
+            inside = _or_fault(folder, options, _directly_in)
             alone = len(inside) == 1 and inside[0].name == folder.resolve().name
             found += inside if alone else [replace(s, name=f"{folder.name}_{s.name}") for s in inside]
     if not found:
@@ -124,41 +198,66 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
         layout = find_layout(root)
         return [ExposureSet(name, "scene", layout.pictures[name], root, name) for name in layout.names]
     if options.sensor is not None and not folders:
-        files = index_files(root, RAW_SUFFIXES)
+        files = list_files(root, RAW_SUFFIXES)
         dark = None if options.dark_frame is None else os.path.realpath(options.dark_frame)
-        return [_mosaic(path) for _, path in sorted(files.items()) if os.path.realpath(path) != dark]
-    shots = filter_shots.find_shots(root)
-    if not shots and index_files(root, filter_shots.SHOT_SUFFIXES):
-        raise PolarguideError(
-            root,
-            expected="raw mosaics with --sensor, or shots with angles in their names",
-            found=describe_contents(root),
-            remedy=_REMEDY,
-        )
-    return [ExposureSet(name, "filter", shot) for name, shot in sorted(shots.items())]
+        return mosaics([path for path in files if os.path.realpath(path) != dark])
+    shots, others = filter_shots.list_shots(root)
+    return _filter_sets(shots) + _strangers(others)
 
 
 def _named_apart(found: list[ExposureSet]) -> list[ExposureSet]:
-    """Sets of one name are called by their folder, too.
+    """Sets of one name are called by their folder, too; it is their fault where that does not tell them apart.
 
-    Raises:
-        PolarguideError: that does not tell them apart.
+    So is a name that is none of a folder.
     """
-    names = [shot.name for shot in found]
+    found = [shot if usable_name(shot.name) else _unusable(shot) for shot in found]
+    names = Counter(shot.name for shot in found)
     apart = [
         shot
-        if names.count(shot.name) == 1
+        if names[shot.name] == 1
         else replace(shot, name=f"{(shot.root or shot.paths[0].resolve().parent).name}_{shot.name}")
         for shot in found
     ]
-    first: dict[str, ExposureSet] = {}
+    named: dict[str, list[ExposureSet]] = {}
     for shot in apart:
-        if shot.name in first:
-            raise PolarguideError(
-                shot.paths[0],
-                expected="one shot of each name",
-                found=f"{shot.name} also at {first[shot.name].paths[0]}",
-                remedy="Rename one of them, or give them in two calls.",
-            )
-        first[shot.name] = shot
-    return apart
+        named.setdefault(shot.name, []).append(shot)
+    return [shot if len(named[shot.name]) == 1 else _ambiguous(shot, named[shot.name]) for shot in apart]
+
+
+def usable_name(name: str) -> bool:
+    """Whether a shot of this name can have a folder of that name."""
+    return name not in ("", ".", "..") and os.sep not in name and not (os.altsep and os.altsep in name)
+
+
+def require_name(shot: ExposureSet) -> None:
+    """Refuse a shot whose files would not be written into a folder of its own.
+
+    Raises:
+        PolarguideError: its name is none of a folder.
+    """
+    if not usable_name(shot.name):
+        raise PolarguideError(
+            shot.paths[0],
+            expected="a name that a folder can have",
+            found=repr(shot.name),
+            remedy="Rename the file.",
+        )
+
+
+def _unusable(shot: ExposureSet) -> ExposureSet:
+    try:
+        require_name(shot)
+    except PolarguideError as error:
+        return replace(shot, fault=shot.fault or error)
+    return shot
+
+
+def _ambiguous(shot: ExposureSet, alike: Sequence[ExposureSet]) -> ExposureSet:
+    other = next(other for other in alike if other is not shot)
+    fault = PolarguideError(
+        shot.paths[0],
+        expected="one shot of each name",
+        found=f"{shot.name} also at {other.paths[0]}",
+        remedy="Rename one of them, or give them in two calls.",
+    )
+    return replace(shot, fault=shot.fault or fault)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,10 +45,6 @@ class NoiseModel:
     floor: float
     slope: float
     source: str
-
-    def variance(self, intensity: Any) -> Any:
-        """Variance of a sample of this intensity, full scales squared; that of no light below zero."""
-        return self.floor + self.slope * np.maximum(intensity, 0)
 
 
 @dataclass(frozen=True, eq=False)

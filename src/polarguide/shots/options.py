@@ -10,9 +10,36 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
+from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.records import check_options
+from polarguide.records import check_options, option_name
 
+Kind = Literal["mosaic", "filter", "scene"]
+"""What a shot is made of: one file, one an angle, or a view of a scene."""
+_KINDS: dict[Kind, str] = {
+    "mosaic": "raw mosaics",
+    "filter": "shots through a filter",
+    "scene": "views of a scene",
+}
+_ONE: dict[Kind, str] = {
+    "mosaic": "a raw mosaic",
+    "filter": "a shot through a filter",
+    "scene": "a view of a scene",
+}
+_OWNERS: dict[str, tuple[Kind, ...]] = {
+    **dict.fromkeys(
+        (
+            "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
+            "saturation", "demosaic", "interpolation", "analyzers",
+        ),
+        ("mosaic",),
+    ),
+    "transfer": ("filter", "scene"),
+    "align": ("filter",),
+    "gains": ("mosaic", "filter"),
+}  # fmt: skip
+"""Options that mean something for some kinds of shots only."""
+_OPTION_OF = {"analyzers": "--calibration (of polarguide calibrate)", "align": "--no-align"}
 _NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
 _Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 
@@ -69,11 +96,52 @@ class ShotOptions:
         """The options themselves.
 
         Raises:
-            PolarguideError: a value is out of range.
+            PolarguideError: a value is out of range, or means nothing beside the others.
         """
         check_options(self)
         checked(self.calibration, "calibration")
+        if self.read_noise and self.full_well is None:
+            raise PolarguideError(
+                "--read-noise",
+                expected="a full well beside it, without which noise is estimated from each shot",
+                found=f"{self.read_noise:g} without --full-well",
+                remedy="Give --full-well, or leave it out.",
+            )
         return self
+
+    def changed(self) -> list[str]:
+        """Names of the options that are not as they are by default."""
+        default = ShotOptions()
+        return [f.name for f in fields(self) if getattr(self, f.name) != getattr(default, f.name)]
+
+    def require_kind(self, kind: Kind, name: str) -> None:
+        """Refuse options that mean nothing for a kind of shot.
+
+        Args:
+            kind: of the shot. name: of the shot.
+
+        Raises:
+            PolarguideError: one is set.
+        """
+        here = f"{name}, {_ONE[kind]}"
+        for option in self.changed():
+            owners = _OWNERS.get(option, (kind,))
+            if kind not in owners:
+                words = " and ".join(_KINDS[owner] for owner in owners)
+                more = " Raw mosaics need --sensor." if owners == ("mosaic",) and self.sensor is None else ""
+                raise PolarguideError(
+                    _OPTION_OF.get(option, option_name(option)),
+                    expected=f"{words}, which it is for",
+                    found=here,
+                    remedy=f"Leave it out; it changes nothing there.{more}",
+                )
+        if kind == "scene" and self.calibration.gains is not None:
+            raise PolarguideError(
+                "calibration (gains)",
+                expected="raw mosaics and shots through a filter, which gains are for",
+                found=here,
+                remedy="Leave the gains out; order, sense and zero apply. prepare --calibration corrects a scene.",
+            )
 
     def preparation(self) -> PrepareSettings:
         """The same as settings of ``prepare``, whose readers are used."""

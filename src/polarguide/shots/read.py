@@ -15,6 +15,8 @@ from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 
+UNREADABLE = (PolarguideError, OSError, MemoryError)
+"""What one bad file may raise; others come after it."""
 _TILE = 1 << 18
 """Pixels that are worked on at a time, so that what is between stays in the processor's cache."""
 _DARK_SNR = 3.0
@@ -49,6 +51,17 @@ def read_shot(
         shot = found[0]
     developed = develop(shot, options)
     return maps_of(shot, developed, options)
+
+
+def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
+    """One of ``UNREADABLE`` as an error that names the shot."""
+    if isinstance(error, PolarguideError):
+        return error
+    if isinstance(error, OSError):
+        found, remedy = error.strerror or str(error), "Check the files and their disk."
+    else:
+        found, remedy = "it needs more memory than there is", "Free memory, or take a smaller region."
+    return PolarguideError(shot.paths[0], expected="a shot that can be read", found=found, remedy=remedy)
 
 
 def tiles(height: int, width: int) -> Iterator[slice]:

@@ -16,12 +16,13 @@ from polarguide.files import atomic, make_folder, write_text, write_whole
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
 from polarguide.shots.catalog import KINDS
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.develop import check_files
+from polarguide.shots.exposures import ExposureSet, find_shots, require_name
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.page_html import PAGE, shot_page
 from polarguide.shots.pictures import drawn, stretch_of, with_legend
-from polarguide.shots.read import read_shot
+from polarguide.shots.read import UNREADABLE, fault_of, read_shot
 from polarguide.shots.surface import SurfaceMaps, camera_of, surface_maps
 from polarguide.visualization import figures
 
@@ -54,7 +55,8 @@ def write_shots(
 ) -> WrittenShots:
     """Write all maps of one or many shots, a folder for each.
 
-    A shot that cannot be read does not stop the others.
+    A shot that cannot be read does not stop the others. Files of an earlier call in other formats are
+    removed.
 
     Args:
         paths: files and folders as ``find_shots`` takes them, or what it has found.
@@ -81,23 +83,23 @@ def write_shots(
     if "exr" in formats:
         optional_import("OpenEXR", "EXR files", install="'polarguide[exr]'")
     found = [s for s in paths if isinstance(s, ExposureSet)]
-    found += (
-        find_shots([p for p in paths if not isinstance(p, ExposureSet)], options)
-        if len(found) < len(paths)
-        else []
-    )
+    if len(found) < len(paths) or not paths:
+        found += find_shots([p for p in paths if not isinstance(p, ExposureSet)], options)
+    check_files(options)
     folders: dict[str, Path] = {}
     faults: dict[str, PolarguideError] = {}
     with reporter.track("shots", len(found)) as advance:
         for number, shot in enumerate(found, 1):
             try:
+                require_name(shot)
                 maps = read_shot(shot, options)
                 surface = surface_maps(maps, camera_of(shot, maps.size, intrinsics), refractive_index)
-            except PolarguideError as error:
+            except UNREADABLE as error:
+                fault = fault_of(shot, error)
                 if len(found) == 1:
-                    raise
-                faults[shot.name] = error
-                reporter.warn(str(error))
+                    raise fault from error
+                faults[shot.name] = fault
+                reporter.warn(str(fault))
             else:
                 for note in maps.notes:
                     reporter.say(f"{shot.name}: {note}")
@@ -113,10 +115,14 @@ def write_maps(
 ) -> Path:
     """Write the maps of one shot into a folder; returns the folder.
 
+    Maps that were written there before in other formats are removed: all that is there is of this shot as read now.
+
     Raises:
         PolarguideError: the folder cannot be made.
     """
     make_folder(folder)
+    # Without the record, files of these names are not known to be this program's.
+    earlier = _files_of(set(FORMATS) - set(formats)) if (folder / UNITS_FILE).is_file() else []
     for kind in KINDS:
         values = kind.values(maps, surface)
         if "png" in formats:
@@ -131,7 +137,16 @@ def write_maps(
     write_whole(folder / UNITS_FILE, to_json(_record(maps, surface)))
     if "page" in formats:
         write_text(folder / PAGE, shot_page(maps, surface))
+    for name in earlier:
+        if not (folder / name).is_dir():
+            (folder / name).unlink(missing_ok=True)
     return folder
+
+
+def _files_of(formats: Collection[str]) -> list[str]:
+    """Names of the files of formats."""
+    names = [f"{kind.key}.{suffix}" for suffix in formats if suffix != "page" for kind in KINDS]
+    return [*names, PAGE] if "page" in formats else names
 
 
 def _record(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, Any]:

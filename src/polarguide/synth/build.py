@@ -11,6 +11,7 @@ import numpy as np
 
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
+from polarguide.synth.bounds import REMEDY, require_light, require_solid
 from polarguide.synth.environment import make_environment
 from polarguide.synth.mesh import Array, Mesh, rotation, write_ply
 from polarguide.synth.mitsuba_dicts import area_light_dict, bsdf_dict, environment_dict, shown_dict
@@ -49,6 +50,7 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
     for thing, mesh in zip(spec.things, meshes, strict=True):
         write_ply(folder / "mesh" / f"{thing.name}.ply", mesh)
     panorama = make_environment(spec.environment, spec.name, spec.folder)
+    require_light(panorama, f"{spec.name} (environment)")
     _, encoded = cv2.imencode(".hdr", panorama[..., ::-1].astype(np.float32))
     write_whole(folder / "environment.hdr", encoded.tobytes())
     pictures = [_texture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
@@ -73,12 +75,28 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
 def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
     turn, position = rotation(thing.rotation), np.array(thing.position, float)
     if thing.shape.get("type") == "ball":
-        mesh = sphere(float(thing.shape.get("radius", 1.0)))
+        mesh = sphere(_radius(thing))
     elif thing.shape.get("type") == "mesh":
         mesh = _user_mesh(spec.folder / str(thing.shape.get("file")))
     else:
         mesh = make_mesh(thing.shape, thing.name)
-    return mesh.moved(thing.scale, turn, position)
+    moved = mesh.moved(thing.scale, turn, position)
+    require_solid(moved.points, thing.name)
+    return moved
+
+
+def _radius(thing: Thing) -> float:
+    """Of a ball.
+
+    Raises:
+        PolarguideError: it is none.
+    """
+    radius = thing.shape.get("radius", 1.0)
+    if isinstance(radius, bool) or not isinstance(radius, int | float) or not radius > 0:
+        raise PolarguideError(
+            f"{thing.name} shape.radius", expected="a number above 0", found=str(radius)[:100], remedy=REMEDY
+        )
+    return float(radius)
 
 
 def _user_mesh(path: Path) -> Mesh:
@@ -123,7 +141,7 @@ def _shape(thing: Thing, mesh: Mesh, path: Path, surface: dict[str, Any]) -> Any
     import mitsuba as mi
 
     if thing.shape.get("type") == "ball":
-        radius = float(thing.shape.get("radius", 1.0)) * thing.scale
+        radius = _radius(thing) * thing.scale
         return mi.load_dict({"type": "sphere", "center": list(thing.position), "radius": radius, **surface})
     flat = mesh.normals is None
     return mi.load_dict({"type": "ply", "filename": str(path), "face_normals": flat, **surface})

@@ -126,7 +126,8 @@ def photograph(out: Path, name: str) -> NDArray[np.uint8]:
     """The mean of a view's four pictures as 8-bit sRGB, [H, W, 3]."""
     files = view_files(out, name, ground_truth=False, raw=False)
     parts = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files]
-    return display_encoded(np.mean(parts, axis=0)[..., ::-1] / 65535)
+    mean = np.mean(parts, axis=0) / 65535
+    return display_encoded(mean[..., ::-1] if mean.ndim == 3 else np.repeat(mean[..., None], 3, axis=2))
 
 
 def display_encoded(linear: Array) -> NDArray[np.uint8]:

@@ -14,12 +14,14 @@ from msgspec import Meta, Struct
 
 from polarguide.errors import PolarguideError
 from polarguide.records import decode, read_record
+from polarguide.synth.bounds import LARGEST, REMEDY, check_file_name, check_numbers
 
-Vector = tuple[float, float, float]
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Vector = tuple[Number, Number, Number]
 Data = dict[str, Any]
+MOST_VIEWS, MOST_SURFACES = 10_000, 1000
 OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
 """Names that fields had in earlier scene files and requests."""
-REMEDY = "docs/reference/scene-files.md describes the fields."
 
 
 class Material(Struct, frozen=True, forbid_unknown_fields=True):
@@ -59,7 +61,17 @@ class Thing(Struct, frozen=True, forbid_unknown_fields=True):
     foreground: bool = True
     position: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (0.0, 0.0, 0.0)
-    scale: float = 1.0
+    scale: Annotated[float, Meta(gt=0, le=LARGEST)] = 1.0
+
+
+class Ring(Struct, frozen=True, rename={"start": "from", "stop": "to"}):
+    """Of cameras: radius, height over the ground, share of the views, and the arc in degrees about z."""
+
+    radius: Annotated[float, Meta(gt=0, le=LARGEST)]
+    height: Number
+    share: Annotated[float, Meta(ge=0, le=LARGEST)] = 1.0
+    start: Number = 0.0
+    stop: Number = 360.0
 
 
 class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
@@ -75,10 +87,10 @@ class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
 
     rings: Annotated[tuple[Data, ...], Meta(min_length=1)]
     target: Vector = (0.0, 0.0, 0.0)
-    wander: float = 0.0
+    wander: Number = 0.0
     fov: Annotated[float, Meta(gt=1, lt=150)] = 40.0
-    views: Annotated[int, Meta(ge=1)] = 72
-    spacing: float | None = None
+    views: Annotated[int, Meta(ge=1, le=MOST_VIEWS)] = 72
+    spacing: Number | None = None
 
 
 class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
@@ -104,9 +116,9 @@ class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
     environment: Data
     about: str = ""
     lights: tuple[Data, ...] = ()
-    depth: int = 6
-    clamp: float = 0.0
-    exposure: float | None = None
+    depth: Annotated[int, Meta(ge=1, le=MOST_SURFACES)] = 6
+    clamp: Annotated[float, Meta(ge=0)] = 0.0
+    exposure: Annotated[float, Meta(gt=0)] | None = None
     object_only: bool = False
     folder: Path = Path(".")
 
@@ -140,10 +152,22 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
         PolarguideError: it lacks a field, has an unknown one or a value out of range.
     """
     spec = decode(with_current_keys(data), SceneSpec, where, remedy=REMEDY)
+    for number, ring in enumerate(spec.camera.rings):
+        decode(ring, Ring, f"{where} (camera.rings[{number}])", remedy=REMEDY)
     names = [thing.name for thing in spec.things]
     if len(set(names)) < len(names):
         raise PolarguideError(
             f"{where} (things)", expected="objects with different names", found=str(names), remedy=REMEDY
+        )
+    for number, thing in enumerate(spec.things):
+        check_file_name(thing.name, f"{where} (things[{number}].name)")
+        check_numbers(thing.shape, where, f"things[{number}].shape")
+        check_numbers(thing.material.color, where, f"things[{number}].material.color")
+    for key in ("environment", "lights"):
+        check_numbers(getattr(spec, key), where, key)
+    if not sum(ring.get("share", 1.0) for ring in spec.camera.rings) > 0:
+        raise PolarguideError(
+            f"{where} (camera.rings)", expected="a share of the views above 0", found="none", remedy=REMEDY
         )
     return msgspec.structs.replace(spec, folder=folder)
 

@@ -24,6 +24,9 @@ from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Weights
 from polarguide.vectors import dot, unit
 
+# Weight of ``coverage_loss``.
+COVERAGE = 0.1
+
 
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     """Unit normals of a depth picture by central differences, facing the camera.
@@ -128,6 +131,15 @@ def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
     return 100 / extent * (shortest * visible).sum() / visible.sum().clamp(min=1)
 
 
+def coverage_loss(alpha: Tensor, empty: Tensor) -> Tensor:
+    """Mean alpha of the pixels that show nothing.
+
+    Args:
+        alpha: [H, W]. empty: [H, W] 1 where the picture shows nothing.
+    """
+    return (alpha * empty).sum() / empty.sum().clamp(min=1)
+
+
 def step_loss(
     result: RenderResult,
     shown: Tensor,
@@ -140,6 +152,7 @@ def step_loss(
     log_scales: Tensor,
     extent: float,
     camera: Camera | None = None,
+    empty: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The weighted sum of a stage's terms, and its photometric term alone (for the display).
 
@@ -153,6 +166,7 @@ def step_loss(
         shading: of the stage, for the run's refractive index.
         log_scales: [N, 3] of the Gaussians. extent: of the scene.
         camera: of the view; needed where a weight asks for the normals of the depth.
+        empty: [H, W] 1 where the view shows nothing; None: where that is not known.
     """
     photometric = photometric_loss(result.final, shown, valid, ssim_weight)
     total = weights.photometric * photometric
@@ -161,6 +175,8 @@ def step_loss(
     if weights.flatness and result.radii is not None:
         total = total + weights.flatness * flatness_loss(log_scales, result.radii, extent)
     total = total + normal_terms(result, weights, priors, camera, shading)
+    if empty is not None:
+        total = total + COVERAGE * coverage_loss(result.alpha, empty)
     if total.device.type == "cpu":
         refuse_diverged(total.detach())
     return total, photometric

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from polarguide.errors import PolarguideError
-from polarguide.options import check_count
+from polarguide.options import check_choice, check_count
 
 MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
+Background = Literal["auto", "scene", "black", "masked"]
+BACKGROUNDS: tuple[Background, ...] = ("auto", "scene", "black", "masked")
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -28,17 +30,21 @@ class TrainSettings:
         refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water.
         views_per_step: Views whose mean gradient makes a step; 0 takes one for each process (or what the run to resume
             took). Learning rates grow with its square root; steps are steps, so more views are looked at.
+        background: What is behind the subject: a scene to reconstruct, too; black, that is nothing; masked makes it
+            nothing (the subject in masks/ alone is read); auto takes black where the edges of the pictures are.
     """
 
     steps: int = 5000
     seed: int = 0
     refractive_index: float = 1.5
     views_per_step: int = 1
+    background: Background = "auto"
 
     def __post_init__(self) -> None:
         check_count("steps", self.steps)
         check_count("views_per_step", self.views_per_step, 0, MOST_VIEWS)
         check_count("seed", self.seed, 0, MOST_SEEDS)
+        check_choice("background", self.background, BACKGROUNDS)
         if not 1.0 < self.refractive_index < 4.0:
             raise PolarguideError(
                 "refractive_index",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -104,12 +104,24 @@ def seeded(*numbers: int) -> torch.Generator:
 
 
 def first_state(
-    scene: Scene, recipe: Recipe, settings: TrainSettings, device: torch.device | str = "cpu"
+    scene: Scene,
+    recipe: Recipe,
+    settings: TrainSettings,
+    device: torch.device | str = "cpu",
+    *,
+    surroundings: bool = True,
 ) -> TrainingState:
-    """The state before the first step; drawn on the CPU, so that every device begins with the same."""
+    """The state before the first step; drawn on the CPU, so that every device begins with the same.
+
+    Args:
+        scene, recipe, settings: of the training.
+        device: of the Gaussians.
+        surroundings: whether there are any, for which far Gaussians are added.
+    """
+    initialization = recipe.initialization if surroundings else replace(recipe.initialization, shell=0)
     colors = srgb_decode(scene.point_colors.float() / 255)
     centers = torch.stack([view.camera.center for view in scene.train_views])
-    tensors = initial_parameters(scene.points, colors, centers, recipe.initialization, seed=settings.seed)
+    tensors = initial_parameters(scene.points, colors, centers, initialization, seed=settings.seed)
     count = tensors["means"].shape[0]
     if recipe.oriented:
         tensors |= {name: torch.zeros(count, *shape) for name, shape in ORIENTED_SHAPES.items()}

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
+from polarguide.capture.background import empty_pixels, has_black_background
 from polarguide.color import srgb_encode
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
@@ -21,7 +22,7 @@ from polarguide.gaussians.initialize import scene_extent
 from polarguide.raster import Backend, ScreenStatistic
 from polarguide.shading.gbuffer import COLOR_CHANNELS, render
 from polarguide.shading.model import PLAIN
-from polarguide.shading.visibility import outward_directions
+from polarguide.shading.visibility import outward_directions, touching_views
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
@@ -31,12 +32,25 @@ from polarguide.training.schedule import Schedule
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState, first_state, seeded
 
+# From so many training views on, what only one of them sees goes where nothing is behind the subject.
+ENOUGH_VIEWS = 12
+
 
 class _Shown(NamedTuple):
-    """A training view's photograph [H, W, 3] as shown, and 1 where it counts [H, W] (None: everywhere)."""
+    """A training view's photograph [H, W, 3] as shown, 1 where it counts [H, W] (None: everywhere), and 1 where it
+    shows nothing [H, W] (None: where that is not known).
+    """
 
     picture: Tensor
     valid: Tensor | None
+    empty: Tensor | None
+
+
+def is_black(scene: Scene, settings: TrainSettings) -> bool:
+    """Whether a training takes it that nothing is behind the subject."""
+    if settings.background == "auto":
+        return has_black_background(scene.train_views)
+    return settings.background != "scene"
 
 
 class Trainer:
@@ -52,6 +66,7 @@ class Trainer:
 
     Attributes:
         shading: the recipe's, for the run's refractive index.
+        black: whether nothing is behind the subject.
         whole: whether the state is one between two steps; an exception may leave it in the middle of a change.
     """
 
@@ -69,7 +84,10 @@ class Trainer:
         self.whole = True
         self.schedule = Schedule(recipe, settings.steps)
         self.shading = recipe.shading.bind(settings.refractive_index)
-        self.state = state or first_state(scene, recipe, settings, backend.device)
+        self.black = is_black(scene, settings)
+        self.state = state or first_state(
+            scene, recipe, settings, backend.device, surroundings=not self.black
+        )
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
         centers = torch.stack([view.camera.center for view in scene.train_views])
@@ -103,6 +121,7 @@ class Trainer:
         mean = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
         report = StepReport(state.step, position.stage.name, len(state.gaussians), mean)
         state.step += 1
+        densifies = position.stage.densify
         if position.stage.densify and state.step % recipe.densification.every == 0:
             self.exchange_statistics()
             densify(
@@ -116,8 +135,25 @@ class Trainer:
                 limit=self._limit,
                 generator=seeded(self.settings.seed, 2, state.step),
             )
+        if self.black and densifies and not self._densifies_next():
+            self._prune_untouched()
         self.whole = True
         return report
+
+    def _densifies_next(self) -> bool:
+        """Whether the next step belongs to a stage with density control."""
+        step = self.state.step
+        return step < self.settings.steps and self.schedule.at(step).stage.densify
+
+    def _prune_untouched(self) -> None:
+        """Remove Gaussians that too few training views can tell anything about: in new views they are fog."""
+        state, views = self.state, self.scene.train_views
+        counts = touching_views(state.gaussians, [view.camera for view in views], self.backend.rasterize)
+        self.ranks.broadcast(counts)
+        kept = counts >= (2 if len(views) >= ENOUGH_VIEWS else 1)
+        if bool(kept.any()):
+            state.gaussians.keep(kept)
+            state.statistics.clear(len(state.gaussians))
 
     def exchange_statistics(self) -> None:
         """Let every rank know what all have seen since the last densification. All ranks have to call it."""
@@ -153,6 +189,7 @@ class Trainer:
             log_scales=state.gaussians["log_scales"],
             extent=self._extent,
             camera=view.camera,
+            empty=shown.empty,
         )
         loss.backward()
         gradient = statistic.gradient if statistic else None
@@ -228,7 +265,8 @@ class Trainer:
         if view.name not in self._shown:
             picture = srgb_encode(view.photograph().clamp(0, 1)).to(self._device)
             valid = (~view.invalid).float().to(self._device) if bool(view.invalid.any()) else None
-            self._shown[view.name] = _Shown(picture, valid)
+            empty = empty_pixels(view).float().to(self._device) if self.black else None
+            self._shown[view.name] = _Shown(picture, valid, empty)
         return self._shown[view.name]
 
     def _priors_of(self, view: View, stage: Stage) -> ViewPriors | None:

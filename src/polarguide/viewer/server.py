@@ -80,7 +80,8 @@ class Viewer:
         self._current, self._photographs = current, photographs
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
         turns = shading.radiance_cubemap is not None
-        self._save = save if host in LOOPBACK else None
+        others = visitors.allow_host or visitors.allow_origin
+        self._save = save if host in LOOPBACK and not others else None
         self._options = PanelOptions(
             shading.layers, turns, tuple(photographs), trains, presentation, self._save is not None
         )

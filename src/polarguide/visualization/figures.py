@@ -151,8 +151,11 @@ def _bar(colors: Picture, left: str, right: str) -> Picture:
     return drawn
 
 
-def write_png(path: str | Path, rgb8: Picture) -> None:
+def write_png(path: str | Path, rgb8: Picture, alpha8: Picture | None = None) -> None:
     """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
+
+    Args:
+        path: of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
 
     Raises:
         ValueError: not such a picture.
@@ -164,16 +167,17 @@ def write_png(path: str | Path, rgb8: Picture) -> None:
         raise PolarguideError(
             path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
         )
-    write_whole(path, png_bytes(rgb8))
+    write_whole(path, png_bytes(rgb8, alpha8))
 
 
-def png_bytes(rgb8: Picture) -> bytes:
-    """A uint8 RGB [H, W, 3] picture as a PNG file.
+def png_bytes(rgb8: Picture, alpha8: Picture | None = None) -> bytes:
+    """A uint8 RGB [H, W, 3] picture as a PNG file, with how opaque it is [H, W] where that is given.
 
     Raises:
         ValueError: it cannot be encoded.
     """
-    encoded, data = cv2.imencode(".png", rgb8[..., ::-1])
+    stored = rgb8[..., ::-1] if alpha8 is None else np.dstack((rgb8[..., ::-1], alpha8))
+    encoded, data = cv2.imencode(".png", stored)
     if not encoded:
         raise ValueError("picture: it could not be encoded as PNG")
     return data.tobytes()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
 from polarguide.capture.filter.exif import orientation
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_file
-from polarguide.capture.layout import ambiguous, angle_folders, index_files, pictures_of_folders
+from polarguide.capture.layout import ambiguous, angle_folders, index_files, list_files, require_angle_folders
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.view_reader import require_alike
 from polarguide.errors import PolarguideError
 
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
+Candidates = dict[str, dict[int, list[Path]]]
+"""View -> angle -> the files that may be its shot: one, unless names are ambiguous."""
 _SUFFIX = re.compile(
     r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE
 )
@@ -63,42 +65,62 @@ def find_shots(root: Path, *, nested: bool = False) -> dict[str, dict[int, Path]
     Raises:
         PolarguideError: two files have the same view and angle, or a folder is missing.
     """
+    shots, _ = list_shots(root, nested=nested)
+    for view, files in shots.items():
+        fault = ambiguity(view, files)
+        if fault is not None:
+            raise fault
+    return {view: {angle: paths[0] for angle, paths in files.items()} for view, files in shots.items()}
+
+
+def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Path]]:
+    """What ``find_shots`` finds, with every file of a view and angle where there are several, and the other pictures.
+
+    Raises:
+        PolarguideError: a folder of an angle is missing, or there are two.
+    """
     folders = angle_folders(root)
-    if folders:
-        return pictures_of_folders(root, folders, SHOT_SUFFIXES)
-    files = list(index_files(root, SHOT_SUFFIXES).values())
-    if nested and not files and not index_files(root, RAW_SUFFIXES):
-        below = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
-        files = [file for folder in below for file in index_files(folder, SHOT_SUFFIXES).values()]
-    return group_shots(files)
+    if not folders:
+        files = list_files(root, SHOT_SUFFIXES)
+        if nested and not files and not index_files(root, RAW_SUFFIXES):
+            below = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
+            files = [file for folder in below for file in list_files(folder, SHOT_SUFFIXES)]
+        return group_files(files)
+    require_angle_folders(root, folders)
+    shots: Candidates = {}
+    for angle, folder in folders.items():
+        for path in list_files(folder, SHOT_SUFFIXES):
+            shots.setdefault(path.stem, {}).setdefault(angle, []).append(path)
+    return shots, []
 
 
-def group_shots(files: Sequence[Path]) -> dict[str, dict[int, Path]]:
-    """View -> angle -> file, by the names of files; those without an angle in their name are left out.
+def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
+    """View -> angle -> files, by their names, and the files without an angle in their name.
 
     Files named like the angles alone are one view, called like their folder, where a folder has nothing else among
     the files.
-
-    Raises:
-        PolarguideError: two files have the same view and angle.
     """
-    shots: dict[str, dict[int, Path]] = {}
+    shots: Candidates = {}
+    others: list[Path] = []
     for folder in dict.fromkeys(path.parent for path in files):
         inside = [path for path in files if path.parent == folder]
-        bare = {int(match["angle"]): path for path in inside if (match := _BARE.fullmatch(path.stem))}
-        if len(bare) == len(inside) == len(ANGLES):
-            shots[folder.resolve().name] = dict(sorted(bare.items()))
-            continue
+        alone = all(_BARE.fullmatch(path.stem) for path in inside)
         for path in inside:
-            match = _SUFFIX.fullmatch(path.stem)
+            match = (_BARE if alone else _SUFFIX).fullmatch(path.stem)
             if match is None:
+                others.append(path)
                 continue
-            view = match["view"]
-            of_view, angle = shots.setdefault(view, {}), int(match["angle"])
-            if angle in of_view:
-                raise ambiguous(folder, f"one picture of {view} at {angle} degrees", of_view[angle], path)
-            of_view[angle] = path
-    return shots
+            view = folder.resolve().name if alone else match["view"]
+            shots.setdefault(view, {}).setdefault(int(match["angle"]), []).append(path)
+    return {view: dict(sorted(of_view.items())) for view, of_view in shots.items()}, others
+
+
+def ambiguity(view: str, files: Mapping[int, Sequence[Path]]) -> PolarguideError | None:
+    """The error that two files are one shot of a view; None where there is at most one an angle."""
+    for angle, (first, *more) in files.items():
+        if more:
+            return ambiguous(first.parent, f"one picture of {view} at {angle} degrees", first, more[0])
+    return None
 
 
 def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:

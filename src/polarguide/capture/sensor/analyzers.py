@@ -1,65 +1,33 @@
-"""Analyzer vectors of a polarization sensor: their file, and the correction of what the sensor measures with them.
+"""Analyzer vectors of a polarization sensor, and the correction of what it measures with them.
 
 A pixel behind a polarizer measures ``I = a . (S0, S1, S2)`` of the linear Stokes vector; ``a`` is its analyzer vector,
-``(1, cos 2p, sin 2p) / 2`` for an ideal polarizer at the angle p. ``polarguide calibrate`` estimates the vectors;
-``read_analyzers`` reads them, and ``AnalyzerCalibration.apply`` gives the intensities that ideal polarizers would have
-measured (the superpixel calibration of Powell and Gruev, Optics Express 21(18), 2013).
+``(1, cos 2p, sin 2p) / 2`` for an ideal polarizer at the angle p. ``polarguide calibrate`` estimates the vectors,
+``analyzer_file`` writes and reads them, and ``AnalyzerCalibration.apply`` gives the intensities that ideal polarizers
+would have measured (the superpixel calibration of Powell and Gruev, Optics Express 21(18), 2013).
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
-from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
+from polarguide.capture.sensor.analyzer_matrices import correction_matrices
+from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
 from polarguide.errors import PolarguideError
-from polarguide.files import require_file, write_whole
 from polarguide.polarizer import ANGLES
-from polarguide.records import decode
 
-FORMAT, VERSION = "polarguide-analyzers", 1
-SUFFIX = ".safetensors"
+FARTHEST_ANGLE = np.radians(20.0)
+"""Of a polarizer from the angle that its position has by design."""
 LEAST_DIATTENUATION = 0.3
 """Of a pixel's polarizer; below it, its angle and the correction mean nothing. (Extinction ratio 1.9.)"""
-_ENTRY, _TENSOR = "polarguide", "vectors"
 _AT_ONCE = 16
 """Rows of cells whose matrices are made at once: their parts then stay in the processor's cache."""
-_REMEDY = "Calibrate again (polarguide calibrate), or copy the file again."
 
 Array = NDArray[np.float32]
 Reference = Literal["angles", "mean"]
-_Positive = Annotated[int, msgspec.Meta(ge=1, le=1 << 20)]
-_NotNegative = Annotated[int, msgspec.Meta(ge=0, le=1 << 20)]
-
-
-class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
-    """The one entry of metadata of the file."""
-
-    format: str
-    version: int
-    sensor: str
-    lens: str
-    width: _Positive
-    height: _Positive
-    offset_x: _NotNegative
-    offset_y: _NotNegative
-    block: _Positive
-    reference: Reference
-    polarizer_extinction: float | None
-    units: str
-    sha256: str
-
-
-UNITS = "intensity per Stokes component, (S0, S1, S2); an ideal polarizer has (1, cos 2p, sin 2p) / 2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,118 +288,11 @@ class AnalyzerCalibration:
         return unique, inverse.reshape(-1)
 
 
-def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
-    """Matrices from measured samples of a cell to those of ideal polarizers.
-
-    ``C = W pinv(A) + n m^T``: A [4, 3] are the analyzer vectors, W those of ideal polarizers, n and m the unit vectors
-    perpendicular to the columns of W and A. C A = W, and C is the identity where A is W.
-
-    Args:
-        analyzers: four of [..., 3], the vectors of the samples of a cell. nominal: their nominal angles in degrees.
-
-    Returns:
-        [4, 4, ...] float32.
-    """
-    u, v, w = ([a[..., component].astype(np.float32) for a in analyzers] for component in range(3))
-
-    def dot(x: list[Any], y: list[Any]) -> Any:
-        return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
-
-    uu, uv, uw, vv, vw, ww = dot(u, u), dot(u, v), dot(u, w), dot(v, v), dot(v, w), dot(w, w)
-    # The inverse of A^T A by its adjugate: millions of 3x3 matrices, for which LAPACK's calls would take seconds.
-    a00, a01, a02 = vv * ww - vw * vw, uw * vw - uv * ww, uv * vw - uw * vv
-    a11, a12, a22 = uu * ww - uw * uw, uv * uw - uu * vw, uu * vv - uv * uv
-    scale = 1 / (uu * a00 + uv * a01 + uw * a02)
-    inverse = [
-        [(r[0] * u[j] + r[1] * v[j] + r[2] * w[j]) * scale for j in range(4)]
-        for r in ((a00, a01, a02), (a01, a11, a12), (a02, a12, a22))
-    ]
-    left = []
-    for j in range(4):
-        i, k, m = (other for other in range(4) if other != j)
-        minor = u[i] * (v[k] * w[m] - v[m] * w[k]) - v[i] * (u[k] * w[m] - u[m] * w[k])
-        minor = minor + w[i] * (u[k] * v[m] - u[m] * v[k])
-        left.append(minor if j % 2 == 0 else -minor)
-    rest = [0.5 if int(angle) % 90 == 0 else -0.5 for angle in nominal]
-    along = dot(rest, left)
-    length = np.copysign(np.sqrt(dot(left, left)), along)
-    left = [part / length for part in left]
-    cosine = [{0: 1.0, 90: -1.0}.get(int(angle), 0.0) for angle in nominal]
-    sine = [{45: 1.0, 135: -1.0}.get(int(angle), 0.0) for angle in nominal]
-    rows = []
-    for k in range(4):
-        turned = inverse[1] if cosine[k] else inverse[2]
-        sign = cosine[k] + sine[k]
-        rows.append([(inverse[0][j] + sign * turned[j]) / 2 + rest[k] * left[j] for j in range(4)])
-    return np.asarray(rows, np.float32)
-
-
 def spread_to_cells(bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Unusable samples [H, W] of a mosaic that starts with a cell, spread to all of their cells: these were mixed."""
     height, width = bad.shape
     cells = bad.reshape(height // 2, 2, width // 2, 2).any(axis=(1, 3))
     return np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
-
-
-def is_analyzer_file(path: Path) -> bool:
-    """Whether a file looks like one of analyzers rather than like JSON; False where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            start = file.read(64)
-    except OSError:
-        return False
-    return path.suffix.lower() == SUFFIX or (start[8:9] == b"{" and not start[:8].isspace())
-
-
-def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
-    """Write the file of a calibration, which is the same bytes for the same content; returns the checksum.
-
-    Raises:
-        PolarguideError: it cannot be written.
-    """
-    vectors = np.ascontiguousarray(calibration.vectors, np.float32)
-    metadata = _Metadata(
-        FORMAT, VERSION, calibration.sensor, calibration.lens, *calibration.size, *calibration.offset,
-        calibration.block, calibration.reference, calibration.polarizer_extinction, UNITS, "",
-    )  # fmt: skip
-    metadata.sha256 = _checksum(metadata, vectors)
-    # One entry: safetensors writes several in any order.
-    text = json.dumps(msgspec.to_builtins(metadata), ensure_ascii=False)
-    write_whole(path, save({_TENSOR: vectors}, metadata={_ENTRY: text}))
-    return metadata.sha256
-
-
-def read_analyzers(path: Path) -> AnalyzerCalibration:
-    """Read the file that ``polarguide calibrate`` wrote.
-
-    Raises:
-        PolarguideError: it cannot be read, is cut short, damaged, or of another kind or version.
-    """
-    require_file(path, expected="a calibration of polarguide calibrate", remedy=_REMEDY)
-    try:
-        with safe_open(path, framework="numpy") as file:
-            entries, names = file.metadata() or {}, list(file.keys())
-            vectors = file.get_tensor(_TENSOR) if names == [_TENSOR] else None
-    except (SafetensorError, ValueError, OSError, RuntimeError, TypeError) as error:
-        raise _damaged(path, f"damaged or foreign data ({str(error)[:200]})") from None
-    if _ENTRY not in entries or vectors is None:
-        raise _damaged(path, "another safetensors file")
-    metadata = decode(entries[_ENTRY].encode(), _Metadata, path, remedy=_REMEDY)
-    if metadata.format != FORMAT or metadata.version != VERSION:
-        raise _damaged(path, f"{metadata.format}, version {metadata.version}")
-    if _checksum(metadata, vectors) != metadata.sha256:
-        raise PolarguideError(
-            path,
-            expected=f"content with the checksum {metadata.sha256[:16]}...",
-            found="other content: the file is damaged, or was changed",
-            remedy=_REMEDY,
-        )
-    found = AnalyzerCalibration(
-        metadata.sensor, metadata.lens, (metadata.offset_x, metadata.offset_y), (metadata.width, metadata.height),
-        metadata.block, vectors, metadata.reference, metadata.polarizer_extinction, metadata.sha256,
-    )  # fmt: skip
-    _require_sound(path, found)
-    return found
 
 
 def grid_shape(offset: tuple[int, int], size: tuple[int, int], block: int) -> tuple[int, int]:
@@ -441,44 +302,6 @@ def grid_shape(offset: tuple[int, int], size: tuple[int, int], block: int) -> tu
         for start, length in zip(offset[::-1], size[::-1], strict=True)
     )
     return rows, columns
-
-
-def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
-    """Refuse content that fits its checksum and still makes no sense.
-
-    Raises:
-        PolarguideError: an unknown sensor, vectors of another shape, or that no polarizer has.
-    """
-    if found.sensor not in SENSORS:
-        raise _damaged(path, f"one of the sensor {found.sensor!r}, which is unknown")
-    period = found.pattern.period
-    shape = (*grid_shape(found.offset, found.size, found.block), period, period, 3)
-    if found.block % period or found.vectors.shape != shape or found.vectors.dtype != np.float32:
-        raise _damaged(
-            path, f"vectors {list(found.vectors.shape)} of {found.vectors.dtype} instead of {list(shape)}"
-        )
-    gain = found.vectors[..., 0]
-    if not (np.isfinite(found.vectors).all() and (gain > 0).all()):
-        raise _damaged(path, "vectors that are not finite, or have no throughput")
-    if (np.hypot(found.vectors[..., 1], found.vectors[..., 2]) < LEAST_DIATTENUATION * gain).any():
-        raise _damaged(path, "vectors of pixels that hardly polarize")
-
-
-def _damaged(path: Path, found: str) -> PolarguideError:
-    return PolarguideError(
-        path,
-        expected=f"a file that polarguide calibrate wrote (version {VERSION})",
-        found=found,
-        remedy=_REMEDY,
-    )
-
-
-def _checksum(metadata: _Metadata, vectors: NDArray[Any]) -> str:
-    said = {key: value for key, value in msgspec.to_builtins(metadata).items() if key != "sha256"}
-    digest = hashlib.sha256(json.dumps(said, ensure_ascii=False, sort_keys=True).encode())
-    digest.update(f"{vectors.dtype.str} {vectors.shape}".encode())
-    digest.update(np.ascontiguousarray(vectors).tobytes())
-    return digest.hexdigest()
 
 
 def _region(offset: tuple[int, int], size: tuple[int, int]) -> str:

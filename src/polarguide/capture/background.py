@@ -1,0 +1,114 @@
+"""What lies behind the subject: surroundings, or nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import label
+from torch import Tensor
+
+from polarguide.capture.view import Scene, View
+from polarguide.errors import PolarguideError
+
+DARK = 0.005
+"""Linear S0/2 up to which a pixel counts as black, taken over 3 x 3 pixels, so that noise does not lighten it."""
+BLACK_EDGE = 0.95
+"""Share of a picture's outermost pixels that are black where there is nothing behind the subject."""
+BLACK_VIEWS = 0.9
+"""Share of the views of which that has to be true."""
+GROWN = 3
+"""Pixels by which a subject is grown before what is outside counts as empty: edges are blended."""
+INSIDE = 0.8
+"""Share of the pictures that see a point in which it has to lie in the mask, to belong to the subject."""
+
+
+def has_black_background(views: Sequence[View]) -> bool:
+    """Whether nothing is behind the subject: the edges of nearly all pictures are black, see ``BLACK_EDGE``."""
+    black = sum(_black_edge(view) for view in views)
+    return bool(views) and black >= BLACK_VIEWS * len(views)
+
+
+def empty_pixels(view: View) -> Tensor:
+    """Where a picture of a subject before black shows nothing, [H, W] bool.
+
+    That is outside its mask, where it has one; elsewhere the black that reaches the edge of the picture, so that a dark
+    spot of the subject is not taken for a hole. The subject is grown by ``GROWN`` pixels.
+    """
+    if view.mask is not None:
+        subject = view.mask.cpu().numpy()
+    else:
+        black = _black(view)
+        regions, _ = label(black)
+        outside = np.unique(np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]]))
+        subject = ~np.isin(regions, outside[outside > 0])
+    return torch.from_numpy(~_grown(subject, GROWN))
+
+
+def without_surroundings(scene: Scene) -> Scene:
+    """The scene with its subject alone: black outside the masks, and points of the subject only.
+
+    Raises:
+        PolarguideError: a view has no mask, or no point lies in the masks.
+    """
+    views = []
+    for view in scene.views:
+        if view.mask is None:
+            raise PolarguideError(
+                scene.root / "masks",
+                expected="a mask of every view for --background masked",
+                found=f"none of view {view.name}",
+                remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
+            )
+        views.append(replace(view, codes=view.codes * view.mask.to(view.codes)[None, ..., None]))
+    inside = _in_masks(scene.points, views)
+    if len(scene.points) and not bool(inside.any()):
+        raise PolarguideError(
+            scene.root / "masks",
+            expected="masks with points of the COLMAP model in them",
+            found=f"none of {len(scene.points)} points",
+            remedy="White is the subject there: invert the masks, or choose another background.",
+        )
+    return replace(
+        scene, views=tuple(views), points=scene.points[inside], point_colors=scene.point_colors[inside]
+    )
+
+
+def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
+    """Which points [M, 3] lie in the grown masks of most of the pictures that they fall into, [M] bool."""
+    seen, inside = torch.zeros(len(points)), torch.zeros(len(points))
+    for view in views:
+        camera = view.camera
+        assert view.mask is not None
+        mask = torch.from_numpy(_grown(view.mask.cpu().numpy(), GROWN))
+        x, y, z = camera.to_camera(points.double() - camera.center).unbind(-1)
+        safe = z.clamp(min=1e-9)
+        column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()
+        row = (camera.fy * y / safe + camera.cy).floor().clamp(-1, camera.height).long()
+        within = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        hit = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+        seen += within
+        inside += within & hit
+    return (seen > 0) & (inside >= INSIDE * seen)
+
+
+def _black(view: View) -> NDArray[np.bool_]:
+    """Where the picture is black, [H, W]; pixels marked as invalid count as black."""
+    picture = view.photograph().cpu().mean(dim=-1).numpy()
+    dark: NDArray[np.bool_] = np.asarray(cv2.blur(picture, (3, 3)) <= DARK)
+    return dark | view.invalid.cpu().numpy()
+
+
+def _black_edge(view: View) -> bool:
+    black = _black(view)
+    edge = np.concatenate([black[0], black[-1], black[1:-1, 0], black[1:-1, -1]])
+    return bool(edge.mean() >= BLACK_EDGE) and not bool(black.all())
+
+
+def _grown(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disk) > 0)

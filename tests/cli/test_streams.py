@@ -1,0 +1,80 @@
+"""What a shell does to a command: streams that are closed or full, folders that go away, names that are empty."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from polarguide.cli import app
+from polarguide.cli.app import run
+
+PROGRAM = f"{sys.executable} -m polarguide"
+
+
+def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a line of a shell."""
+    return subprocess.run(
+        ["bash", "-c", line], cwd=folder, capture_output=True, text=True, check=False, timeout=120
+    )
+
+
+@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-"])
+def test_help_into_nothing(closed: str, tmp_path: Path) -> None:
+    done = shell(f"{PROGRAM} --help {closed}", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full, which takes nothing")
+def test_an_error_that_nobody_can_be_told_is_one_still(tmp_path: Path) -> None:
+    assert shell(f"{PROGRAM} eval nowhere 2> /dev/full", tmp_path).returncode == 2
+
+
+def test_a_current_folder_that_is_no_more_is_one_line(tmp_path: Path) -> None:
+    done = shell(f"mkdir gone; cd gone; rmdir ../gone; {PROGRAM} eval ../run", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: the current folder: expected one that exists")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["train", "scene", "--out="], ["train", "scene", "--out", ""], ["train", "", "--out", "x"], ["eval", ""],
+     ["measure", "a", "", "--out", "x"], ["prepare", "a", "--out", "x", "--dark-frame="], ["share", "run", "--out", ""],
+     ["priors", "a", "--out="], ["compare", "", "--recipes", "3dgs", "--out", "x"]],
+)  # fmt: skip
+def test_an_empty_name_is_not_the_current_folder(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(words) == 2
+    assert "expected the name of a file or folder, found an empty one" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(MemoryError(), "memory: expected enough"), (RuntimeError("can't start new thread"), "memory: expected enough"),
+     (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), "memory: expected enough"),
+     (ImportError("libx.so: failed to map segment from shared object"), "packages: expected installed ones")],
+)  # fmt: skip
+def test_a_machine_without_room_is_one_line(
+    error: Exception, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> int:
+        raise error
+
+    monkeypatch.setattr(app, "_call", fail)
+    assert run(["eval", "run"]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("error", [RuntimeError("a fault of ours"), ModuleNotFoundError("no such module")])
+def test_faults_of_ours_are_not_hidden(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> int:
+        raise error
+
+    monkeypatch.setattr(app, "_call", fail)
+    with pytest.raises(type(error)):
+        run(["eval", "run"])

@@ -1,0 +1,169 @@
+"""Options that mean nothing for a kind of shot, and shots that cannot be written, are refused or told."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import polarguide
+from polarguide.capture.calibration import Calibration
+from polarguide.errors import PolarguideError
+from polarguide.options import SceneOptions
+from polarguide.shots import ShotOptions, find_shots, read_shot, write_shots
+from polarguide.shots.exposures import ExposureSet
+from tests.helpers.heard import Heard
+from tests.shots.test_read import CUP, MONO, write_four, write_mosaic
+
+MOSAIC_ONLY: list[dict[str, Any]] = [
+    {"black_level": 500.0}, {"saturation": 3000}, {"bits": 12}, {"demosaic": "quarter"}, {"packing": "12p"},
+    {"dark_frame": Path("none.png")}, {"offset_x": 2}, {"interpolation": "guided"}, {"width": 2448},
+]  # fmt: skip
+
+
+def refused(option: str, paths: list[Path], given: dict[str, Any], place: str) -> None:
+    with pytest.raises(PolarguideError) as error:
+        find_shots(paths, ShotOptions(**given))
+    assert str(error.value).startswith(option), str(error.value)
+    assert place in str(error.value)
+
+
+@pytest.mark.parametrize("given", MOSAIC_ONLY)
+def test_options_of_mosaics_are_refused_for_four_shots(tmp_path: Path, given: dict[str, Any]) -> None:
+    paths = write_four(tmp_path, CUP)
+    option = "--" + next(iter(given)).replace("_", "-")
+    refused(option, paths, given, "raw mosaics, which it is for, found cup, a shot through a filter")
+    (shot,) = find_shots(paths)
+    with pytest.raises(PolarguideError, match=option):
+        read_shot(shot, ShotOptions(**given))
+
+
+@pytest.mark.parametrize("given", [*MOSAIC_ONLY, {"gains": "auto"}, {"align": False}])
+def test_options_of_sensors_and_filters_are_refused_for_views(given: dict[str, Any]) -> None:
+    name = next(iter(given))
+    with polarguide.demo_scene() as scene:
+        option = "--no-align" if name == "align" else "--" + name.replace("_", "-")
+        refused(option, [scene], given, "a view of a scene")
+
+
+def test_gains_of_a_calibration_are_refused_for_views() -> None:
+    with polarguide.demo_scene() as scene:
+        given = {"calibration": Calibration(gains=(1.0, 1.1, 1.0, 1.0))}
+        refused("calibration (gains)", [scene], given, "a view of a scene")
+        assert find_shots([scene], ShotOptions(calibration=Calibration(sense="cw")))
+
+
+@pytest.mark.parametrize("given", [{"transfer": "srgb"}, {"align": False}])
+def test_options_of_filters_are_refused_for_mosaics(tmp_path: Path, given: dict[str, Any]) -> None:
+    write_mosaic(tmp_path / "part.png")
+    option = "--no-align" if "align" in given else "--transfer"
+    refused(option, [tmp_path], {"sensor": "IMX250MZR", **given}, "part, a raw mosaic")
+
+
+def test_read_noise_needs_a_full_well() -> None:
+    with pytest.raises(PolarguideError, match="--read-noise: expected a full well beside it"):
+        ShotOptions(read_noise=5.0).checked()
+    ShotOptions(read_noise=5.0, full_well=5000.0).checked()
+
+
+def test_no_paths() -> None:
+    for call in (find_shots, read_shot, lambda paths: write_shots(paths, "out")):
+        with pytest.raises(PolarguideError, match="paths: expected at least one file or folder"):
+            call([])
+    with pytest.raises(PolarguideError, match="paths: expected at least one file or folder"):
+        polarguide.priors([], "out")
+
+
+def test_a_name_that_leads_out_of_the_folder(tmp_path: Path) -> None:
+    write_mosaic(tmp_path / "a.png")
+    odd = tmp_path / "in" / "...png"
+    odd.parent.mkdir()
+    shutil.copy(tmp_path / "a.png", odd)
+    with pytest.raises(PolarguideError, match=r"expected a name that a folder can have, found '\.\.'"):
+        write_shots([odd], tmp_path / "out" / "deep", MONO, formats=("npy",))
+    for name in ("..", "../b"):
+        shot = ExposureSet(name, "mosaic", {0: tmp_path / "a.png"})
+        with pytest.raises(PolarguideError, match="expected a name that a folder can have"):
+            write_shots([shot], tmp_path / "out" / "deep", MONO, formats=("npy",))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(PermissionError(13, "Permission denied"), "Permission denied"), (MemoryError(), "more memory than")],
+)
+def test_no_error_of_one_shot_stops_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
+) -> None:
+    for name in "abc":
+        write_mosaic(tmp_path / f"{name}.png")
+
+    def read(shot: ExposureSet, options: ShotOptions) -> Any:
+        if shot.name == "b":
+            raise error
+        return read_shot(shot, options)
+
+    monkeypatch.setattr("polarguide.shots.write.read_shot", read)
+    heard = Heard()
+    done = write_shots([tmp_path], tmp_path / "out", MONO, formats=("npy",), reporter=heard)
+    assert list(done.folders) == ["a", "c"]
+    assert said in str(done.faults["b"])
+    assert any("b.png" in text and said in text for text in heard.said)
+    with pytest.raises(PolarguideError, match=said):
+        write_shots([tmp_path / "b.png"], tmp_path / "out", MONO, formats=("npy",))
+
+
+def test_formats_of_an_earlier_call_do_not_stay(tmp_path: Path) -> None:
+    write_mosaic(tmp_path / "a.png")
+    folder = tmp_path / "out" / "a"
+    folder.mkdir(parents=True)
+    (folder / "S0.npy").write_bytes(b"mine")  # not known to be of this program
+    write_shots([tmp_path / "a.png"], tmp_path / "out", MONO, formats=("png", "page"))
+    assert (folder / "S0.npy").read_bytes() == b"mine"
+    (folder / "notes.png").write_bytes(b"mine")
+    write_shots([tmp_path / "a.png"], tmp_path / "out", MONO, formats=("npy",))
+    assert {path.suffix for path in folder.iterdir()} == {".npy", ".json", ".png"}
+    assert [path.name for path in folder.glob("*.png")] == ["notes.png"]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"full_well": 1e4}, {"snr": 5.0}, {"gains": "auto"}, {"calibration": Calibration(order=(90, 45, 0, 135))},
+     {"calibration": Calibration(gains=(1.0, 1.1, 1.0, 1.0))}, {"bits": 12}, {"transfer": "srgb"}],
+)  # fmt: skip
+def test_options_of_shots_are_refused_for_a_scene_with_poses(tmp_path: Path, given: dict[str, Any]) -> None:
+    name = next(iter(given))
+    with (
+        polarguide.demo_scene() as scene,
+        pytest.raises(
+            PolarguideError, match=f"^--{name.replace('_', '-')}: expected shots, found a scene with poses"
+        ),
+    ):
+        polarguide.priors(scene, tmp_path / "x", views="v000", shots=ShotOptions(**given))
+    assert not (tmp_path / "x").exists()
+
+
+def test_noise_counts_for_the_maps_of_a_scene_with_poses(tmp_path: Path) -> None:
+    with polarguide.demo_scene() as scene:
+        noisy = ShotOptions(full_well=100.0)
+        polarguide.priors(scene, tmp_path, views="v000", shots=noisy, formats=["npy"])
+        record = json.loads((tmp_path / "v000" / "maps.json").read_text())
+        assert record["noise"]["source"] == "given"
+        wrong = ShotOptions(calibration=Calibration(order=(90, 45, 0, 135)))
+        with pytest.raises(PolarguideError, match="calibration: expected shots"):
+            polarguide.priors(scene, tmp_path, views="v000", shots=wrong, formats=["npy"])
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [("views", {"views": "all"}), ("memory", {"reading": SceneOptions(memory=1.0)}),
+     ("transfer", {"reading": SceneOptions(transfer="srgb")})],
+)  # fmt: skip
+def test_options_of_scenes_are_refused_for_shots(tmp_path: Path, name: str, given: dict[str, Any]) -> None:
+    paths = write_four(tmp_path / "in", CUP)
+    with pytest.raises(PolarguideError, match=f"^--{name}: expected a scene with poses, found shots"):
+        polarguide.priors(paths, tmp_path / "out", **given)
+    assert not (tmp_path / "out").exists()

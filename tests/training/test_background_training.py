@@ -1,0 +1,146 @@
+"""Training a subject with nothing behind it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from polarguide.capture import Scene
+from polarguide.errors import PolarguideError
+from polarguide.raster import Backend, choose_backend, rasterize_reference
+from polarguide.recipes import RECIPES
+from polarguide.shading.visibility import LEAST_PIXELS, touching_views
+from polarguide.training.losses import coverage_loss
+from polarguide.training.settings import TrainSettings
+from polarguide.training.state import first_state
+from polarguide.training.trainer import Trainer, is_black
+
+BACKEND = choose_backend("cpu")
+
+
+@pytest.fixture
+def black_scene(tiny_scene: Scene) -> Scene:
+    """The tiny scene's pictures with black where they show their background alone."""
+    background = torch.tensor([0.2, 0.25, 0.3])
+    views = []
+    for view in tiny_scene.views:
+        shown = (view.photograph() - background).abs().amax(dim=-1) > 0.02
+        shown[:2] = shown[-2:] = shown[:, :2] = shown[:, -2:] = False
+        views.append(replace(view, codes=view.codes * shown.to(view.codes)[None, ..., None]))
+    return replace(tiny_scene, views=tuple(views))
+
+
+def trainer(scene: Scene, background: str, recipe: str = "3dgs", steps: int = 60) -> Trainer:
+    settings = TrainSettings(steps, 3, background=background)  # type: ignore[arg-type]
+    return Trainer(scene, RECIPES[recipe], settings, BACKEND)
+
+
+def outside(made: Trainer, scene: Scene) -> float:
+    """Mean alpha of the first view's two outermost rows."""
+    from polarguide.shading.gbuffer import render
+
+    alpha = render(
+        made.state.gaussians, scene.views[0].camera, BACKEND.rasterize, normals=False
+    ).alpha.detach()
+    return float(torch.cat((alpha[:2], alpha[-2:])).mean())
+
+
+def test_the_mode_is_found_from_the_pictures_unless_it_is_given(
+    tiny_scene: Scene, black_scene: Scene
+) -> None:
+    for scene, found in ((tiny_scene, False), (black_scene, True)):
+        assert is_black(scene, TrainSettings()) == found
+        assert not is_black(scene, TrainSettings(background="scene"))
+        assert is_black(scene, TrainSettings(background="black"))
+
+
+@pytest.mark.parametrize("name", ["3dgs", "3dgs-dr", "ref-gs", "polarguide-stokes"])
+def test_every_recipe_begins_without_far_gaussians(black_scene: Scene, name: str) -> None:
+    begun = Trainer(black_scene, RECIPES[name], TrainSettings(60), BACKEND)
+    assert len(begun.state.gaussians) == len(black_scene.points)
+    with_shell = first_state(black_scene, RECIPES[name], TrainSettings(60))
+    assert len(with_shell.gaussians) == len(black_scene.points) + RECIPES[name].initialization.shell
+
+
+def test_empty_pixels_are_emptier_than_where_surroundings_are_trained(black_scene: Scene) -> None:
+    alphas = {}
+    for background in ("scene", "black"):
+        made = trainer(black_scene, background, steps=150)
+        made.run(lambda _: None)
+        alphas[background] = outside(made, black_scene)
+    assert alphas["black"] < 0.5 * alphas["scene"]
+
+
+def test_coverage_counts_empty_pixels_alone() -> None:
+    alpha = torch.tensor([[0.5, 0.25], [1.0, 1.0]]).requires_grad_()
+    empty = torch.tensor([[1.0, 1.0], [0.0, 0.0]])
+    loss = coverage_loss(alpha, empty)
+    assert float(loss.detach()) == 0.375
+    loss.backward()
+    assert alpha.grad is not None
+    assert alpha.grad.tolist() == [[0.5, 0.5], [0.0, 0.0]]
+    assert float(coverage_loss(alpha.detach(), torch.zeros(2, 2))) == 0
+
+
+def summed_weights(made: Trainer, number: int) -> list[float]:
+    """What one Gaussian adds to each training view, by pictures with it white among black ones."""
+    from polarguide.shading.gbuffer import splats
+
+    given = splats(made.state.gaussians)
+    features = torch.zeros(len(given.means), 1)
+    features[number] = 1.0
+    fixed = type(given)(*(tensor.detach() for tensor in given))._replace(features=features)
+    return [float(rasterize_reference(fixed, view.camera).features.sum()) for view in made.scene.train_views]
+
+
+def test_pictures_that_a_gaussian_adds_to_are_counted(black_scene: Scene) -> None:
+    made = trainer(black_scene, "black")
+    with torch.no_grad():
+        made.state.gaussians["means"][0] = torch.tensor([0.0, 0.0, 50.0])
+        made.state.gaussians["opacity_logits"][1] = -12.0
+    cameras = [view.camera for view in black_scene.train_views]
+    counts = touching_views(made.state.gaussians, cameras, BACKEND.rasterize)
+    for number in (0, 1, 2, 7):
+        assert counts[number] == sum(w >= LEAST_PIXELS for w in summed_weights(made, number))
+    assert counts[1] == 0
+    assert counts[2] > 0
+
+
+def test_what_no_view_sees_goes_when_the_density_control_ends(black_scene: Scene) -> None:
+    made = trainer(black_scene, "black", steps=40)  # too few for a round of the density control
+    with torch.no_grad():
+        made.state.gaussians["means"][0] = torch.tensor([0.0, -500.0, 0.0])
+    count = len(made.state.gaussians)
+    made.run(lambda _: None, until=19)
+    assert len(made.state.gaussians) == count
+    made.run(lambda _: None, until=21)
+    assert len(made.state.gaussians) < count
+    assert float(made.state.gaussians["means"].detach().abs().max()) < 100
+    assert len(made.state.statistics.mean()) == len(made.state.gaussians)
+
+
+def test_surroundings_keep_what_no_view_sees(black_scene: Scene) -> None:
+    made = trainer(black_scene, "scene", steps=40)
+    count = len(made.state.gaussians)
+    made.run(lambda _: None)
+    assert len(made.state.gaussians) == count
+
+
+def test_all_stays_where_no_view_sees_anything(black_scene: Scene) -> None:
+    def nothing(splats, camera, *, statistic=None):  # type: ignore[no-untyped-def]
+        return rasterize_reference(
+            splats._replace(opacities=splats.opacities * 0), camera, statistic=statistic
+        )
+
+    made = Trainer(
+        black_scene, RECIPES["3dgs"], TrainSettings(40, background="black"), Backend(BACKEND.device, nothing)
+    )
+    made.run(lambda _: None)
+    assert len(made.state.gaussians) == len(black_scene.points)
+
+
+def test_a_mode_that_there_is_not_is_refused() -> None:
+    with pytest.raises(PolarguideError, match="background: expected one of auto, scene, black, masked"):
+        TrainSettings(background="white")  # type: ignore[arg-type]
