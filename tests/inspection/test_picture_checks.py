@@ -125,6 +125,19 @@ def test_a_reversed_or_missing_filter_is_suspected(tmp_path, share: float) -> No
     assert "LCD screen" in check.remedy
 
 
+def test_noise_in_the_dark_does_not_hide_a_reversed_filter(tmp_path) -> None:
+    rng = np.random.default_rng(4)
+
+    def noisy(values: np.ndarray) -> np.ndarray:
+        mean = values.mean(axis=0, keepdims=True).repeat(4, 0)
+        mean[:, :, : mean.shape[2] // 8] *= 0.05
+        return mean + rng.normal(0, 1, values.shape) * np.sqrt(mean / 12_000)
+
+    check = checked(write_scene(tmp_path / "s", noisy))["low_dolp"]
+    assert check.figures["p99_dolp"] > 0.05
+    assert "No modulation: was the filter reversed, or missing?" in check.finding
+
+
 def test_weak_polarization_is_no_reversed_filter(tmp_path) -> None:
     def weak(values: np.ndarray) -> np.ndarray:
         mean = values.mean(axis=0, keepdims=True)

@@ -185,11 +185,12 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
     figures = {"polarized": share, "median_dolp": median, "p99_dolp": strongest}
     if share >= LITTLE:
         return Check(key, title, "ok", said, figures=figures)
-    if strongest < POLARIZED and noise < POLARIZED:
+    if (strongest < POLARIZED or share < ALMOST_NONE) and noise < POLARIZED:
         return Check(
             key, title, "wrong",
-            f"No modulation: was the filter reversed, or missing? The four pictures show the same light; 99 % of the "
-            f"pixels (median view) have a DoLP under {strongest:.3f}.",
+            f"No modulation: was the filter reversed, or missing? The four pictures show the same light but for "
+            f"noise; 99 % of the pixels (median view) have a DoLP under {strongest:.3f}, and {share:.1%} one above "
+            "three times their noise.",
             "Hold the filter before an LCD screen and turn it: the side that is towards the screen when it goes dark "
             "must face the scene. If the filter was right: photograph glossy surfaces obliquely (50 to 65 degrees).",
             figures=figures,
