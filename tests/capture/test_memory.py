@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from pathlib import Path
@@ -9,12 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
+from dataset_files import WRITERS
+from hostile_files import deflated_tiff, exr, two_sizes_hdr
 from tiny_capture import NAMES, TinyCapture, write_tiny_capture
 
 from polarguide.capture import load_scene, view_reader
+from polarguide.capture.formats.headers import read_picture, stated_size
 from polarguide.capture.formats.integrity import declared_size
-from polarguide.capture.memory import KEPT, READ, stated_size
+from polarguide.capture.formats.pictures import decode_stored
+from polarguide.capture.memory import KEPT, READ, SHARE
 from polarguide.errors import PolarguideError
+from polarguide.preparation.mosaic_files import WORKED
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
+from polarguide.shots import ShotOptions, read_shot
 from polarguide.system import free_memory
 
 
@@ -122,3 +132,99 @@ def test_the_system_says_what_is_free() -> None:
     free = free_memory()
     assert free is None or 0 <= free < 1 << 50
     assert np.isfinite(free or 0)
+
+
+def test_headers_of_every_kind_state_a_size(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((5, 7, 3), np.float32))
+    np.save(tmp_path / "b.npy", np.zeros(9))
+    two_sizes_hdr(tmp_path / "a.hdr", 300)
+    exr(tmp_path / "a.exr", 40)
+    (tmp_path / "b.exr").write_bytes(b"junk")
+    deflated_tiff(tmp_path / "a.tif", 60)
+    (tmp_path / "b.tif").write_bytes(b"II*\0\xf0\xff\xff\xff")
+    sizes = {path.name: stated_size(path) for path in sorted(tmp_path.iterdir())}
+    assert sizes == {
+        "a.npy": (7, 5), "b.npy": None, "a.hdr": (300, 300), "a.exr": (40, 40), "b.exr": None, "a.tif": (60, 60),
+        "b.tif": None,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_a_tiff_is_not_read_whole_for_its_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, big: bool
+) -> None:
+    """Its directory may stand behind the pixels, as libtiff writes it."""
+    read: list[int] = []
+
+    class Counted(io.FileIO):
+        def read(self, size: int = -1) -> bytes:
+            data = super().read(size)
+            read.append(len(data))
+            return data
+
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((700, 900), np.uint16), bigtiff=big)
+    data = bytearray(path.read_bytes())
+    at = 8 if big else 4
+    (start,) = struct.unpack_from("<Q" if big else "<I", data, at)
+    struct.pack_into("<Q" if big else "<I", data, at, len(data))
+    path.write_bytes(bytes(data) + bytes(data[start : start + 400]))
+    monkeypatch.setattr("polarguide.capture.formats.headers.open", lambda p, mode: Counted(p), raising=False)
+    assert stated_size(path) == (900, 700)
+    assert sum(read) < 2000
+
+
+def test_a_picture_file_far_larger_than_its_pixels_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    for content in (b"II*\0", None):
+        if content is None:
+            tifffile.imwrite(path, np.zeros((8, 8), np.uint16))
+        else:
+            path.write_bytes(content)
+        with open(path, "r+b") as file:
+            file.truncate((1 << 31) - 1)
+        with pytest.raises(PolarguideError, match="more than 64 MiB"):
+            read_picture(path)
+
+
+def test_tiff_files_that_decoders_take_in_part_are_refused(tmp_path: Path) -> None:
+    pixels = np.zeros((2, 8, 8), np.uint16)
+    tifffile.imwrite(tmp_path / "two.tif", pixels, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "white.tif", pixels[0], photometric="miniswhite")
+    for name, words in (("two.tif", "of 2 pictures"), ("white.tif", "whose white is 0")):
+        with pytest.raises(PolarguideError, match=words):
+            decode_stored(tmp_path / name, (tmp_path / name).read_bytes())
+    with tifffile.TiffWriter(tmp_path / "small.tif") as file:
+        file.write(pixels[0])
+        file.write(pixels[0, ::2, ::2], subfiletype=1)  # a smaller copy, for lists of files
+    assert decode_stored(tmp_path / "small.tif", (tmp_path / "small.tif").read_bytes()).shape == (8, 8)
+
+
+@pytest.mark.parametrize("mode", ["quarter", "half", "full"])
+def test_mosaics_that_do_not_fit_are_refused_by_their_headers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: Any
+) -> None:
+    (tmp_path / "raw").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "raw" / f"{name}.png").write_bytes(png_of(4000, 3000))
+    free = int(WORKED[mode] * 12e6 / SHARE)
+    settings = PrepareSettings(sensor="IMX250MYR", poses="none", demosaic=mode)
+    for room, words in (
+        (0.99 * free, "found a mosaic of 4000x3000 that take"),
+        (1.01 * free, "cannot be decoded|channel"),
+    ):
+        monkeypatch.setattr("polarguide.capture.memory.free_memory", lambda room=room: int(room))
+        with pytest.raises(PolarguideError, match=words):
+            prepare_scene(tmp_path / "raw", tmp_path / "out", settings)
+    monkeypatch.setattr("polarguide.capture.memory.free_memory", lambda: 1000)
+    with pytest.raises(PolarguideError, match="a mosaic of 4000x3000"):
+        read_shot(tmp_path / "raw/a.png", ShotOptions(sensor="IMX250MYR", demosaic=mode))
+
+
+def test_datasets_that_do_not_fit_are_refused_by_their_headers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    WRITERS["nersp"](tmp_path / "data")
+    monkeypatch.setattr("polarguide.capture.memory.free_memory", lambda: 100_000)
+    with pytest.raises(PolarguideError, match=r"\.npy: expected .*found Stokes vectors of 64x48"):
+        prepare_scene(tmp_path / "data", tmp_path / "out", PrepareSettings(format="nersp"))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import struct
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from polarguide.capture.formats.integrity import declared_size
+from polarguide.capture.formats.headers import stated_size
 from polarguide.capture.layout import Layout
 from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
@@ -20,7 +19,6 @@ SHARE = 0.8
 KEPT = 4 * 3 * 2 + 2 + 4
 # While one view is read: what is decoded of it, its copy in linear codes, and channels apart.
 READ = 4 * 3 * 2 * 3
-_HEADER = 1 << 20
 
 
 def check_memory(layout: Layout, names: Sequence[str], *, factor: int, at_once: int, limit: float) -> None:
@@ -39,6 +37,23 @@ def check_memory(layout: Layout, names: Sequence[str], *, factor: int, at_once: 
     needed = kept + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
     remedy = "Give --downscale 2 or more, fewer views, or more --memory."
     require_memory(layout.root, needed, f"{len(names)} views", limit=limit, remedy=remedy)
+
+
+def require_memory_of_each(paths: Sequence[Path], pixel: int, what: str, *, remedy: str) -> None:
+    """Refuse files that are worked on one after the other, where the largest does not fit into memory.
+
+    Args:
+        paths: of pictures and arrays whose headers state a size; others are passed over.
+        pixel: bytes that one of their pixels takes, at least. what, remedy: for messages.
+
+    Raises:
+        PolarguideError: it does not.
+    """
+    sizes = {path: stated_size(path) or (0, 0) for path in paths}
+    if sizes:
+        path = max(sizes, key=lambda path: math.prod(sizes[path]))
+        width, height = sizes[path]
+        require_memory(path, pixel * width * height, f"{what} of {width}x{height}", remedy=remedy)
 
 
 def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: float = 0.0) -> None:
@@ -63,18 +78,6 @@ def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: f
             found=f"{what} that take {needed / GIBIBYTE:.1f} GiB",
             remedy=remedy,
         )
-
-
-def stated_size(path: Path) -> tuple[int, int] | None:
-    """Width and height in the header of a picture; None where there is none to be read."""
-    if not path.is_file():  # a pipe, a folder, a link to nowhere: whoever reads it says so
-        return None
-    with contextlib.suppress(OSError, struct.error), open(path, "rb") as file:
-        head = file.read(_HEADER)
-        if head[:2] in (b"II", b"MM"):  # its directory stands anywhere
-            head += file.read()
-        return declared_size(head)
-    return None
 
 
 def _largest(layout: Layout, name: str) -> int:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from polarguide.camera import Camera
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
+from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes, read_file
 from polarguide.capture.ground_truth import read_ground_truth
@@ -35,7 +36,13 @@ class Files:
 
     def read(self, path: Path, largest: int = LARGEST_FILE) -> bytes:
         """The bytes of a file of up to ``largest``."""
-        data = read_file(path, largest=largest)
+        return self._noted(path, read_file(path, largest=largest))
+
+    def picture(self, path: Path) -> bytes:
+        """The bytes of a picture file."""
+        return self._noted(path, read_picture(path))
+
+    def _noted(self, path: Path, data: bytes) -> bytes:
         self.digests[path] = hashlib.sha256(data).hexdigest()
         return data
 
@@ -131,7 +138,7 @@ def _read_angles(files: Files, paths: dict[int, Path]) -> list[NDArray[Any]]:
     pictures: list[NDArray[Any]] = []
     for angle in ANGLES:
         path = paths[angle]
-        data = files.read(path)
+        data = files.picture(path)
         if pictures:
             require_size(path, data, pictures[0].shape[:2], like=paths[0])
         picture = decode_picture(path, data)
@@ -181,7 +188,7 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
 
 
 def _read_mask(files: Files, path: Path, size: tuple[int, int], *, any_value: bool) -> NDArray[np.bool_]:
-    data = files.read(path)
+    data = files.picture(path)
     require_size(path, data, size)
     mask = decode_mask(path, data, any_value=any_value)
     _require_same(path, (mask.shape[1], mask.shape[0]), size)  # of a format whose header says nothing

@@ -15,6 +15,7 @@ from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
+from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.pictures import decode_picture, read_file
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import applied_calibration, refractive_index_of
@@ -140,7 +141,7 @@ def read_capture(
 
 def _fitting_factor(layout: Layout, name: str) -> int:
     path = next(iter(layout.pictures[name].values()))
-    height, width = decode_picture(path, read_file(path)).shape[:2]
+    height, width = decode_picture(path, read_picture(path)).shape[:2]
     return max(1, math.ceil(max(height, width) / LONGEST))
 
 

@@ -22,7 +22,7 @@ from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
-from polarguide.capture.memory import require_memory, stated_size
+from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.write import EXACT, Rounding, rounding_of
 from polarguide.color import srgb_decode_array
@@ -73,11 +73,8 @@ class FilterSource(Source):
         Raises:
             PolarguideError: the largest is too large.
         """
-        sizes = {path: stated_size(path) or (0, 0) for path in self.paths}
-        path = max(sizes, key=lambda path: sizes[path][0] * sizes[path][1])
-        width, height = sizes[path]
         remedy = "Make the pictures smaller, all by the same factor."
-        require_memory(path, _WORKED * width * height, f"four shots of {width}x{height}", remedy=remedy)
+        require_memory_of_each(self.paths, _WORKED, "four shots", remedy=remedy)
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """The transfer of the capture, from a few views spread over it."""

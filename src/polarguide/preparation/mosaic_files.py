@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.memory import require_memory, require_memory_of_each
 from polarguide.capture.sensor.color_filters import require_kind
 from polarguide.capture.sensor.pattern import SENSORS, sensor_pattern
 from polarguide.capture.sensor.radiometry import Levels
@@ -17,6 +18,8 @@ from polarguide.preparation.settings import PrepareSettings
 
 SMALLEST = 16
 """Pixels of the shorter side of a mosaic."""
+WORKED = {"quarter": 16, "half": 60, "full": 240}
+"""Bytes that a pixel of the sensor takes at least while a mosaic is developed, by the mode of demosaicing."""
 
 
 class MosaicFiles:
@@ -50,8 +53,15 @@ class MosaicFiles:
         """The stored values of a whole mosaic, [H, W].
 
         Raises:
-            PolarguideError: the file cannot be read, or is too small.
+            PolarguideError: the file cannot be read, is too small, or does not fit into memory when it is developed.
         """
+        worked, raw = WORKED[self._settings.demosaic], self._raw
+        remedy = "Give a region of the sensor, or choose --demosaic half or quarter."
+        if path.suffix.lower() != ".raw":
+            require_memory_of_each([path], worked, "a mosaic", remedy=remedy)
+        elif raw.width is not None and raw.height is not None:
+            what = f"a mosaic of {raw.width}x{raw.height}"
+            require_memory(path, worked * raw.width * raw.height, what, remedy=remedy)
         return read_mosaic(path, self._raw, least=SMALLEST)
 
     def container(self, path: Path, values: NDArray[Any]) -> int:

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_file
+from polarguide.capture.formats.headers import read_picture
+from polarguide.capture.formats.pictures import SUFFIXES, decode_mask
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.preparation.source import DevelopedView, Source
@@ -72,7 +73,7 @@ class MaskedSource(Source):
 
 def _fitted(path: Path, view: DevelopedView) -> NDArray[np.bool_]:
     """A mask at the size of the developed picture: True where at least half of a pixel is object."""
-    mask = decode_mask(path, read_file(path), any_value=False)
+    mask = decode_mask(path, read_picture(path), any_value=False)
     geometry = view.geometry
     size = (mask.shape[1], mask.shape[0])
     if size == geometry.size:

@@ -11,8 +11,8 @@ from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets import detect_dataset, open_dataset
 from polarguide.capture.datasets.pisr import SENSOR as PISR_SENSOR
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
-from polarguide.capture.formats.integrity import declared_size
-from polarguide.capture.formats.pictures import read_file
+from polarguide.capture.formats.headers import stated_size
+from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import angle_folders, describe_contents, index_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
@@ -149,7 +149,8 @@ def known_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
         return Poses.of_cameras(pictures.cameras, root, pictures.views)
     path = Path(origin)
     if path.suffix.lower() in POSE_FILES and path.is_file():
-        size = declared_size(read_file(pictures.paths[0])) or (0, 0)
+        first = pictures.paths[0]
+        size = (stated_size(first) if first.suffix.lower() in SUFFIXES else None) or (0, 0)
         if path.suffix.lower() == ".npz" and 0 in size:
             raise PolarguideError(
                 path,

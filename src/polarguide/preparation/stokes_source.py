@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from polarguide.capture.calibration import oriented
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.datasets.dataset import Dataset, StokesImage, not_as_published, resized_mask
+from polarguide.capture.memory import require_memory_of_each
 from polarguide.polarizer import four_intensities
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import DevelopedView, Source
@@ -22,6 +23,8 @@ PAIR_SUMS = (
 _BRIGHT = 99.9
 _HEADROOM = 2.0
 _SAMPLES = 20_000
+_WORKED = 4 * 3 * (3 + 3 + 4 + 4)
+"""Bytes that a pixel takes at least: Stokes vectors as read and where they are finite, intensities, clipped ones."""
 
 
 class StokesSource(Source):
@@ -41,6 +44,8 @@ class StokesSource(Source):
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
         else twice this one does, and what exceeds it clips.
         """
+        remedy = "Make the files smaller, all by the same factor, or prepare the dataset on a larger machine."
+        require_memory_of_each(self.paths, _WORKED, "Stokes vectors", remedy=remedy)
         peaks: list[NDArray[np.float32]] = []
         largest, negative, broken, count = 0.0, 0, 0, 0
         for number, view in enumerate(self.views, 1):

@@ -17,7 +17,8 @@ from polarguide.capture.colmap.features import match_features, pipeline_options,
 from polarguide.capture.colmap.model import load_model
 from polarguide.capture.colmap.visual_hull import sample_visual_hull
 from polarguide.capture.colmap.write import PosedCamera, colmap_camera, write_cameras
-from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_file
+from polarguide.capture.formats.headers import read_picture
+from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole, writing
 from polarguide.progress import Reporter
@@ -132,7 +133,7 @@ def _sample(
     for view in cameras:
         path = folder / "masks" / f"{view}.png"
         if path.exists():
-            masks[view] = decode_mask(path, read_file(path), any_value=True)
+            masks[view] = decode_mask(path, read_picture(path), any_value=True)
     places = sample_visual_hull(cameras, masks, SAMPLES, np.random.default_rng(seed))
     kind = "the hull of the masks" if masks else "the cameras' common field of view"
     if len(places) == 0:
@@ -163,7 +164,7 @@ def _colors(
     views = sorted(cameras)
     for view in views[:: max(1, len(views) // 8)]:
         path = folder / "images" / f"{view}.png"
-        picture = decode_picture(path, read_file(path))
+        picture = decode_picture(path, read_picture(path))
         camera = cameras[view]
         local = places @ camera.rotation.T + camera.translation
         plain = colmap_camera(camera)  # without its distortion

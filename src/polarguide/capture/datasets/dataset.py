@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Sense
 from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_file
+from polarguide.capture.formats.headers import read_picture
+from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored
 from polarguide.capture.formats.radiance import read_radiance
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import listed
@@ -24,7 +25,7 @@ StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
     """An object mask [H, W] from a picture: where it reaches half of its maximum."""
-    return decode_mask(path, read_file(path), any_value=False)
+    return decode_mask(path, read_picture(path), any_value=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +175,7 @@ def first_picture_size(pictures: Mapping[str, Path], folder: Path) -> tuple[int,
     if not pictures:
         raise not_as_published(folder, "the pictures that the intrinsics belong to", "none")
     path = pictures[min(pictures)]
-    height, width = decode_stored(path, read_file(path)).shape[:2]
+    height, width = decode_stored(path, read_picture(path)).shape[:2]
     return width, height
 
 

@@ -33,7 +33,8 @@ from polarguide.capture.datasets.dataset import (
     require_same_shape,
 )
 from polarguide.capture.formats.arrays import array_kind, finite_numbers, read_array
-from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, linear_codes, read_file
+from polarguide.capture.formats.headers import read_picture
+from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, linear_codes
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import FULL_CODE
 from polarguide.records import read_record
@@ -64,7 +65,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
     )
 
     def read_stokes(view: str) -> StokesImage:
-        stored = decode_picture(pictures[view], read_file(pictures[view]))
+        stored = decode_picture(pictures[view], read_picture(pictures[view]))
         aop, dop = (_plane(files[view], stored.shape, pictures[view]) for files in (angles, degrees))
         s0 = 2 * linear_codes(stored, transfer).astype(np.float32) / np.float32(FULL_CODE)
         stokes = [s0, s0 * (dop * np.cos(2 * aop))[..., None], s0 * (dop * np.sin(2 * aop))[..., None]]

@@ -23,7 +23,8 @@ from polarguide.capture.datasets.dataset import (
     read_mask,
     stokes_dataset,
 )
-from polarguide.capture.formats.pictures import SUFFIXES, decode_stored, read_file
+from polarguide.capture.formats.headers import read_picture
+from polarguide.capture.formats.pictures import SUFFIXES, decode_stored
 from polarguide.capture.layout import index_files
 
 _PARTS = ("s0", "s1", "s2")
@@ -57,5 +58,5 @@ def _halved(planes: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _last_channel(path: Path) -> NDArray[np.bool_]:
-    pixels = decode_stored(path, read_file(path))
+    pixels = decode_stored(path, read_picture(path))
     return np.asarray((pixels if pixels.ndim == 2 else pixels[..., -1]) > 0)

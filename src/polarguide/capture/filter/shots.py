@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
 from polarguide.capture.filter.exif import orientation
-from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_file
+from polarguide.capture.formats.headers import read_picture
+from polarguide.capture.formats.pictures import SUFFIXES, decode_picture
 from polarguide.capture.layout import ambiguous, angle_folders, index_files, list_files, require_angle_folders
+from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.view_reader import require_alike
@@ -29,6 +31,8 @@ _SUFFIX = re.compile(
 _BARE = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
 # Compression smears the edge of clipped areas over a few values.
 _JPEG_FULL = 250
+_READ = 4 * 3 * (2 + 2)
+"""Bytes that a pixel of four shots takes at least: as decoded, and stacked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +158,8 @@ def read_shots(files: dict[int, Path], gains: tuple[float, float, float] = (1.0,
     Raises:
         PolarguideError: one cannot be read, or they differ in size, depth or orientation.
     """
+    remedy = "Make the pictures smaller, all by the same factor."
+    require_memory_of_each(list(files.values()), _READ, "four shots", remedy=remedy)
     pictures: list[NDArray[Any]] = []
     codes: list[int] = []
     for angle in ANGLES:
@@ -180,5 +186,5 @@ def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[A
     """Stored values [H, W, 3] of a shot and its EXIF orientation."""
     if is_camera_raw(path):
         return read_camera_raw(path, gains)
-    data = read_file(path)
+    data = read_picture(path)
     return decode_picture(path, data), orientation(data)

@@ -6,6 +6,7 @@ part. Parsing the structure first gives the same answer with every decoder.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import struct
 import zlib
@@ -19,12 +20,18 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _TIFF_CODES = {1: "B", 3: "H", 4: "I"}
-_TIFF = (b"II*\0", b"MM\0*")
-_BIG_TIFF = (b"II+\0", b"MM\0+")
+TIFF = (b"II*\0", b"MM\0*")
+BIG_TIFF = (b"II+\0", b"MM\0+")
 # Marks without a length: one that nobody uses, and restarts.
 _JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
+MOST_BIG_ENTRIES = 4096
+"""Of a BigTIFF directory that are looked at: its count has 64 bits, and files have some thirty."""
 _MOST_SCANS = 200
 """Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not."""
+_MOST_PICTURES = 1000
+_SUBFILE, _OLD_SUBFILE, _PHOTOMETRIC = 254, 255, 262
+_NO_PICTURE, _REDUCED = 1 | 4, 2
+"""A smaller copy, or a mask of transparency; a smaller copy as the older tag has it."""
 _TIFF_STRIPS = ((273, 279), (324, 325))
 
 
@@ -48,11 +55,11 @@ def find_damage(data: bytes) -> str | None:
         return _png_damage(data)
     if data.startswith(b"\xff\xd8"):
         return _jpeg_damage(data)
-    if data[:4] in _TIFF:
+    if data[:4] in TIFF:
         if not _tiff_is_complete(data):
             return f"a TIFF file cut short (it ends after {len(data)} bytes)"
-        return None if _tiff_size(data) is not None else "a TIFF file without one plain size"
-    if data[:4] in _BIG_TIFF:  # the decoder finds what is cut short
+        return _tiff_oddity(data) if _tiff_size(data) is not None else "a TIFF file without one plain size"
+    if data[:4] in BIG_TIFF:  # the decoder finds what is cut short
         return None if declared_size(data) is not None else "a BigTIFF file without one plain size"
     return "a file that is none of these"
 
@@ -63,9 +70,9 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
         return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
-    if data[:4] in _TIFF:
+    if data[:4] in TIFF:
         return _tiff_size(data)
-    if data[:4] in _BIG_TIFF:
+    if data[:4] in BIG_TIFF:
         return _big_tiff_size(data)
     return None
 
@@ -142,7 +149,7 @@ def _big_tiff_size(data: bytes) -> tuple[int, int] | None:
     try:
         (start,) = struct.unpack_from(order + "Q", data, 8)
         (count,) = struct.unpack_from(order + "Q", data, start)
-        for entry in range(start + 8, start + 8 + 20 * min(count, 4096), 20):
+        for entry in range(start + 8, start + 8 + 20 * min(count, MOST_BIG_ENTRIES), 20):
             tag, kind = struct.unpack_from(order + "HH", data, entry)
             if tag in (256, 257) and (tag in found or kind not in (3, 4, 16)):
                 return None
@@ -151,6 +158,28 @@ def _big_tiff_size(data: bytes) -> tuple[int, int] | None:
     except (struct.error, OverflowError):
         return None
     return (found[256], found[257]) if len(found) == 2 else None
+
+
+def _tiff_oddity(data: bytes) -> str | None:
+    """What decoders pass over without a word: white that is stored as 0, and all pictures but the first."""
+    order, pictures = tiff_order(data), 0
+    seen: set[int] = set()
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    with contextlib.suppress(struct.error):
+        while start and start not in seen and len(seen) < _MOST_PICTURES:
+            seen.add(start)
+            (count,) = struct.unpack_from(order + "H", data, start)
+            tags = {}
+            for at in range(start + 2, start + 2 + 12 * count, 12):
+                tag, kind = struct.unpack_from(order + "HH", data, at)
+                if tag in (_SUBFILE, _OLD_SUBFILE, _PHOTOMETRIC) and kind in _TIFF_CODES:
+                    (tags[tag],) = struct.unpack_from(order + _TIFF_CODES[kind], data, at + 8)
+            if len(seen) == 1 and tags.get(_PHOTOMETRIC) == 0:
+                return "a TIFF file whose white is 0"
+            smaller = tags.get(_SUBFILE, 0) & _NO_PICTURE or tags.get(_OLD_SUBFILE) == _REDUCED
+            pictures += not smaller
+            (start,) = struct.unpack_from(order + "I", data, start + 2 + 12 * count)
+    return f"a TIFF file of {pictures} pictures" if pictures > 1 else None
 
 
 def _png_damage(data: bytes) -> str | None:

@@ -54,11 +54,9 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
 def _read_hdr(path: Path) -> NDArray[Any]:
     data = read_file(path)
     found = "an empty file" if not data else "a file that is none"
-    # The size stands behind the first empty line; before it, anything may look like one.
-    size = _HDR_SIZE.match(data, data.find(b"\n\n", 0, 4096) + 2)
-    pixels = None
-    if data.startswith(b"#?") and size is not None:
-        height, width = int(size[1]), int(size[2])
+    size, pixels = hdr_size(data), None
+    if size is not None:
+        width, height = size
         found = f"one that is damaged or cut short (it ends after {len(data)} bytes)"
         # Run lengths reach 127 pixels with two bytes a channel: fewer bytes than this cannot be complete.
         if 0 < height * width <= min(LARGEST_PIXELS, 64 * len(data)):
@@ -86,7 +84,7 @@ def _read_exr(path: Path, wanted: tuple[str, ...] | None = None) -> NDArray[Any]
     pixels = None
     if data.startswith(_EXR_MAGIC):
         try:
-            _require_exr_size(data)
+            exr_size(data)
             pixels = _exr_channels(path, openexr, wanted)
         except Exception as error:  # the binding raises whatever C++ threw
             found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
@@ -105,12 +103,22 @@ def read_exr_channels(path: Path, groups: Sequence[Sequence[str]]) -> list[NDArr
     return [_read_exr(path, tuple(names)) for names in groups]
 
 
-def _require_exr_size(data: bytes) -> None:
-    """Look at the windows in the headers of an OpenEXR file before the package takes memory for them.
+def hdr_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in the head of a Radiance file."""
+    # The size stands behind the first empty line; before it, anything may look like one.
+    size = _HDR_SIZE.match(data, data.find(b"\n\n", 0, 4096) + 2)
+    return None if size is None or not data.startswith(b"#?") else (int(size[2]), int(size[1]))
+
+
+def exr_size(data: bytes) -> tuple[int, int]:
+    """Width and height of the last window in the headers of an OpenEXR file, before the package takes memory for it.
 
     Raises:
         ValueError, struct.error: one is larger than any picture, or there is none.
     """
+    if not data.startswith(_EXR_MAGIC):
+        raise ValueError("no OpenEXR file")
+    width = height = 0
     (version,) = struct.unpack_from("<I", data, 4)
     at, found = 8, False
     while data[at : at + 1] not in (b"\0", b""):
@@ -129,6 +137,7 @@ def _require_exr_size(data: bytes) -> None:
             break
     if not found:
         raise ValueError("no size")
+    return width, height
 
 
 def _exr_channels(path: Path, package: Any, wanted: tuple[str, ...] | None) -> NDArray[Any] | None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import array_kind, read_array
+from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.pictures import decode_stored, read_file
 from polarguide.capture.sensor.packing import PACKINGS, packed_size, unpack
 from polarguide.errors import PolarguideError
@@ -59,7 +60,7 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
 
 def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
     suffix = path.suffix.lower()
-    values = read_array(path) if suffix == ".npy" else decode_stored(path, read_file(path))
+    values = read_array(path) if suffix == ".npy" else decode_stored(path, read_picture(path))
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
