@@ -18,6 +18,7 @@ import spoil
 from base import EVAL, MOSAICS, READ, RESUME, SHOTS, TRAIN
 from corpus_more import more_cases
 from forked import Case
+from further import further_cases
 from options import option_cases
 
 BYTES = ("cut", "empty", "garbage", "flip", "fill", "insert", "append", "twice")
@@ -37,6 +38,7 @@ def corpus(first_seed: int = 0, times: int = 1) -> Iterator[Case]:
     yield from option_cases()
     yield from disk_cases()
     yield from more_cases(every=times > 1)
+    yield from further_cases(every=times > 1)
 
 
 def case(
