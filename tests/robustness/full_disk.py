@@ -20,6 +20,7 @@ import os
 import shutil
 import sys
 import tempfile
+import traceback
 import zipfile
 from collections import Counter
 from collections.abc import Callable
@@ -29,6 +30,8 @@ from warm import warm_up  # it puts the helpers on the path
 
 from base import EVAL, MOSAICS, READ, make_base  # isort: skip
 from forked import ERROR  # isort: skip
+from random_runs import ring  # isort: skip
+from tiny_capture import NAMES  # isort: skip
 
 CLONE_NEWNS, CLONE_NEWUSER = 0x00020000, 0x10000000
 MS_REMOUNT, MS_REC, MS_PRIVATE = 32, 1 << 14, 1 << 18
@@ -89,7 +92,8 @@ def fix() -> None:
 
 
 EXPORTS = ("ply", "spz", "sog", "environment", "cameras")
-"""Not of surfaces: so short a training has none."""
+SURFACES = ("mesh", "points")
+"""Of the run ``round``: so short a training has none."""
 COMMANDS: dict[str, Command] = {
     "train": train,
     "eval": lambda: EVAL,
@@ -103,6 +107,8 @@ COMMANDS: dict[str, Command] = {
     "inspect --fix": fix,
     "share": lambda: ["share", "run", "--out", "new/page.html"],
     **{f"export {kind}": lambda kind=kind: ["export", "run", "--format", kind, "--out", "new"] for kind in EXPORTS},
+    **{f"export {kind}": lambda kind=kind: ["export", "round", "--format", kind, "--out", "new", "--resolution", "24"]
+       for kind in SURFACES},
     "compare": lambda: ["compare", "scene", "--recipes", "3dgs", "polarguide", "--steps", STEPS, "--out", "new"],
     "synth": lambda: ["synth", "proof", "--out", "new", "--size", "16x16", "--samples", "1"],
     "bench": lambda: ["bench", "--out", "new"],
@@ -111,6 +117,44 @@ AT_ONCE_ONLY = {"bench"}
 """Too long to wait for: on a disk without any room alone."""
 STARTS = {"compare", "synth", "bench"}
 """Start further programs, or import for seconds."""
+
+
+def make_round(base: Path) -> None:
+    """A run with a surface: opaque Gaussians about the origin, in a scene whose cameras stand around it."""
+    safetensors = importlib.import_module("safetensors.torch")
+    rotation = importlib.import_module("scipy.spatial.transform").Rotation
+    torch = importlib.import_module("torch")
+    shutil.copytree(base / "scene", base / "circle")
+    rows = []
+    for number, (name, camera) in enumerate(zip(NAMES, ring(len(NAMES)).values(), strict=True), 1):
+        x, y, z, w = rotation.from_matrix(camera.rotation.numpy()).as_quat()
+        numbers = " ".join(map(str, (number, w, x, y, z, *camera.translation.tolist(), 1)))
+        rows.append(f"{numbers} {name}.png\n\n")
+    (base / "circle/sparse/0/images.txt").write_text("".join(rows))
+    shutil.copytree(base / "run", base / "round")
+    record = json.loads((base / "round/run.json").read_text())
+    (base / "round/run.json").write_text(json.dumps({**record, "scene": str(base / "circle")}))
+    tensors = safetensors.load_file(base / "round/checkpoint.safetensors")
+    count = len(tensors["gaussians.means"])
+    tensors["gaussians.means"] = 0.4 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    tensors["gaussians.log_scales"].fill_(-1.5)
+    tensors["gaussians.opacity_logits"].fill_(6.0)
+    safetensors.save_file(tensors, base / "round/checkpoint.safetensors")
+
+
+def in_a_fork(act: Callable[[], None]) -> None:
+    """Do something in a child, so that this process computes nothing."""
+    pid = os.fork()
+    if not pid:
+        code = 1
+        try:
+            act()
+            code = 0
+        except Exception:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    assert not os.waitpid(pid, 0)[1]
 
 
 def ended(command: Command, disk: Path, said: Path) -> int:
@@ -262,6 +306,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         base, disk = Path(folder) / "base", Path(folder) / "disk"
         make_base(base)
+        in_a_fork(lambda: make_round(base))
         disk.mkdir()
         if not mount(disk, LARGE):
             return NO_MOUNT

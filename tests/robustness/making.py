@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import random
@@ -60,6 +61,17 @@ def of_bytes(path: str, data: bytes) -> Change:
 def of_json(path: str, content: Any) -> Change:
     """Write a JSON file."""
     return of_bytes(path, json.dumps(content).encode())
+
+
+def small_machine(then: Change) -> Change:
+    """As on a machine with 2 GiB of free memory."""
+
+    def change(folder: Path) -> None:
+        memory = importlib.import_module("polarguide.capture.memory")
+        memory.free_memory = lambda: 2 << 30  # type: ignore[attr-defined]
+        then(folder)
+
+    return change
 
 
 def instead(

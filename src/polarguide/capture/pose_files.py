@@ -5,10 +5,11 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.capture.datasets.cameras import checked_pose, pinhole_camera, read_projections
@@ -23,6 +24,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """nerfstudio's cameras look along -z with y up."""
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _LARGEST_XML = 1 << 24
+MOST_FRAMES = 20_000
 
 
 def read_pose_file(path: Path, views: Sequence[str], size: tuple[int, int]) -> dict[str, PosedCamera]:
@@ -77,7 +79,7 @@ class _Frame(_Lens):
 
 
 class _Transforms(_Lens):
-    frames: list[_Frame] = []
+    frames: Annotated[list[_Frame], Meta(max_length=MOST_FRAMES)] = []
 
 
 def _nerfstudio(path: Path) -> dict[str, PosedCamera]:
