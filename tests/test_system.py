@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -56,8 +57,18 @@ def test_a_process_is_alive_until_it_ends() -> None:
     assert not process_is_alive(process.pid)
 
 
+@pytest.fixture
+def terminal() -> Iterator[None]:
+    """Not ignoring that a terminal goes away, as what nohup starts does."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_interrupts_before_work_and_asks_it_to_stop_after(number: signal.Signals) -> None:
+def test_a_signal_interrupts_before_work_and_asks_it_to_stop_after(
+    number: signal.Signals, terminal: None
+) -> None:
     before = signal.getsignal(number)
     with StopSignals() as should_stop:
         with pytest.raises(KeyboardInterrupt):
@@ -70,7 +81,7 @@ def test_a_signal_interrupts_before_work_and_asks_it_to_stop_after(number: signa
     assert signal.getsignal(number) is before
 
 
-def test_a_terminal_that_goes_away_is_passed_over_where_it_is_ignored() -> None:
+def test_a_terminal_that_goes_away_is_passed_over_where_it_is_ignored(terminal: None) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
         assert signal.SIGHUP not in stop_signals()

@@ -54,7 +54,7 @@ def test_saturation_of_the_rendered_scenes(name: str, share: float) -> None:
 
 @pytest.mark.shared
 def test_real_capture() -> None:
-    scene = load_scene(shared("real/wwbottle"), downscale=4)
+    scene = load_scene(shared("real/wwbottle"), downscale=4, split="every-8th")
     assert len(scene.views) == 60
     assert scene.warnings == ()
     assert scene.refractive_index is None

@@ -238,7 +238,7 @@ def _analyzers(
         digest.update(f"{vectors.dtype.str} {vectors.shape}".encode())
         digest.update(np.ascontiguousarray(vectors).tobytes())
         said["sha256"] = digest.hexdigest()
-    from polarguide.capture.sensor import analyzers
+    from polarguide.capture.sensor import analyzer_file as analyzers
 
     kind = {"float32": "F32", "float64": "F64"}[str(vectors.dtype)]
     data = vectors.tobytes()
@@ -258,7 +258,7 @@ def _analyzers(
 
 
 def _units() -> dict[str, Any]:
-    from polarguide.capture.sensor import analyzers
+    from polarguide.capture.sensor import analyzer_file as analyzers
 
     return {"format": analyzers.FORMAT, "version": analyzers.VERSION, "units": analyzers.UNITS}
 

@@ -101,8 +101,8 @@ def process_cases() -> Iterator[MadeCase]:
         ("whose source is renamed meanwhile", _meanwhile(lambda f: os.rename(f / "mosaics", f / "elsewhere")), MOSAICS, WORKS),
         ("whose mosaics grow meanwhile", _meanwhile(lambda f: [_swap(f) for _ in range(400)]), MOSAICS, WORKS),
         ("whose table's folder is removed meanwhile", _meanwhile(lambda f: shutil.rmtree(f / "new", ignore_errors=True)), MEASURE, WORKS),
-        ("whose run is renamed meanwhile", _meanwhile(lambda f: os.rename(f / "new", f / "elsewhere"), 0.6), [*TRAIN[:4], "--steps", "60", "--checkpoint-every", "5", *TRAIN[6:]], ""),
-        ("whose run is removed meanwhile", _meanwhile(lambda f: shutil.rmtree(f / "new"), 0.6), [*TRAIN[:4], "--steps", "60", "--checkpoint-every", "5", *TRAIN[6:]], ""),
+        ("whose run is renamed meanwhile", _meanwhile(lambda f: os.rename(f / "new", f / "elsewhere"), 0.6), [*TRAIN[:4], "--steps", "60", "--checkpoint-every", "5", *TRAIN[6:]], "the training may have ended before"),
+        ("whose run is removed meanwhile", _meanwhile(lambda f: shutil.rmtree(f / "new"), 0.6), [*TRAIN[:4], "--steps", "60", "--checkpoint-every", "5", *TRAIN[6:]], "the training may have ended before"),
     ):  # fmt: skip
         yield made_case(f"further process {name}", change, command, reason)
 

@@ -61,9 +61,14 @@ class _Folder:
             found = (
                 self._mosaics() if self.reading.sensor is not None else list_shots([self.root], self.reading)
             )
-        except (PolarguideError, OSError) as error:
-            # Perhaps only the first of four folders is there, or the network is gone: this may pass.
+        except PolarguideError as error:  # perhaps only the first of four folders is there: this may pass
             self._worry(str(error))
+            return []
+        except OSError as error:  # the network may be gone for a while
+            self._worry(
+                f"{self.root}: expected a folder that can be read, found {error.strerror or error}. Bring it back, or "
+                "watch another."
+            )
             return []
         self._trouble = ("", 0.0)
         return [shot for shot in found if not any(os.path.realpath(p) in self.ignored for p in shot.paths)]
