@@ -10,6 +10,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from polarguide.capture.formats.arrays import BROKEN
 from polarguide.capture.formats.integrity import BIG_TIFF, MOST_BIG_ENTRIES, TIFF, declared_size, tiff_order
 from polarguide.capture.formats.radiance import exr_size, hdr_size
 from polarguide.files import LARGEST_FILE, read_file
@@ -28,7 +29,7 @@ def stated_size(path: Path) -> tuple[int, int] | None:
     """
     if not path.is_file():  # a pipe, a folder, a link to nowhere: whoever reads it says so
         return None
-    with contextlib.suppress(OSError, struct.error, ValueError, OverflowError), open(path, "rb") as file:
+    with contextlib.suppress(*BROKEN, struct.error, OverflowError), open(path, "rb") as file:
         start = file.read(16)
         if start[:4] in (*TIFF, *BIG_TIFF):
             return declared_size(_directory(file, start))
