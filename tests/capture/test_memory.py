@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 from dataset_files import WRITERS
-from hostile_files import deflated_tiff, exr, two_sizes_hdr
+from hostile_files import deflated_tiff, exr, header, two_sizes_hdr
 from tiny_capture import NAMES, TinyCapture, write_tiny_capture
 
 from polarguide.capture import load_scene, view_reader
@@ -142,10 +142,12 @@ def test_headers_of_every_kind_state_a_size(tmp_path: Path) -> None:
     (tmp_path / "b.exr").write_bytes(b"junk")
     deflated_tiff(tmp_path / "a.tif", 60)
     (tmp_path / "b.tif").write_bytes(b"II*\0\xf0\xff\xff\xff")
+    for name, head in (("c.npy", "{'descr': ("), ("d.npy", "{{}: 1}"), ("e.npy", "-" * 9000 + "1")):
+        (tmp_path / name).write_bytes(header(head))
     sizes = {path.name: stated_size(path) for path in sorted(tmp_path.iterdir())}
     assert sizes == {
         "a.npy": (7, 5), "b.npy": None, "a.hdr": (300, 300), "a.exr": (40, 40), "b.exr": None, "a.tif": (60, 60),
-        "b.tif": None,
+        "b.tif": None, "c.npy": None, "d.npy": None, "e.npy": None,
     }  # fmt: skip
 
 
