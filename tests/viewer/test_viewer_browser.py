@@ -226,6 +226,42 @@ def test_a_hostile_page_sees_nothing(opened, site):
     page.close()
 
 
+ASK = """async (address) => {
+    const found = [];
+    const loaded = (tag, name) => new Promise((done) => {
+        const made = document.createElement(tag);
+        made.onload = () => done(found.push(tag));
+        made.onerror = () => done();
+        made[name] = address + "/?" + tag;
+        document.body.append(made);
+    });
+    await Promise.all([loaded("script", "src"), loaded("img", "src"), loaded("embed", "src"), new Promise((done) => {
+        const events = new EventSource(address);
+        events.onopen = () => done(found.push("events"));
+        events.onerror = () => done(events.close());
+    })]);
+    const ways = [{}, {mode: "no-cors"}, {method: "POST", mode: "no-cors", body: "x"}, {credentials: "include"}];
+    for (const more of ways)
+        try {
+            const answer = await fetch(address, more);
+            if (answer.type !== "opaque" || (await answer.text()).length) found.push(JSON.stringify(more));
+        } catch { }
+    navigator.sendBeacon(address, "x");
+    return found.filter((what) => what !== "embed");
+}"""
+
+
+def test_a_hostile_page_loads_nothing_of_the_viewer(opened):
+    page = opened.page.context.browser.new_page()
+    site = "http://hostile.example/"
+    page.route("**/*", lambda route: route.fulfill(body="<p>win</p>", content_type="text/html")
+               if route.request.url.startswith(site) else route.continue_())  # fmt: skip
+    page.goto(site)
+    assert page.evaluate(ASK, opened.viewer.address) == []
+    assert opened._thread.is_alive()
+    page.close()
+
+
 def test_a_name_that_was_bound_to_this_machine_sees_nothing(opened):
     page = opened.page.context.browser.new_page()
     port = opened.viewer.address.rpartition(":")[2]
