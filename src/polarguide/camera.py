@@ -122,6 +122,21 @@ class Camera:
         return replace(self, width=self.width // factor, height=self.height // factor, **inner)
 
 
+def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
+    """Where a camera sees points: the nearest pixel (row, column), the depth, and whether it lies in the picture.
+
+    Args:
+        offsets: [N, 3] from the camera's center to the points, world axes.
+        camera: the view.
+    """
+    x, y, z = camera.to_camera(offsets).unbind(-1)
+    safe = z.clamp(min=1e-6)
+    column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()
+    row = (camera.fy * y / safe + camera.cy).floor().clamp(-1, camera.height).long()
+    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return (row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)), z, inside
+
+
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> tuple[Tensor, Tensor]:
     """The pose of a camera that looks at a point.
 

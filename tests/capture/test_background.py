@@ -97,6 +97,14 @@ def test_without_surroundings_only_the_subject_and_its_points_are_left() -> None
     assert alone.point_colors.tolist() == [[1, 2, 3]]
 
 
+def test_masks_of_test_views_do_not_choose_points() -> None:
+    nothing = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    scene = scene_of(view(mask=subject_mask()), view("v1", mask=nothing))
+    assert without_surroundings(replace(scene, test_names=("v1",))).points.tolist() == [[0.0, 0.0, 0.0]]
+    with pytest.raises(PolarguideError, match="none of 2 points"):
+        without_surroundings(scene)
+
+
 def test_a_view_without_a_mask_is_named() -> None:
     with pytest.raises(PolarguideError, match=r"none of view v1.*masks/v1\.png"):
         without_surroundings(scene_of(view(mask=subject_mask()), view("v1")))

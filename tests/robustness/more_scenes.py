@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from base import READ, TRAIN
 from forked import Case
-from making import PICTURE, SAME, TRUTH, UNUSED, Change, of_bytes, of_json, sparse
+from making import PICTURE, SAME, TRUTH, UNUSED, Change, of_bytes, of_json, put, sparse
 from making import more_case as case
 
 INSPECT = ["inspect", "scene", "--normals", "points", "--out", "new"]
@@ -106,23 +105,6 @@ def scene_cases() -> Iterator[Case]:
         [*INSPECT, "--fix", "fixed"],
         "there is nothing to fix where geometry does not decide",
     )
-
-    def put(path: str, how: str) -> Change:
-        def change(folder: Path) -> None:
-            target = folder / path
-            shutil.rmtree(target) if target.is_dir() else target.unlink()
-            if how == "file":
-                target.write_text("no folder")
-            elif how == "pipe":
-                os.mkfifo(target)
-            elif how == "loop":
-                target.symlink_to(target.name)
-            elif how == "root":
-                target.symlink_to("/")
-            elif how == "itself":
-                target.symlink_to(".")
-
-        return change
 
     for path in ("scene", "scene/polar", "scene/sparse", "scene/sparse/0", "scene/gt", "scene/invalid"):
         for how in ("file", "pipe", "loop", "root", "itself"):

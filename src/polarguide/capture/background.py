@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 from torch import Tensor
 
+from polarguide.camera import seen_at
 from polarguide.capture.view import Scene, View
 from polarguide.errors import PolarguideError
 
@@ -65,7 +66,8 @@ def without_surroundings(scene: Scene) -> Scene:
                 remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
             )
         views.append(replace(view, codes=view.codes * view.mask.to(view.codes)[None, ..., None]))
-    inside = _in_masks(scene.points, views)
+    # The masks of test views tell training nothing.
+    inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])
     if len(scene.points) and not bool(inside.any()):
         raise PolarguideError(
             scene.root / "masks",
@@ -82,17 +84,11 @@ def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
     """Which points [M, 3] lie in the grown masks of most of the pictures that they fall into, [M] bool."""
     seen, inside = torch.zeros(len(points)), torch.zeros(len(points))
     for view in views:
-        camera = view.camera
         assert view.mask is not None
         mask = torch.from_numpy(_grown(view.mask.cpu().numpy(), GROWN))
-        x, y, z = camera.to_camera(points.double() - camera.center).unbind(-1)
-        safe = z.clamp(min=1e-9)
-        column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()
-        row = (camera.fy * y / safe + camera.cy).floor().clamp(-1, camera.height).long()
-        within = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        hit = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+        pixel, _, within = seen_at(points.double() - view.camera.center, view.camera)
         seen += within
-        inside += within & hit
+        inside += within & mask[pixel]
     return (seen > 0) & (inside >= INSIDE * seen)
 
 

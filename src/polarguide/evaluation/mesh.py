@@ -12,14 +12,13 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, seen_at
 from polarguide.capture import View
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.evaluation.target import jumps
 from polarguide.rendering.fusion import NoSurfaceError, Surface, seen_points
 from polarguide.rendering.mesh import RESOLUTION, fused_surface
 from polarguide.shading.result import RenderResult
-from polarguide.shading.visibility import seen_at
 
 THRESHOLDS = {"05": 0.005, "1": 0.01}
 """Distances that count as right, as shares of the object's diagonal, by the end of their keys."""

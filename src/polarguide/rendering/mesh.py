@@ -10,12 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, seen_at
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.rendering.fusion import TRUNCATION, Box, Surface, box_around, fuse, seen_points, surface_of
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import RenderResult
-from polarguide.shading.visibility import seen_at
 from polarguide.vectors import dot, unit
 
 RESOLUTION = 192

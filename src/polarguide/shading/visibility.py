@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import Camera, seen_at
 from polarguide.capture import View
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render, splats
@@ -18,21 +18,6 @@ from polarguide.vectors import unit
 DEPTH_SLACK = 0.02
 # Pixels that a Gaussian has to fill, counted by its blending weights, to add to a picture.
 LEAST_PIXELS = 0.05
-
-
-def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """Where a camera sees points: the nearest pixel (row, column), the depth, and whether it lies in the picture.
-
-    Args:
-        offsets: [N, 3] from the camera's center to the points, world axes.
-        camera: the view.
-    """
-    x, y, z = camera.to_camera(offsets).unbind(-1)
-    safe = z.clamp(min=1e-6)
-    column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()
-    row = (camera.fy * y / safe + camera.cy).floor().clamp(-1, camera.height).long()
-    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    return (row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)), z, inside
 
 
 @torch.no_grad()

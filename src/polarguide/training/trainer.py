@@ -121,7 +121,6 @@ class Trainer:
         mean = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
         report = StepReport(state.step, position.stage.name, len(state.gaussians), mean)
         state.step += 1
-        densifies = position.stage.densify
         if position.stage.densify and state.step % recipe.densification.every == 0:
             self.exchange_statistics()
             densify(
@@ -135,7 +134,7 @@ class Trainer:
                 limit=self._limit,
                 generator=seeded(self.settings.seed, 2, state.step),
             )
-        if self.black and densifies and not self._densifies_next():
+        if self.black and position.stage.densify and not self._densifies_next():
             self._prune_untouched()
         self.whole = True
         return report

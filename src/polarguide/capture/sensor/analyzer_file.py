@@ -141,9 +141,8 @@ def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
         raise _damaged(path, "vectors of pixels that hardly polarize")
     nominal = 2 * np.radians(found.pattern.angles)
     angles = np.arctan2(found.vectors[..., 2], found.vectors[..., 1])
-    if (
-        np.cos(angles - nominal) < np.cos(2 * FARTHEST_ANGLE)
-    ).any():  # and four alike could not be solved for light
+    # Four that are alike could not be solved for light.
+    if (np.cos(angles - nominal) < np.cos(2 * FARTHEST_ANGLE)).any():
         raise _damaged(path, "vectors of polarizers far from the sensor's angles")
 
 
