@@ -12,6 +12,7 @@ from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, choose_backend, rasterize_reference
 from polarguide.recipes import RECIPES
 from polarguide.shading.visibility import LEAST_PIXELS, touching_views
+from polarguide.training import losses as losses_of_steps
 from polarguide.training.losses import coverage_loss
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import first_state
@@ -82,6 +83,20 @@ def test_coverage_counts_empty_pixels_alone() -> None:
     assert alpha.grad is not None
     assert alpha.grad.tolist() == [[0.5, 0.5], [0.0, 0.0]]
     assert float(coverage_loss(alpha.detach(), torch.zeros(2, 2))) == 0
+
+
+def test_a_step_is_pulled_to_emptiness_where_the_background_is_black(
+    black_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loss of the first step, with and without the term on coverage, where masks leave Gaussians outside."""
+    mask = torch.zeros(black_scene.views[0].codes.shape[1:3], dtype=torch.bool)
+    mask[9:11, 11:13] = True
+    masked = replace(black_scene, views=tuple(replace(view, mask=mask) for view in black_scene.views))
+    losses = []
+    for weight in (0.0, losses_of_steps.COVERAGE):
+        monkeypatch.setattr(losses_of_steps, "COVERAGE", weight)
+        losses.append(float(trainer(masked, "black").step().measured[2]))
+    assert losses[1] > losses[0]
 
 
 def summed_weights(made: Trainer, number: int) -> list[float]:
