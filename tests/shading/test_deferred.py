@@ -299,3 +299,42 @@ def test_normals_keep_their_outer_side_past_the_silhouette(gaussians: dict[str, 
     assert normal is not None
     assert other is not None
     assert not torch.allclose(normal, other)
+
+
+@pytest.mark.parametrize("shading", [LERP, FRESNEL], ids=["lerp", "fresnel"])
+def test_held_layers_are_the_layers_and_leave_rotations_alone(
+    gaussians: dict[str, Tensor], shading: DeferredShading
+) -> None:
+    leaves = {name: values.clone().requires_grad_() for name, values in gaussians.items()}
+    texels = environment().requires_grad_()
+    result = render(
+        leaves, camera(), rasterize_cpu, shading=shading, light={"texels": texels}, held=True, depth=True
+    )
+    assert result.held is not None
+    assert result.specular is not None
+    assert result.diffuse is not None
+    assert torch.equal(result.held[0], result.specular)
+    assert torch.equal(result.held[1], result.diffuse)
+
+    def gradients(layer: Tensor) -> dict[str, Tensor]:
+        wanted = [leaves["strength_logits"], leaves["sh_dc"], texels, leaves["quaternions"]]
+        found = torch.autograd.grad(layer.square().sum(), wanted, retain_graph=True, materialize_grads=True)
+        return dict(zip(("strength", "base", "texels", "quaternions"), found, strict=True))
+
+    moved, held = gradients(result.specular), gradients(result.held[0])
+    for name in ("strength", "base", "texels"):
+        torch.testing.assert_close(held[name], moved[name])
+    # Rotations shape the splats, too, so that what is left of their gradient is not zero: it is that of a picture whose
+    # normals are given.
+    assert float((held["quaternions"] - moved["quaternions"]).abs().max()) > 1e-4
+    frozen = {**leaves, "quaternions": leaves["quaternions"].detach()}
+    still = render(frozen, camera(), rasterize_cpu, shading=shading, light={"texels": texels}, depth=True)
+    assert still.specular is not None
+    assert torch.equal(still.specular, result.held[0])
+
+
+def test_layers_are_held_only_where_asked_for(gaussians: dict[str, Tensor]) -> None:
+    light = {"texels": environment()}
+    assert render(gaussians, camera(), rasterize_cpu, shading=FRESNEL, light=light).held is None
+    plain = render(gaussians, camera(), rasterize_cpu, shading=PLAIN, held=True)
+    assert plain.held is None

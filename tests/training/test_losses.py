@@ -26,7 +26,7 @@ from polarguide.training.losses import (
 )
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
-from polarguide.training.recipe import Weights
+from polarguide.training.recipe import Priors, Weights
 
 SIZE = (12, 14)
 GLASS = DeferredShading("fresnel").bind(1.5)
@@ -70,6 +70,7 @@ def priors() -> ViewPriors:
         CAMERA,
         measured(1.0),
         torch.ones(SIZE),
+        Priors(),
     )
 
 
@@ -227,6 +228,59 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
     )
     assert float(total) == pytest.approx(float(expected), rel=1e-5)
     assert float(photometric) == pytest.approx(float(expected_photometric), rel=1e-6)
+
+
+def test_few_polarized_pixels_pull_no_harder_than_many(priors: ViewPriors) -> None:
+    one = torch.zeros(SIZE)
+    one[3, 4] = 1.0
+    few = replace(priors, weight=one, chromatic_weight=one)
+    spread = replace(few, settings=Priors(azimuth_share=0.5, chromatic_share=0.25))
+    pixels = SIZE[0] * SIZE[1]
+    for loss, share in ((azimuth_loss, 0.5), (normal_loss, 0.5), (chromatic_loss, 0.25)):
+        assert float(loss(unit(9), spread)) == pytest.approx(float(loss(unit(9), few)) / (share * pixels))
+    # Where more than that share is polarized, the least share means nothing.
+    whole = replace(spread, weight=torch.ones(SIZE))
+    assert float(azimuth_loss(unit(9), whole)) == pytest.approx(
+        float(azimuth_loss(unit(9), replace(whole, settings=Priors())))
+    )
+
+
+def test_what_is_bright_counts_for_the_agreement_with_depth_whatever_its_polarization(
+    priors: ViewPriors,
+) -> None:
+    dark, bright = torch.zeros_like(priors.stokes), torch.ones_like(priors.stokes)
+    settings = Priors(bright=0.25)
+    none = replace(priors, weight=torch.zeros(SIZE), settings=settings)
+    assert torch.equal(replace(none, stokes=bright).surface, torch.ones(SIZE))
+    assert torch.equal(replace(none, stokes=dark).surface, torch.zeros(SIZE))
+    # S0/2 of 0.125 is half of what counts fully.
+    torch.testing.assert_close(replace(none, stokes=0.25 * bright).surface, torch.full(SIZE, 0.5))
+    assert torch.equal(replace(priors, stokes=dark, settings=settings).surface, priors.weight)
+    assert torch.equal(replace(none, stokes=bright, settings=Priors()).surface, none.weight)
+
+
+def test_layers_of_half_the_picture_weigh_half(priors: ViewPriors) -> None:
+    rendered = result(final=picture(6), specular=picture(7), diffuse=picture(8))
+    half = torch.zeros(SIZE)
+    half[: SIZE[0] // 2] = 1.0
+    some = replace(priors, separated=half)
+
+    def layers(given: ViewPriors) -> float:
+        total, photometric = step_loss(
+            rendered,
+            srgb_encode(picture(6)),
+            None,
+            Weights(specular=0.5),
+            given,
+            ssim_weight=0.2,
+            shading=GLASS,
+            log_scales=SCALES,
+            extent=2.0,
+        )
+        return float(total - photometric)
+
+    expected = 0.5 * float(photometric_loss(picture(7), priors.specular, half, 0.2))
+    assert layers(some) == pytest.approx(0.5 * expected, rel=1e-5)
 
 
 def test_a_perfect_picture_costs_nothing(priors: ViewPriors) -> None:

@@ -66,8 +66,18 @@ RECIPE_POLARGUIDE: Recipe = replace(
         _FINAL,
         final_rates=_SLOW,
     ),
-    # An ideal sensor measures the azimuth down to a DoLP of a percent; noise has its own mask.
-    priors=Priors(threshold=0.01, full_dolp=0.05, azimuth_weight=1.0, snr=3.0, chromatic=True),
+    hold_normals=True,
+    priors=Priors(
+        # An ideal sensor measures the azimuth down to a DoLP of a percent; noise has its own mask.
+        threshold=0.01,
+        full_dolp=0.05,
+        azimuth_weight=1.0,
+        snr=3.0,
+        chromatic=True,
+        azimuth_share=0.5,
+        chromatic_share=0.1,
+        bright=0.1,
+    ),
 )
 
 SHADING_STOKES = replace(SHADING_3DGS_DR, blend="fresnel", local=True, first_strength=0.5)
@@ -91,6 +101,7 @@ RECIPE_POLARGUIDE_PAPER: Recipe = replace(
     name="polarguide-paper",
     about="PolarGuide-GSDR to the letter: its four candidates and its separation cue; its kind reading is :kind.",
     stages=_stages(Weights(specular=0.5, diffuse=0.2, normal=0.2), Weights(normal=0.2)),
+    hold_normals=False,
     priors=Priors(candidates="paper", separation="paper", azimuth_weight=0.0),
 )
 

@@ -28,6 +28,7 @@ def render(
     light: Light = NO_LIGHT,
     normals: bool = True,
     depth: bool = False,
+    held: bool = False,
     statistic: ScreenStatistic | None = None,
 ) -> RenderResult:
     """Render one view.
@@ -39,6 +40,7 @@ def render(
         shading: what is splatted, and how it makes the picture. light: its learned light, by name.
         normals: also splat normals where the shading model does not need them.
         depth: also splat camera depth.
+        held: also give the layers without a gradient on the normals, of a shading model that has them.
         statistic: see ``ScreenStatistic``; the color channels come first.
     """
     pose = camera.pose(gaussians["means"].dtype, gaussians["means"].device)
@@ -56,6 +58,7 @@ def render(
     picture = rasterize(splats(gaussians, torch.cat(channels, dim=1)), camera, statistic=statistic)
     features, normal, camera_depth = split(picture.features, picture.alpha, normals=normals, depth=depth)
     layers = shading.shade(GBuffer(features, picture.alpha), light, camera)
+    again = shading.shade(_hold_normals(features, picture.alpha), light, camera) if held and normals else {}
     return RenderResult(
         final=layers["final"],
         base=features[..., :3],
@@ -64,7 +67,14 @@ def render(
         depth=camera_depth,
         alpha=picture.alpha,
         radii=picture.radii,
+        held=(again["specular"], again["diffuse"]) if "specular" in again else None,
     )
+
+
+def _hold_normals(features: Tensor, alpha: Tensor) -> GBuffer:
+    """The G-buffer of blended [H, W, D] channels, with normals that get no gradient."""
+    normal = features[..., 3:6].detach()
+    return GBuffer(torch.cat((features[..., :3], normal, features[..., 6:]), dim=-1), alpha)
 
 
 Split = tuple[Tensor, Tensor | None, Tensor | None]

@@ -27,6 +27,7 @@ class RenderResult:
         depth: [H, W] expected camera depth over alpha; None where not asked for.
         alpha: [H, W] in [0, 1].
         radii: [N] pixels, of the projected Gaussians; 0 where culled; None where there are no Gaussians.
+        held: ``specular`` and ``diffuse`` once more, without a gradient on the normals; None where not asked for.
     """
 
     final: Tensor
@@ -39,9 +40,10 @@ class RenderResult:
     depth: Tensor | None
     alpha: Tensor
     radii: Tensor | None = None
+    held: tuple[Tensor, Tensor] | None = None
 
     def to(self, device: torch.device | str) -> RenderResult:
-        """The same on a device; nothing is copied that is there already."""
-        layers = {field.name: getattr(self, field.name) for field in fields(self)}
+        """The same on a device, but for ``held``; nothing is copied that is there already."""
+        layers = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "held"}
         moved: dict[str, Any] = {name: t.to(device) for name, t in layers.items() if t is not None}
-        return replace(self, **moved)
+        return replace(self, held=None, **moved)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -84,7 +86,7 @@ def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
         normal: [H, W, 3] blended normals, world axes, any length.
     """
     cosine = dot(unit(normal, 1e-2), nearest_target(normal, priors))
-    return ((1 - cosine) * priors.weight).sum() / priors.weight.sum().clamp(min=1)
+    return ((1 - cosine) * priors.weight).sum() / priors.total
 
 
 def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
@@ -93,7 +95,7 @@ def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
     Unlike the zenith of a pure-lobe inversion, the plane does not depend on the refractive index or on how lobes mix.
     """
     distance = dot(unit(normal, 1e-2), priors.plane).abs()
-    return (distance * priors.weight).sum() / priors.weight.sum().clamp(min=1)
+    return (distance * priors.weight).sum() / priors.total
 
 
 def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
@@ -103,7 +105,7 @@ def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
         normal: [H, W, 3] blended normals, world axes, any length.
     """
     cosine = dot(unit(normal, 1e-2), priors.chromatic)
-    return ((1 - cosine) * priors.chromatic_weight).sum() / priors.chromatic_weight.sum().clamp(min=1)
+    return ((1 - cosine) * priors.chromatic_weight).sum() / priors.chromatic_total
 
 
 def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel) -> Tensor:
@@ -170,6 +172,9 @@ def step_loss(
     """
     photometric = photometric_loss(result.final, shown, valid, ssim_weight)
     total = weights.photometric * photometric
+    if result.held is not None:
+        specular, diffuse = result.held
+        result = replace(result, specular=specular, diffuse=diffuse)
     if priors is not None:
         total = total + _layer_terms(result, weights, priors, ssim_weight)
     if weights.flatness and result.radii is not None:
@@ -205,7 +210,8 @@ def _layer_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssi
     ):
         if weight and layer is not None:
             total = total + weight * photometric_loss(layer, target, priors.separated, ssim_weight)
-    return total
+    # Over all pixels like the picture's own term, so that before nothing it does not outweigh it.
+    return priors.separated_share * total
 
 
 def normal_terms(
@@ -232,11 +238,17 @@ def normal_terms(
     if priors is not None:
         assert result.normal is not None
         directions = [
-            Directions(target, weight, factor / max(1.0, float(weight.sum())), plane)
-            for factor, target, weight, plane in (
-                (weights.normal, nearest_target(result.normal, priors), priors.weight, False),
-                (weights.azimuth, priors.plane, priors.weight, True),
-                (weights.chromatic, priors.chromatic, priors.chromatic_weight, False),
+            Directions(target, weight, factor / total, plane)
+            for factor, target, weight, total, plane in (
+                (weights.normal, nearest_target(result.normal, priors), priors.weight, priors.total, False),
+                (weights.azimuth, priors.plane, priors.weight, priors.total, True),
+                (
+                    weights.chromatic,
+                    priors.chromatic,
+                    priors.chromatic_weight,
+                    priors.chromatic_total,
+                    False,
+                ),
             )
             if factor
         ]
@@ -248,7 +260,7 @@ def normal_terms(
             stokes = Polarization(measured, S1_AND_S2, priors.stokes_weight, factor, index)
     if weights.consistency and camera is not None:
         factor = weights.consistency / ((result.alpha.shape[0] - 2) * (result.alpha.shape[1] - 2))
-        consistency = Consistency(None if priors is None else priors.weight, factor)
+        consistency = Consistency(None if priors is None else priors.surface, factor)
     terms = Terms(stokes, directions, consistency)
     if not any(terms):
         return beside
@@ -285,6 +297,6 @@ def normal_terms_reference(
             total = total + weights.stokes * stokes_loss(result, priors, shading)
     if weights.consistency and camera is not None:
         total = total + weights.consistency * consistency_loss(
-            result, camera, None if priors is None else priors.weight
+            result, camera, None if priors is None else priors.surface
         )
     return total

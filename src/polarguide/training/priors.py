@@ -43,6 +43,7 @@ class ViewPriors:
         camera: of the view.
         stokes: [3, H, W, 3] as measured.
         reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or clips.
+        settings: what they were computed with.
     """
 
     specular: Tensor
@@ -56,6 +57,7 @@ class ViewPriors:
     camera: Camera
     stokes: Tensor
     reliable: Tensor
+    settings: Priors
     candidates: Tensor | None = None
 
     @cached_property
@@ -64,6 +66,27 @@ class ViewPriors:
         the noise.
         """
         return self.reliable * (self.stokes[0].mean(dim=-1) + 0.01).rsqrt()
+
+    @cached_property
+    def total(self) -> float:
+        """What sums with ``weight`` are divided by: its sum, or the least share of the pixels."""
+        return _total(self.weight, self.settings.azimuth_share)
+
+    @cached_property
+    def chromatic_total(self) -> float:
+        """What sums with ``chromatic_weight`` are divided by: its sum, or the least share of the pixels."""
+        return _total(self.chromatic_weight, self.settings.chromatic_share)
+
+    @cached_property
+    def separated_share(self) -> float:
+        """The mean of ``separated``."""
+        return float(self.separated.mean())
+
+    @cached_property
+    def surface(self) -> Tensor:
+        """[H, W] weight of the agreement of normals and depth, in [0, 1]."""
+        shown = optics.luminance(self.stokes)[0] / 2
+        return torch.maximum(self.weight, (shown / self.settings.bright).clamp(0, 1))
 
 
 def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -139,8 +162,13 @@ def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: 
         camera=view.camera,
         stokes=stokes,
         reliable=(~(view.invalid | view.saturated)).float(),
+        settings=settings,
         candidates=view.camera.to_world(_normals(candidates)) if settings.live else None,
     )
+
+
+def _total(weight: Tensor, share: float) -> float:
+    return max(1.0, float(weight.sum()), share * weight.numel())
 
 
 def _candidates(

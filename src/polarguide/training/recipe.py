@@ -6,6 +6,7 @@ Nothing in the loop compares a step with a constant: boundaries are fractions of
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
@@ -102,6 +103,11 @@ class Weights:
         """Whether a term looks at the rendered depth."""
         return self.consistency > 0
 
+    @property
+    def layers(self) -> bool:
+        """Whether a term looks at the layers one by one."""
+        return any((self.specular, self.diffuse, self.stokes))
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -145,6 +151,10 @@ class Priors:
         azimuth_weight: in [0, 1], how much the choice among candidates trusts azimuth over zenith.
         snr: ratio of the DoLP to its noise above which a pixel's normal is used; 0 switches the test off.
         chromatic: whether the polarization of color differences gives the plane where it is decided.
+        azimuth_share, chromatic_share: of the pixels, the least that the terms on directions are averaged over, so that
+            a view whose few pixels are polarized does not pull as hard as one that is polarized all over.
+        bright: S0/2 from which on consistency counts fully whatever the DoLP, and below in proportion: where a surface
+            shows something, its depth is known. Infinity: by the DoLP alone.
     """
 
     candidates: Candidates = "physical"
@@ -155,6 +165,9 @@ class Priors:
     azimuth_weight: float = 0.5
     snr: float = 0.0
     chromatic: bool = False
+    azimuth_share: float = 0.0
+    chromatic_share: float = 0.0
+    bright: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -186,6 +199,9 @@ class Recipe:
         rates: learning rates of what every recipe trains; that of the means is times the scene's extent.
         shading: how Gaussians and learned light make the picture in stages with reflection.
         means_decay: factor on the means' rate at the last step (exponential in between).
+        hold_normals: whether the terms on the layers reach the normals through Fresnel's equations alone, and not
+            through what the layers mirror at them: the separated pictures are made with the normals of before, so that
+            normals which follow them confirm their own errors.
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
@@ -200,6 +216,7 @@ class Recipe:
     rates: Mapping[str, float]
     shading: ShadingModel = PLAIN
     means_decay: float = 0.01
+    hold_normals: bool = False
     oriented: bool = False
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
     ssim_weight: float = 0.2

@@ -174,6 +174,7 @@ class Trainer:
             light=state.light,
             normals=stage.weights.normals,
             depth=stage.weights.depth,
+            held=stage.reflection and recipe.hold_normals and stage.weights.layers,
             statistic=statistic,
         )
         shown = self._shown_photograph(view)
