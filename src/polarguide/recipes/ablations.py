@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -104,6 +105,21 @@ _COMMON = (
         firm_to_the_end,
     ),
     ("without-consistency", "Normals need not agree with the depth.", off("consistency")),
+    (
+        "consistency-by-dolp",
+        "Normals agree with the depth where polarization says something, and nowhere else.",
+        priors(bright=math.inf),
+    ),
+    (
+        "layers-turn-normals",
+        "The terms on the layers reach the normals through what the layers mirror, too.",
+        lambda recipe: replace(recipe, hold_normals=False),
+    ),
+    (
+        "few-pixels-pull",
+        "The terms on directions are averaged over what is polarized, however few pixels that are.",
+        priors(azimuth_share=0.0, chromatic_share=0.0),
+    ),
     _UNPOLARIZED,
     _UNPOLARIZED_INCONSISTENT,
 )
