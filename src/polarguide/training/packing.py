@@ -109,8 +109,10 @@ def unpack_priors(entry: Entry, camera: Camera) -> ViewPriors:
         values.setdefault(name, nothing.expand(size))
     light = values.pop("stokes_weight", None)
     measured = values.pop("stokes", None)
-    stokes = nothing.expand(3, *size, 3) if measured is None else torch.nn.functional.pad(
-        measured, (0, 0, 0, 0, 0, 0, 1, 0), value=torch.nan
+    stokes = (
+        nothing.expand(3, *size, 3)
+        if measured is None
+        else torch.nn.functional.pad(measured, (0, 0, 0, 0, 0, 0, 1, 0), value=torch.nan)
     )
     priors = ViewPriors(camera=camera, stokes=stokes, **values)
     if light is not None:

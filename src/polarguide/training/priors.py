@@ -224,4 +224,8 @@ def facing_chromatic(
 def _chromatic_angles(stokes: Tensor, refractive_index: float, good: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Zenith, azimuth and weight in [0, 1] of the normals of the color differences, each [H, W]."""
     found = optics.chromatic_normals(stokes, refractive_index)
-    return found.zenith, found.azimuth, (found.certainty / FULL_CERTAINTY).clamp(max=1) * (found.decided & good)
+    return (
+        found.zenith,
+        found.azimuth,
+        (found.certainty / FULL_CERTAINTY).clamp(max=1) * (found.decided & good),
+    )

@@ -58,10 +58,12 @@ class _Shown(NamedTuple):
 
 
 def is_black(scene: Scene, settings: TrainSettings) -> bool:
-    """Whether a training takes it that nothing is behind the subject."""
-    if settings.background == "auto":
-        return has_black_background(scene.train_views)
-    return settings.background != "scene"
+    """Whether a training takes it that nothing is behind the subject; a scene's pictures are looked at once."""
+    if settings.background != "auto":
+        return settings.background != "scene"
+    if "_black" not in vars(scene):
+        vars(scene)["_black"] = has_black_background(scene.train_views)
+    return bool(vars(scene)["_black"])
 
 
 class Trainer:
@@ -107,7 +109,7 @@ class Trainer:
         self._extent = scene_extent(centers)
         self._middle = centers.mean(dim=0).float().to(self._device)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
-        self._limit = int(pixels / recipe.densification.pixels_each)
+        self._limit = settings.gaussians or int(pixels / recipe.densification.pixels_each)
         empty = free_space(scene.points, [view.camera for view in scene.train_views])
         self._empty = empty.to(self._device)
         self._store = store or ViewStore()
@@ -177,6 +179,7 @@ class Trainer:
         view = self._view_of(state.step * self.settings.views_per_step + slot)
         shading = self.shading if stage.reflection else PLAIN
         statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
+        priors = self._priors_of(view, stage)  # before there is a picture, which takes memory, too
         result = render(
             state.gaussians,
             view.camera,
@@ -194,7 +197,7 @@ class Trainer:
             shown.picture,
             shown.valid,
             stage.weights,
-            self._priors_of(view, stage),
+            priors,
             ssim_weight=recipe.ssim_weight,
             shading=shading,
             log_scales=state.gaussians["log_scales"],

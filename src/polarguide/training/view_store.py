@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,7 +102,8 @@ class ViewStore:
 
     def _write(self, key: tuple[str, str], entry: Entry, size: int) -> None:
         if self._file is None:
-            self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)
+            self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115, until close
+            weakref.finalize(self, self._file.close)
         place = self._places.get(key)
         if place is None or place.room < size:
             place = _Place(self.in_file, size)
