@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -85,6 +86,20 @@ def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
         raise PolarguideError(name, expected=expected, found=value, remedy="Correct the name.")
 
 
+_UNITS = {"k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
+_BINARY = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30, "t": 1 << 40}
+_SIZE = re.compile(r"(?P<count>\d+(\.\d*)?|\.\d+) ?(?P<unit>[kmgt])(?P<binary>i?)b?", re.IGNORECASE)
+
+
+def gibibytes(text: str) -> float | None:
+    """A size such as 4GB, 600MB or 3.5GiB in GiB; None where it is none, a number without a unit too."""
+    found = _SIZE.fullmatch(text.strip())
+    if found is None:
+        return None
+    units = _BINARY if found["binary"] else _UNITS
+    return float(found["count"]) * units[found["unit"].lower()] / _BINARY["g"]
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """How a scene folder is read.
@@ -92,7 +107,8 @@ class SceneOptions:
     Attributes:
         downscale: Average the pictures over boxes of this many pixels first.
         transfer: How the files encode radiance. Polarization needs linear; srgb undoes the display curve of JPEGs.
-        memory: GiB that the pictures may take, as their headers state; 0 is 80 % of what is free.
+        memory: The most memory to take, such as 4GB (a number alone is GiB): of training, all that the process takes;
+            elsewhere what the pictures take, as their headers state. 0 is 80 % of what is free.
         split: Which views are held out to be scored on where the scene has no split.json, one in eight: directions
             spreads them among the others, every-8th counts through the names.
     """

@@ -159,6 +159,20 @@ def peak_memory_mib() -> float | None:
     return peak / MEBIBYTE if os.uname().sysname == "Darwin" else peak / 1024
 
 
+def resident_memory() -> int | None:
+    """Bytes of memory that this process holds now, or the most that it has held; None: the system does not tell."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    peak = peak_memory_mib()
+    return None if peak is None else int(peak * MEBIBYTE)
+
+
+def return_freed_memory() -> None:
+    """Give what has been freed back to the system, where the allocator is glibc's."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def keep_freed_memory() -> None:
     """Tell the allocator, for the rest of this process, to keep what is freed; only glibc's does as told.
 

@@ -65,7 +65,7 @@ def without_surroundings(scene: Scene) -> Scene:
                 found=f"none of view {view.name}",
                 remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
             )
-        views.append(replace(view, codes=view.codes * view.mask.to(view.codes)[None, ..., None]))
+        views.append(view.subject_alone())
     # The masks of test views tell training nothing.
     inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])
     if len(scene.points) and not bool(inside.any()):

@@ -48,15 +48,26 @@ class Measures:
     sums: NDArray[np.float64]
 
 
+def sampled(codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """What ``measure`` looks at of the codes of a view [4, H, W, 3], for whoever does not keep them."""
+    step = _step(codes.shape[1] * codes.shape[2])
+    return codes[:, ::step, ::step].copy()
+
+
+def _step(pixels: int) -> int:
+    """Distance of the pixels that are measured."""
+    return max(1, math.ceil(math.sqrt(pixels / _SAMPLES)))
+
+
 def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_]) -> Measures:
     """Measure one view.
 
     Args:
-        codes: linear codes [4, H, W, 3].
+        codes: linear codes [4, H, W, 3], or ``sampled`` ones.
         usable: pixels that are neither saturated nor invalid, [H, W].
     """
-    step = max(1, math.ceil(math.sqrt(usable.size / _SAMPLES)))
-    sample = codes[:, ::step, ::step].astype(np.float64)
+    step = _step(usable.size)
+    sample = (codes if codes.shape[1:3] != usable.shape else codes[:, ::step, ::step]).astype(np.float64)
     bright = float(np.percentile(sample, 99.0)) / FULL_CODE
     gray = sample.mean(axis=3)
     angles = gray[:, usable[::step, ::step] & (gray.min(axis=0) > _LOW_CODE)]

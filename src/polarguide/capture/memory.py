@@ -15,25 +15,28 @@ from polarguide.system import free_memory
 GIBIBYTE = 1 << 30
 SHARE = 0.8
 """Of the free memory, that the pictures may take where nothing else was asked for."""
-# Bytes for each pixel of a view: codes of four angles in three channels, peak, black, invalid, saturated, mask.
-KEPT = 4 * 3 * 2 + 2 + 4
+# Bytes for each pixel of a view: peak, black, invalid, saturated, mask; with codes of four angles in three channels.
+MASKS = 2 + 4
+KEPT = 4 * 3 * 2 + MASKS
 # While one view is read: what is decoded of it, its copy in linear codes, and channels apart.
 READ = 4 * 3 * 2 * 3
 
 
-def check_memory(layout: Layout, names: Sequence[str], *, factor: int, at_once: int, limit: float) -> None:
+def check_memory(
+    layout: Layout, names: Sequence[str], *, factor: int, at_once: int, limit: float, hold: bool = True
+) -> None:
     """Refuse pictures that do not fit into memory.
 
     Args:
         layout: the files. names: views to be read, with all their angles.
         factor: side of the boxes over which they are averaged. at_once: views that are read at a time.
-        limit: GiB that may be taken; 0: 80 % of what is free.
+        limit: GiB that may be taken; 0: 80 % of what is free. hold: whether the pictures stay in memory.
 
     Raises:
         PolarguideError: the least that suffices is more.
     """
-    pixels = [_largest(layout, name) for name in names]
-    kept = sum(KEPT * count // factor**2 for count in pixels)
+    pixels = stated_pixels(layout, names)
+    kept = sum((KEPT if hold else MASKS) * count // factor**2 for count in pixels)
     needed = kept + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
     remedy = "Give --downscale 2 or more, fewer views, or more --memory."
     require_memory(layout.root, needed, f"{len(names)} views", limit=limit, remedy=remedy)
@@ -78,6 +81,11 @@ def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: f
             found=f"{what} that take {needed / GIBIBYTE:.1f} GiB",
             remedy=remedy,
         )
+
+
+def stated_pixels(layout: Layout, names: Sequence[str]) -> list[int]:
+    """Pixels of the pictures of each view, as their headers state; 0 where they do not."""
+    return [_largest(layout, name) for name in names]
 
 
 def _largest(layout: Layout, name: str) -> int:

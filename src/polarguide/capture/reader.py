@@ -6,11 +6,12 @@ import hashlib
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera
@@ -22,7 +23,8 @@ from polarguide.capture.memory import check_memory, stated_size
 from polarguide.capture.metadata import held_out, refractive_index_of
 from polarguide.capture.objects import objects_of
 from polarguide.capture.split import chosen_views, far_from_training
-from polarguide.capture.view import Scene, listed
+from polarguide.capture.stored_view import StoredView, ViewFiles
+from polarguide.capture.view import GroundTruth, Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, read_view
 from polarguide.errors import PolarguideError
 from polarguide.options import Split, check_choice
@@ -59,6 +61,7 @@ def load_scene(
     memory: float = 0.0,
     split: Split = "directions",
     test_views: Sequence[str] | None = None,
+    hold: bool = True,
     reporter: Reporter = SILENT,
 ) -> Scene:
     """Read a capture.
@@ -78,6 +81,7 @@ def load_scene(
         memory: GiB that the pictures may take; 0: 80 % of what is free.
         split: which views are held out where there is no ``split.json``, see ``split.chosen_views``.
         test_views: names of the views to hold out, whatever else says so, as far as there are such views.
+        hold: whether pictures stay in memory; otherwise views decode theirs again whenever they are asked for them.
         reporter: receives the progress.
 
     Returns:
@@ -104,9 +108,10 @@ def load_scene(
         size = stated_size(layout.pictures[name][0])
         if size is not None:
             fit_camera(camera, *size, folder=model.folder, view=name)
-    check_memory(layout, names, factor=downscale, at_once=_THREADS, limit=memory)
+    check_memory(layout, names, factor=downscale, at_once=_THREADS, limit=memory, hold=hold)
 
-    stored = read_views(layout, names, model, downscale=downscale, transfer=transfer, reporter=reporter)
+    how = {"downscale": downscale, "transfer": transfer, "hold": hold, "reporter": reporter}
+    stored = read_views(layout, names, model, **how)  # type: ignore[arg-type]
     for item in stored.data:
         files.digests.update(item.digests)
     if all(item.invalid.all() for item in stored.data):
@@ -116,8 +121,11 @@ def load_scene(
             found=f"none in {len(stored.data)} views",
             remedy="White is invalid there: invert the pictures, or remove them.",
         )
+    pictures = ViewFiles(layout, downscale, transfer, files.digests)
     posed_views = tuple(
         item.view(camera, stored.full_scale)
+        if hold
+        else StoredView(item, camera, stored.full_scale, pictures)
         for item, camera in zip(stored.data, stored.cameras, strict=True)
         if camera is not None
     )
@@ -173,6 +181,7 @@ def read_views(
     *,
     downscale: int,
     transfer: str,
+    hold: bool = True,
     reporter: Reporter = SILENT,
 ) -> StoredViews:
     """Read the files of some views, in several threads.
@@ -183,6 +192,7 @@ def read_views(
         model: the capture's COLMAP model, if it has one; views that it lacks are read without a camera.
         downscale: side of the pixel boxes to average.
         transfer: "linear" or "srgb".
+        hold: whether to keep all codes and the ground truth; otherwise samples of them.
         reporter: receives the progress.
 
     Raises:
@@ -190,7 +200,8 @@ def read_views(
     """
 
     def read(name: str) -> ViewData:
-        return read_view(layout, name, factor=downscale, transfer=transfer)
+        found = read_view(layout, name, factor=downscale, transfer=transfer)
+        return found if hold else _without_pictures(found)
 
     posed = frozenset(() if model is None else model.names)
     data: list[ViewData] = []
@@ -211,6 +222,14 @@ def read_views(
     scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
     measures = [checks.measure(item.codes, ~(item.invalid | item.saturated(scale))) for item in data]
     return StoredViews(tuple(data), tuple(cameras), tuple(measures), largest_value, scale)
+
+
+def _without_pictures(data: ViewData) -> ViewData:
+    """What ``read_views`` keeps of a view whose pictures stay in their files."""
+    truth = data.ground_truth
+    told_apart = truth is not None and truth.object_ids is not None
+    stub = GroundTruth(object_ids=torch.empty(0)) if told_apart else None
+    return replace(data, codes=checks.sampled(data.codes), ground_truth=stub)
 
 
 def check_transfer(transfer: str) -> None:

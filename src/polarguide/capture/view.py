@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -72,6 +72,11 @@ class View:
         codes, invalid, saturated = (t.to(device) for t in (self.codes, self.invalid, self.saturated))
         mask = None if self.mask is None else self.mask.to(device)
         return View(self.name, self.camera, codes, invalid, saturated, mask)
+
+    def subject_alone(self) -> View:
+        """The view with black outside its mask, which it has to have."""
+        assert self.mask is not None
+        return replace(self, codes=self.codes * self.mask.to(self.codes)[None, ..., None])
 
     def intensities(self) -> Tensor:
         """Linear intensities in [0, 1] at 0, 45, 90, 135 degrees: [4, H, W, 3] float32."""

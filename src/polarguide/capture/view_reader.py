@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,7 +122,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
     return ViewData(
         name=name,
         size=(width, height),
-        codes=np.stack([boxes.mean_codes(linear_codes(pixels, transfer), factor) for pixels in raw]),
+        codes=_codes(raw, transfer, factor),
         peak=boxes.maximum(peak, factor),
         black=boxes.maximum(np.asarray(peak == 0), factor),
         histogram=np.sum([checks.top_histogram(pixels) for pixels in raw], axis=0),
@@ -131,6 +131,37 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         ground_truth=ground_truth,
         digests=files.digests,
     )
+
+
+def read_codes(
+    layout: Layout, name: str, *, factor: int, transfer: str, digests: Mapping[Path, str]
+) -> NDArray[np.uint16]:
+    """The codes of a view that was read before, as ``read_view`` gives them.
+
+    Raises:
+        PolarguideError: a file has changed since: its SHA-256 is not that of ``digests``.
+    """
+    files = Files()
+    raw = _read_angles(files, layout.pictures[name])
+    for path, digest in files.digests.items():
+        if digests[path] != digest:
+            raise changed(path)
+    return _codes(raw, transfer, factor)
+
+
+def changed(path: Path) -> PolarguideError:
+    """The error that a file is not what it was when the scene was read."""
+    return PolarguideError(
+        path,
+        expected="the file that was there as the scene was read",
+        found="other contents",
+        remedy="Leave a scene alone while it is worked on; then start again.",
+    )
+
+
+def _codes(raw: Sequence[NDArray[Any]], transfer: str, factor: int) -> NDArray[np.uint16]:
+    """Linear codes of stored pictures, averaged over boxes."""
+    return np.stack([boxes.mean_codes(linear_codes(pixels, transfer), factor) for pixels in raw])
 
 
 def _read_angles(files: Files, paths: dict[int, Path]) -> list[NDArray[Any]]:

@@ -18,6 +18,7 @@ from rich.console import Console
 from polarguide import __version__
 from polarguide.cli.console import printable, warnings_printed
 from polarguide.errors import PolarguideError
+from polarguide.options import gibibytes
 
 VERBS = {
     "demo": "demo",
@@ -124,7 +125,8 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
     if verb is not None:
         _require_place()
         _refuse_empty_paths(verb, arguments[1:])
-        found = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=arguments[1:])
+        words = _sizes_as_numbers(arguments[1:])
+        found = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=words)
         return found if isinstance(found, int) else 0
     if arguments and not arguments[0].startswith("-"):
         raise PolarguideError(
@@ -170,6 +172,20 @@ def _refuse_empty_paths(verb: str, words: Sequence[str]) -> None:
                 found="an empty one",
                 remedy="Name it; . is the current folder.",
             )
+
+
+def _sizes_as_numbers(words: Sequence[str]) -> list[str]:
+    """The words with what --memory is given as a number of GiB: 4GB as 3.7252902984619140."""
+    found = list(words)
+    for place, word in enumerate(words):
+        option, equals, value = word.partition("=")
+        if option == "--memory" and equals:
+            size = gibibytes(value)
+            found[place] = word if size is None else f"--memory={size!r}"
+        elif place and words[place - 1] == "--memory":
+            size = gibibytes(word)
+            found[place] = word if size is None else repr(size)
+    return found
 
 
 def _empty_words(words: Sequence[str]) -> Iterator[str]:

@@ -135,7 +135,7 @@ class PlannedRun:
         same = (
             found.scene_digest == self.scene.digest
             and found.recipe_data == self.recipe.data()
-            and found.settings == self.settings
+            and replace(found.settings, gaussians=self.settings.gaussians) == self.settings
             and (found.recipe, found.downscale, found.transfer, found.test_views)
             == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
         )

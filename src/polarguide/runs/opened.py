@@ -311,12 +311,14 @@ def read_scene(
     options: SceneOptions = SceneOptions(),
     reporter: Reporter = SILENT,
     test_views: tuple[str, ...] | None = None,
+    *,
+    hold: bool = True,
 ) -> Scene:
     """Load a scene, with progress, and hand on its warnings.
 
     Args:
         folder: of the scene. options: how it is read. reporter: told how far it is.
-        test_views: as for ``load_scene``.
+        test_views, hold: as for ``load_scene``.
 
     Raises:
         PolarguideError: it cannot be read.
@@ -328,6 +330,7 @@ def read_scene(
         memory=options.memory,
         split=options.split,
         test_views=test_views,
+        hold=hold,
         reporter=reporter,
     )
     for warning in scene.warnings:

@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,10 +16,12 @@ from polarguide.capture import Scene
 from polarguide.capture.background import without_surroundings
 from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
+from polarguide.files import make_folder
 from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
-from polarguide.raster import use_threads
+from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
+from polarguide.runs.defaults import most_gaussians, with_defaults
 from polarguide.runs.folder import (
     CHECKPOINT,
     CONFIGURATION,
@@ -30,8 +32,11 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
+from polarguide.runs.forecast import forecast
+from polarguide.runs.memory import MemoryPlan, pixels_of, plan_memory
 from polarguide.runs.opened import GaussianModel, OpenedRun, read_scene
 from polarguide.runs.point_cloud import write_run_ply
+from polarguide.system import return_freed_memory
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.recipe import Recipe
@@ -39,6 +44,7 @@ from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 from polarguide.training.stopwatch import Stopwatch
 from polarguide.training.trainer import Trainer
+from polarguide.training.view_store import ViewStore
 
 LOG_EVERY = 10
 Ends = Callable[[], bool]
@@ -103,10 +109,13 @@ def train(
             settings, views_per_step=_views(settings.views_per_step, ranks, out if resume else None, reporter)
         )
         backend = backend_of(ranks, session.device, reporter)
-        loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
+        earlier = RunConfiguration.load(out).settings if resume else None
+        plan = _planned(scene, chosen, settings, earlier, reading)
+        loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=plan.hold)
         if settings.background == "masked":
             loaded = without_surroundings(loaded)
         _check_scene(loaded)
+        settings = with_defaults(settings, loaded, chosen, earlier)
         configuration = RunConfiguration.of(loaded, chosen, settings, backend.device)
         state = None
         if resume:
@@ -116,7 +125,14 @@ def train(
             if (out / CHECKPOINT).exists():
                 state = load_checkpoint(out, chosen, backend.device)
                 _check_slots(state, settings, out)
-        trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
+        expected = None
+        if ranks.world == 1 and not resume:
+            expected = forecast(loaded, chosen, settings, backend, plan.peak)
+            if expected is not None:
+                reporter.say(expected.sentence())
+        return_freed_memory()  # of decoded files, and of what was only measured
+        store = locked.enter_context(closing(_store(plan, backend, out, reporter)))
+        trainer = Trainer(loaded, chosen, settings, backend, state, ranks, store)
         if trainer.black and settings.background == "auto":
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
         with watch(trainer) if watch is not None else nullcontext() as look:
@@ -127,8 +143,10 @@ def train(
                     if problem := _unsuitable(out, resume):  # another training has begun meanwhile
                         raise problem
                 configuration.save(out)
-            _Loop(trainer, out, session, reporter, should_stop, look).run()
+            seconds = _Loop(trainer, out, session, reporter, should_stop, look).run()
         model = GaussianModel(trainer.state, trainer.shading, backend)
+        if expected is not None:
+            reporter.say(expected.truth(seconds))
         if leads:
             centers = torch.stack([view.camera.center for view in loaded.views])
             write_run_ply(out / PLY, model.state, model.shading, centers)
@@ -154,8 +172,8 @@ class _Loop:
             self._log.cut(trainer.state.step)
         self._stopwatch = Stopwatch(*self._log.elapsed()) if self._log else Stopwatch()
 
-    def run(self) -> None:
-        """Train; see ``train``."""
+    def run(self) -> float:
+        """Train; see ``train``. Returns the seconds that it took."""
         trainer = self._trainer
         with self._reporter.track("training", trainer.settings.steps) as advance:
             meter = _Meter(advance, self._log, self._stopwatch)
@@ -170,6 +188,7 @@ class _Loop:
         self._save()
         if stopped:
             raise TrainingStopped(trainer.state.step)
+        return self._stopwatch.read()[0]
 
     def _steps(self, meter: _Meter) -> bool:
         """Steps up to the last one; True where training is to stop before."""
@@ -252,6 +271,31 @@ class _Meter:
         )
         self._advance(last.step + 1, note=note)
         return loss, psnr
+
+
+def _planned(
+    scene: Scene | PathLike,
+    recipe: Recipe,
+    settings: TrainSettings,
+    resumed: TrainSettings | None,
+    reading: SceneOptions,
+) -> MemoryPlan:
+    """How the training stays within its memory, as far as headers tell."""
+    if isinstance(scene, Scene):
+        pixels = [view.camera.width * view.camera.height for view in scene.train_views]
+    else:
+        pixels = pixels_of(Path(scene), reading.downscale)
+    asked = settings.gaussians or (resumed.gaussians if resumed is not None else 0)
+    gaussians = asked or most_gaussians(sum(pixels), recipe)
+    return plan_memory(pixels, recipe, gaussians, limit=reading.memory, held=isinstance(scene, Scene))
+
+
+def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
+    """Where what is computed of the views is kept. What a GPU reads stays on it."""
+    if plan.kept is None or backend.device.type != "cpu":
+        return ViewStore()
+    make_folder(out)
+    return ViewStore(plan.kept, out, reporter.warn)
 
 
 def _views(asked: int, ranks: Ranks, resumed: Path | None, reporter: Reporter) -> int:

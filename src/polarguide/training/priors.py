@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -89,6 +90,43 @@ class ViewPriors:
         return torch.maximum(self.weight, (shown / self.settings.bright).clamp(0, 1))
 
 
+class Unguided(NamedTuple):
+    """What of a view's priors no guide decides: it stays the same from refresh to refresh.
+
+    Attributes:
+        usable: [H, W] bool, where the polarization is above the threshold and its noise.
+        zenith, azimuth: [H, W] radians, of the normals of the color differences; None where these are not asked for.
+        certainty: [H, W] weight of these normals, in [0, 1], 0 where color decides nothing; None likewise.
+    """
+
+    usable: Tensor
+    zenith: Tensor | None = None
+    azimuth: Tensor | None = None
+    certainty: Tensor | None = None
+
+
+@torch.no_grad()
+def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
+    """What can be said of a view's priors before there are Gaussians.
+
+    Args:
+        view: the capture; its device does the work. settings: of the priors. refractive_index: of all surfaces.
+    """
+    intensities = view.intensities()
+    stokes = optics.stokes(intensities)
+    usable = optics.polarization_mask(
+        optics.luminance(stokes),
+        threshold=settings.threshold,
+        invalid=view.invalid,
+        noise_sigma=optics.intensity_noise(intensities.mean(dim=-1)) if settings.snr else 0.0,
+        snr=settings.snr,
+        saturated=view.saturated,
+    )
+    if not settings.chromatic:
+        return Unguided(usable)
+    return Unguided(usable, *_chromatic_angles(stokes, refractive_index, ~(view.invalid | view.saturated)))
+
+
 def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
     """Unit normals facing the camera from blended ones [H, W, 3], and where they are trustworthy [H, W].
 
@@ -101,7 +139,9 @@ def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: float) -> ViewPriors:
+def view_priors(
+    view: View, normal: Tensor, settings: Priors, refractive_index: float, known: Unguided | None = None
+) -> ViewPriors:
     """Compute the priors of one view.
 
     Args:
@@ -109,27 +149,18 @@ def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: 
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
         refractive_index: of all surfaces.
+        known: ``unguided`` of the view, where it is at hand.
     """
     view = view.to(normal.device)
     rays = view.camera.rays(device=normal.device)
-    intensities = view.intensities()
-    stokes = optics.stokes(intensities)
+    usable, *found = known or unguided(view, settings, refractive_index)
+    stokes = optics.stokes(view.intensities())
     luminance = optics.luminance(stokes)
-    guide, known = guide_normals(view.camera.to_camera(normal), rays)
-    usable = optics.polarization_mask(
-        luminance,
-        threshold=settings.threshold,
-        invalid=view.invalid,
-        noise_sigma=optics.intensity_noise(intensities.mean(dim=-1)) if settings.snr else 0.0,
-        snr=settings.snr,
-        saturated=view.saturated,
-    )
+    guide, shown = guide_normals(view.camera.to_camera(normal), rays)
     nearest_to = guide
-    if settings.chromatic:
-        chromatic, chromatic_weight = facing_chromatic(
-            stokes, guide, rays, refractive_index, ~(view.invalid | view.saturated)
-        )
-        chromatic_weight = chromatic_weight * known
+    zenith, azimuth, certainty = found
+    if zenith is not None and azimuth is not None and certainty is not None:
+        chromatic, chromatic_weight = facing(zenith, azimuth, guide, rays), certainty * shown
         nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
     chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal
@@ -139,11 +170,11 @@ def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: 
         conditioned = ~view.saturated
     else:
         layers = optics.exact_separation(stokes, guide, rays, refractive_index)
-        conditioned = layers.conditioned & known & ~view.saturated
+        conditioned = layers.conditioned & shown & ~view.saturated
     plane = unit(torch.linalg.cross(rays, chosen))
     degree = optics.dolp(luminance)
-    weight = (degree / settings.full_dolp).clamp(max=1) * (usable if settings.live else usable & known)
-    if settings.chromatic:
+    weight = (degree / settings.full_dolp).clamp(max=1) * (usable if settings.live else usable & shown)
+    if certainty is not None:
         # Nearly unpolarized light has no reliable AoLP; the slope among its colors may still have one.
         better = (chromatic_weight > 0) & (degree < CHROMATIC_PLANE_DOLP)
         plane = torch.where(better[..., None], unit(torch.linalg.cross(rays, chromatic)), plane)
@@ -191,6 +222,17 @@ def _normals(candidates: optics.Candidates | optics.PhysicalCandidates | Tensor)
     return candidates if isinstance(candidates, Tensor) else candidates.normals
 
 
+def facing(zenith: Tensor, azimuth: Tensor, guide: Tensor, rays: Tensor) -> Tensor:
+    """Normals [H, W, 3] of an azimuth that is known up to half a turn, on the guide's side of each ray.
+
+    Args:
+        zenith, azimuth: [H, W] radians. guide, rays: [H, W, 3] camera axes.
+    """
+    normal = optics.normal_from_angles(zenith, azimuth, rays)
+    mirrored = optics.normal_from_angles(zenith, azimuth + torch.pi, rays)
+    return torch.where((dot(normal, guide) >= dot(mirrored, guide))[..., None], normal, mirrored)
+
+
 def facing_chromatic(
     stokes: Tensor, guide: Tensor, rays: Tensor, refractive_index: float, good: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -203,9 +245,15 @@ def facing_chromatic(
     Returns:
         [H, W, 3] unit, camera axes; [H, W] in [0, 1], 0 where color decides nothing.
     """
+    zenith, azimuth, weight = _chromatic_angles(stokes, refractive_index, good)
+    return facing(zenith, azimuth, guide, rays), weight
+
+
+def _chromatic_angles(stokes: Tensor, refractive_index: float, good: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Zenith, azimuth and weight in [0, 1] of the normals of the color differences, each [H, W]."""
     found = optics.chromatic_normals(stokes, refractive_index)
-    normal = optics.normal_from_angles(found.zenith, found.azimuth, rays)
-    mirrored = optics.normal_from_angles(found.zenith, found.azimuth + torch.pi, rays)
-    nearer = dot(normal, guide) >= dot(mirrored, guide)
-    weight = (found.certainty / FULL_CERTAINTY).clamp(max=1) * (found.decided & good)
-    return torch.where(nearer[..., None], normal, mirrored), weight
+    return (
+        found.zenith,
+        found.azimuth,
+        (found.certainty / FULL_CERTAINTY).clamp(max=1) * (found.decided & good),
+    )

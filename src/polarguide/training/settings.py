@@ -25,13 +25,16 @@ class TrainSettings:
     "On scaling up 3D Gaussian splatting training").
 
     Attributes:
-        steps: Optimizer steps in all. 3,000 show the scene, 5,000 and more settle it.
+        steps: Optimizer steps in all. 3,000 show the scene, 5,000 and more settle it; 0 takes 5,000, 60 visits to each
+            view where that is more, and twice as many for pictures over a megapixel (or what the run to resume took).
         seed: Seed of every random draw.
         refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water.
         views_per_step: Views whose mean gradient makes a step; 0 takes one for each process (or what the run to resume
             took). Learning rates grow with its square root; steps are steps, so more views are looked at.
         background: What is behind the subject: a scene to reconstruct, too; black, that is nothing; masked makes it
             nothing (the subject in masks/ alone is read); auto takes black where the edges of the pictures are.
+        gaussians: Most Gaussians that there may be, each of which takes 4 kB; 0 takes one for 20 pixels of all training
+            views, 400,000 at most (or what the run to resume took).
     """
 
     steps: int = 5000
@@ -39,9 +42,11 @@ class TrainSettings:
     refractive_index: float = 1.5
     views_per_step: int = 1
     background: Background = "auto"
+    gaussians: int = 0
 
     def __post_init__(self) -> None:
-        check_count("steps", self.steps)
+        check_count("steps", self.steps, 0)
+        check_count("gaussians", self.gaussians, 0)
         check_count("views_per_step", self.views_per_step, 0, MOST_VIEWS)
         check_count("seed", self.seed, 0, MOST_SEEDS)
         check_choice("background", self.background, BACKGROUNDS)

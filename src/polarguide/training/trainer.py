@@ -26,11 +26,22 @@ from polarguide.shading.visibility import outward_directions, touching_views
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
-from polarguide.training.priors import ViewPriors, view_priors
+from polarguide.training.packing import (
+    Entry,
+    Packed,
+    fields_read,
+    holds,
+    pack_priors,
+    packed,
+    unpack_priors,
+    unpacked,
+)
+from polarguide.training.priors import Unguided, ViewPriors, unguided, view_priors
 from polarguide.training.recipe import Action, Recipe, Stage
 from polarguide.training.schedule import Schedule
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState, first_state, seeded
+from polarguide.training.view_store import ViewStore
 
 # From so many training views on, what only one of them sees goes where nothing is behind the subject.
 ENOUGH_VIEWS = 12
@@ -47,10 +58,12 @@ class _Shown(NamedTuple):
 
 
 def is_black(scene: Scene, settings: TrainSettings) -> bool:
-    """Whether a training takes it that nothing is behind the subject."""
-    if settings.background == "auto":
-        return has_black_background(scene.train_views)
-    return settings.background != "scene"
+    """Whether a training takes it that nothing is behind the subject; a scene's pictures are looked at once."""
+    if settings.background != "auto":
+        return settings.background != "scene"
+    if "_black" not in vars(scene):
+        vars(scene)["_black"] = has_black_background(scene.train_views)
+    return bool(vars(scene)["_black"])
 
 
 class Trainer:
@@ -63,6 +76,7 @@ class Trainer:
         backend: device and rasterizer.
         state: where to go on from, on the backend's device; None: from the beginning.
         ranks: the processes that share the views of each step.
+        store: keeps what is computed of the views; None: in memory.
 
     Attributes:
         shading: the recipe's, for the run's refractive index.
@@ -78,6 +92,7 @@ class Trainer:
         backend: Backend,
         state: TrainingState | None = None,
         ranks: Ranks = ALONE,
+        store: ViewStore | None = None,
     ) -> None:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
         self.ranks, self._device = ranks, backend.device
@@ -94,11 +109,10 @@ class Trainer:
         self._extent = scene_extent(centers)
         self._middle = centers.mean(dim=0).float().to(self._device)
         pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
-        self._limit = int(pixels / recipe.densification.pixels_each)
+        self._limit = settings.gaussians or int(pixels / recipe.densification.pixels_each)
         empty = free_space(scene.points, [view.camera for view in scene.train_views])
         self._empty = empty.to(self._device)
-        self._shown: dict[str, _Shown] = {}
-        self._priors: dict[str, ViewPriors] = {}
+        self._store = store or ViewStore()
 
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
         """Train until the last step (or ``until``), reporting each step."""
@@ -165,6 +179,7 @@ class Trainer:
         view = self._view_of(state.step * self.settings.views_per_step + slot)
         shading = self.shading if stage.reflection else PLAIN
         statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
+        priors = self._priors_of(view, stage)  # before there is a picture, which takes memory, too
         result = render(
             state.gaussians,
             view.camera,
@@ -183,7 +198,7 @@ class Trainer:
             shown.picture,
             shown.valid,
             stage.weights,
-            self._priors_of(view, stage),
+            priors,
             ssim_weight=recipe.ssim_weight,
             shading=shading,
             log_scales=state.gaussians["log_scales"],
@@ -249,7 +264,7 @@ class Trainer:
             gaussians.overwrite("outward", outward)
         else:
             self.state.frozen = self.state.gaussians.snapshot()
-            self._priors.clear()
+            self._store.drop("priors")
 
     def _view_of(self, place: int) -> View:
         """The view at a place in the sequence of all views ever trained on.
@@ -262,27 +277,45 @@ class Trainer:
         return views[int(order[place])]
 
     def _shown_photograph(self, view: View) -> _Shown:
-        if view.name not in self._shown:
-            picture = srgb_encode(view.photograph().clamp(0, 1)).to(self._device)
-            valid = (~view.invalid).float().to(self._device) if bool(view.invalid.any()) else None
-            empty = empty_pixels(view).float().to(self._device) if self.black else None
-            self._shown[view.name] = _Shown(picture, valid, empty)
-        return self._shown[view.name]
+        def make() -> Entry:
+            entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(self._device))}
+            if bool(view.invalid.any()):
+                entry["valid"] = Packed((~view.invalid).to(self._device))
+            if self.black:
+                entry["empty"] = Packed(empty_pixels(view).to(self._device))
+            return entry
+
+        kept = self._store.get("shown", view.name, make)
+        masks = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
+        return _Shown(unpacked(kept["picture"]), *masks)
 
     def _priors_of(self, view: View, stage: Stage) -> ViewPriors | None:
         if not stage.weights.priors:
             return None
-        if view.name not in self._priors:
-            if self.state.frozen is None:
-                self._act("refresh_priors")
-            assert self.state.frozen is not None
-            with torch.no_grad():
-                guide = render(self.state.frozen, view.camera, self.backend.rasterize, sh_degree=0).normal
-            assert guide is not None
-            self._priors[view.name] = view_priors(
-                view, guide, self.recipe.priors, self.settings.refractive_index
-            )
-        return self._priors[view.name]
+        if self.state.frozen is None:
+            self._act("refresh_priors")
+        fields = fields_read(stage.weights)
+        entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields))
+        if not holds(entry, fields):  # the stage reads more than the one before
+            self._store.drop("priors", view.name)
+            entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields))
+        return unpack_priors(entry, view.camera)
+
+    def _new_priors(self, view: View, fields: frozenset[str]) -> Entry:
+        assert self.state.frozen is not None
+        with torch.no_grad():
+            guide = render(self.state.frozen, view.camera, self.backend.rasterize, sh_degree=0).normal
+        assert guide is not None
+        settings, index = self.recipe.priors, self.settings.refractive_index
+
+        def make() -> Entry:
+            found = unguided(view.to(guide.device), settings, index)._asdict()
+            return {name: Packed(values) for name, values in found.items() if values is not None}
+
+        # It can be had again for a part of the work, so that it is not worth a file.
+        kept = self._store.get("unguided", view.name, make, disposable=True)
+        known = Unguided(**{name: part.codes for name, part in kept.items()})
+        return pack_priors(view_priors(view, guide, settings, index, known), fields)
 
 
 @torch.no_grad()

@@ -1,0 +1,141 @@
+"""What a training will take, measured in a few steps of each of its stages, and what it took in the end."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import torch
+
+from polarguide.capture import Scene
+from polarguide.raster import Backend
+from polarguide.runs.memory import in_gigabytes
+from polarguide.system import MEBIBYTE, peak_memory_mib
+from polarguide.training.recipe import Recipe
+from polarguide.training.schedule import Schedule
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
+
+LEAST_STEPS = 500
+"""A shorter training is over before it has been measured."""
+GROWTH = 4
+"""Of the Gaussians, up to which the time is estimated: the density control decides it on the way."""
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a training is expected to take.
+
+    Attributes:
+        seconds: as long as there are as many Gaussians as at the beginning. most_seconds: with ``most`` of them.
+        gaussians: at the beginning. most: see above.
+        peak: bytes of memory, at most.
+    """
+
+    seconds: float
+    most_seconds: float
+    gaussians: int
+    most: int
+    peak: int
+
+    def sentence(self) -> str:
+        """For whoever waits."""
+        return (
+            f"estimate: {in_words(self.seconds)} with the {self.gaussians:,} Gaussians of the beginning, "
+            f"{in_words(self.most_seconds)} with {self.most:,}; up to {in_gigabytes(self.peak)} of memory"
+        )
+
+    def truth(self, seconds: float) -> str:
+        """What it took, beside what was expected."""
+        peak = peak_memory_mib()
+        memory = "" if peak is None else f" and {in_gigabytes(int(peak * MEBIBYTE))} of memory"
+        return (
+            f"took {in_words(seconds)}{memory} (estimate: {in_words(self.seconds)} to "
+            f"{in_words(self.most_seconds)}, up to {in_gigabytes(self.peak)})"
+        )
+
+
+def forecast(
+    scene: Scene, recipe: Recipe, settings: TrainSettings, backend: Backend, peak: int
+) -> Forecast | None:
+    """Take a few steps of each stage on a state of their own; None for a training that is too short for it.
+
+    Args:
+        scene, recipe, settings, backend: of the training. peak: bytes that it will take.
+    """
+    if settings.steps < LEAST_STEPS:
+        return None
+    trainer = Trainer(scene, recipe, settings, backend)
+    first = len(trainer.state.gaussians)
+    most = max(first, min(GROWTH * first, settings.gaussians or GROWTH * first))
+    seconds, priors = _measured(trainer)
+    priors *= _priors_made(recipe, settings, len(scene.train_views))
+    if most == first:
+        return Forecast(seconds + priors, seconds + priors, first, most, peak)
+    _multiply(trainer, most)
+    return Forecast(seconds + priors, _measured(trainer)[0] + priors, first, most, peak)
+
+
+def in_words(seconds: float) -> str:
+    """A time as 40 s, 12 min or 1 h 05 min."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def _measured(trainer: Trainer) -> tuple[float, float]:
+    """Seconds of all steps with as many Gaussians as now, without priors, and seconds of the priors of one view."""
+    schedule, steps = trainer.schedule, trainer.settings.steps
+    stages = [schedule.at(step).stage for step in range(steps)]
+    found: dict[tuple[bool, object], float] = {}
+    seconds, priors = 0.0, 0.0
+    for step in range(1, steps - 1):
+        position = schedule.at(step)
+        kind = position.stage.reflection, position.stage.weights
+        if kind in found or position.actions or stages[step + 1] is not position.stage:
+            continue
+        if (step + 1) % trainer.recipe.densification.every == 0:
+            continue
+        if not found:
+            _timed(trainer, step)  # what is loaded and made for the first time
+        fresh, found[kind] = _timed(trainer, step), _timed(trainer, step)
+        if position.stage.weights.priors:
+            priors = max(priors, fresh - found[kind])
+    for stage in stages:
+        seconds += found.get((stage.reflection, stage.weights), max(found.values()))
+    return seconds, priors
+
+
+def _timed(trainer: Trainer, step: int) -> float:
+    """Seconds of one step."""
+    trainer.state.step = step
+    begin = time.perf_counter()
+    trainer.step().measured.tolist()  # which waits for the device
+    return time.perf_counter() - begin
+
+
+def _priors_made(recipe: Recipe, settings: TrainSettings, views: int) -> int:
+    """How many times priors of a view are computed."""
+    schedule, made, due = Schedule(recipe, settings.steps), 0, views
+    for step in range(settings.steps):
+        position = schedule.at(step)
+        if "refresh_priors" in position.actions:
+            due = views
+        if position.stage.weights.priors:
+            made += min(due, settings.views_per_step)
+            due -= min(due, settings.views_per_step)
+    return made
+
+
+@torch.no_grad()
+def _multiply(trainer: Trainer, count: int) -> None:
+    """Put several smaller Gaussians in the place of each, as the density control does, up to ``count``."""
+    gaussians = trainer.state.gaussians
+    before = len(gaussians)
+    gaussians.keep(torch.arange(count, device=gaussians["means"].device) % before)
+    gaussians.overwrite("log_scales", gaussians["log_scales"] - 0.5 * math.log(count / before))
+    away = torch.randn(count, 3, generator=torch.Generator().manual_seed(0)).to(gaussians["means"].device)
+    gaussians.overwrite("means", gaussians["means"] + away * gaussians["log_scales"].exp())
+    trainer.state.statistics.clear(count)

@@ -1,0 +1,112 @@
+"""What memory a training takes, from the headers of its pictures alone, and what of its views can stay there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from polarguide.capture.layout import find_layout, select_views
+from polarguide.capture.memory import GIBIBYTE, KEPT, MASKS, READ, SHARE, stated_pixels
+from polarguide.errors import PolarguideError
+from polarguide.system import free_memory, resident_memory
+from polarguide.training.recipe import Recipe
+
+GIGABYTE = 10**9
+# Measured on captures of 612 x 512 and 1224 x 1024 (benchmarks/speed/memory.py), with a margin of a tenth.
+PROCESS = 250_000_000
+"""Bytes that a process takes beside what it holds before training: of libraries, and what the allocator splits."""
+STEP = 780
+"""Bytes a pixel of a step: targets, G-buffer, layers, terms, and their gradients."""
+PRIORS = 900
+"""Bytes a pixel while the priors of a view are computed."""
+PRIORS_KEPT, SHOWN_KEPT, UNGUIDED_KEPT = 44, 8, 13
+"""Bytes a pixel of what is kept of a view: targets, photograph with masks, and what of the targets needs no guide."""
+COPIES, WRITTEN = 5, 4
+"""Of a Gaussian's parameters: values, gradients, two moments, frozen; and those in the file that is written."""
+SPLAT = 600
+"""Bytes a Gaussian of what a rasterizer makes of it."""
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """How a training stays within its memory.
+
+    Attributes:
+        hold: whether the pictures stay in memory; otherwise views decode theirs again.
+        kept: bytes of what is kept of the views in memory, the rest lies in a file; None: all stays in memory.
+        peak: bytes that the process takes at most.
+    """
+
+    hold: bool
+    kept: int | None
+    peak: int
+
+
+def plan_memory(
+    pixels: Sequence[int], recipe: Recipe, gaussians: int, *, limit: float, held: bool = False
+) -> MemoryPlan:
+    """Share out memory among a training's step, its Gaussians and its views.
+
+    Args:
+        pixels: of each view as it is trained on. recipe: the method. gaussians: most that there may be.
+        limit: GiB that the process may take; 0: what is free, but a fifth.
+        held: whether the pictures are in memory already.
+
+    Raises:
+        PolarguideError: a limit that was given is too small; the message has the least that suffices.
+    """
+    largest, total = max(pixels, default=0), sum(pixels)
+    floats = sum(math.prod(shape) for shape in recipe.shapes.values())
+    guided = any(stage.weights.priors for stage in recipe.stages)
+    of_view = SHOWN_KEPT + (PRIORS_KEPT + UNGUIDED_KEPT if guided else 0)
+    now = resident_memory() or 0
+    step = (max(STEP, PRIORS) if guided else STEP) * largest + SPLAT * gaussians
+    work = now + PROCESS + 4 * floats * COPIES * gaussians + max(step, 4 * floats * WRITTEN * gaussians)
+    pictures = 0 if held else (KEPT - MASKS) * total
+    masks = 0 if held else (MASKS - 3) * total
+    # The photograph of one view, decoded again, and its targets.
+    least = work + masks + (KEPT + of_view) * largest
+    least = max(least, now + PROCESS + MASKS * total + 4 * READ * largest)
+    whole = work + masks + pictures + of_view * total
+    if limit > 0:
+        allowed = int(limit * GIBIBYTE)
+        if allowed < least:
+            raise too_little(least, allowed, gaussians)
+    else:
+        free = free_memory()
+        if free is None:
+            return MemoryPlan(True, None, whole)
+        allowed = now + int(SHARE * free)
+    if whole <= allowed:
+        return MemoryPlan(True, None, whole)
+    hold = held or (work + masks + pictures + of_view * largest <= allowed and of_view * total <= pictures)
+    room = allowed - work - masks - (pictures if hold and not held else KEPT * largest)
+    return MemoryPlan(hold, max(0, room), max(least, min(allowed, whole)))
+
+
+def pixels_of(folder: Path, downscale: int) -> list[int]:
+    """Pixels of each view of a scene at the size that is trained on, as the headers of its files state.
+
+    Raises:
+        PolarguideError: it is no scene.
+    """
+    layout = find_layout(folder)
+    return [count // downscale**2 for count in stated_pixels(layout, select_views(layout, None))]
+
+
+def too_little(least: int, allowed: int, gaussians: int) -> PolarguideError:
+    """The error that a limit is too small."""
+    return PolarguideError(
+        "memory",
+        expected=f"at least {in_gigabytes(least)} for pictures of this size and up to {gaussians:,} Gaussians",
+        found=in_gigabytes(allowed, up=False),
+        remedy=f"Give --memory {in_gigabytes(least).replace(' ', '')}, fewer --gaussians, or --downscale 2.",
+    )
+
+
+def in_gigabytes(count: int, *, up: bool = True) -> str:
+    """Bytes as gigabytes with one digit, rounded so that what is said to suffice does."""
+    tenths = count * 10 / GIGABYTE
+    return f"{(math.ceil(tenths) if up else math.floor(tenths)) / 10:.1f} GB"

@@ -1,0 +1,142 @@
+"""What a training keeps of its views: in memory up to a limit, beyond it in a file, which nobody has to clean up.
+
+Whatever is kept can be made again to the same bits, so that neither the limit nor a file that is gone changes a result.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import torch
+
+from polarguide.training.packing import Entry, Packed
+
+ALIGNED = 64
+
+
+@dataclass
+class _Place:
+    """Where in the file an entry is: its offset, the room there, and what to make of the bytes."""
+
+    offset: int
+    room: int
+    parts: dict[str, tuple[torch.dtype, tuple[int, ...], torch.Tensor | None]] | None = None
+
+
+class ViewStore:
+    """Keeps entries by kind and view.
+
+    Which of them lie in memory is decided as they come, and stays so: views are visited in changing order, in which
+    what was used last is not what is used next, so that exchanging them would only write more.
+
+    Args:
+        limit: bytes of entries in memory; None: all.
+        folder: for the file of the others. It has no name there, and is gone with the process; None: entries over the
+            limit are not kept but made again.
+        warn: told where the file cannot be written; entries over the limit are then made again.
+    """
+
+    def __init__(
+        self,
+        limit: int | None = None,
+        folder: Path | None = None,
+        warn: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._limit, self._folder, self._warn = limit, folder, warn
+        self._held: dict[tuple[str, str], Entry] = {}
+        self._places: dict[tuple[str, str], _Place] = {}
+        self._file: IO[bytes] | None = None
+        self.in_memory, self.in_file = 0, 0
+
+    def get(self, kind: str, view: str, make: Callable[[], Entry], *, disposable: bool = False) -> Entry:
+        """An entry; it is made where it is not kept.
+
+        Args:
+            kind, view: its name. make: makes it. disposable: over the limit it is made again, not put into the file.
+        """
+        key = (kind, view)
+        found = self._held.get(key) or self._read(key)
+        if found is None:
+            found = make()
+            self._keep(key, found, disposable)
+        return found
+
+    def drop(self, kind: str, view: str | None = None) -> None:
+        """Forget the entries of a kind, or one of them; their places in the file are used again."""
+        for key in [key for key in self._held if key[0] == kind and view in (None, key[1])]:
+            self.in_memory -= _size(self._held.pop(key))
+        for key, place in self._places.items():
+            if key[0] == kind and view in (None, key[1]):
+                place.parts = None
+
+    def close(self) -> None:
+        """Forget everything."""
+        self._held.clear()
+        self._places.clear()
+        self.in_memory = self.in_file = 0
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _keep(self, key: tuple[str, str], entry: Entry, disposable: bool) -> None:
+        size = _size(entry)
+        if self._limit is None or self.in_memory + size <= self._limit:
+            self._held[key] = entry
+            self.in_memory += size
+        elif self._folder is not None and not disposable:
+            try:
+                self._write(key, entry, size)
+            except OSError as error:
+                self._places.pop(key, None)
+                self._folder = None
+                self._warn(
+                    f"what a training keeps of its views cannot be put into a file ({error.strerror or error}): it is "
+                    "computed again for every step, which is slow. Make room on the disk, or give more --memory."
+                )
+
+    def _write(self, key: tuple[str, str], entry: Entry, size: int) -> None:
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115, until close
+            weakref.finalize(self, self._file.close)
+        place = self._places.get(key)
+        if place is None or place.room < size:
+            place = _Place(self.in_file, size)
+            self.in_file += -(-size // ALIGNED) * ALIGNED
+            self._places[key] = place
+        place.parts = None
+        self._file.seek(place.offset)
+        for part in entry.values():
+            rest = memoryview(part.codes.contiguous().view(torch.uint8).numpy()).cast("B")
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        place.parts = {name: (p.codes.dtype, tuple(p.codes.shape), p.top) for name, p in entry.items()}
+
+    def _read(self, key: tuple[str, str]) -> Entry | None:
+        """An entry from the file; None where it is not there, or cannot be read."""
+        place = self._places.get(key)
+        if place is None or place.parts is None or self._file is None:
+            return None
+        entry = {}
+        with contextlib.suppress(OSError):
+            self._file.seek(place.offset)
+            for name, (kind, shape, top) in place.parts.items():
+                codes = torch.empty(shape, dtype=kind)
+                rest = memoryview(codes.view(torch.uint8).numpy()).cast("B")
+                while rest:
+                    count = self._file.readinto(rest)  # type: ignore[attr-defined]
+                    if not count:
+                        return None
+                    rest = rest[count:]
+                entry[name] = Packed(codes, top)
+            return entry
+        return None
+
+
+def _size(entry: Entry) -> int:
+    return sum(part.bytes for part in entry.values())

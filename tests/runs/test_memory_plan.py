@@ -1,0 +1,156 @@
+"""The memory of a training: shared out before a picture is decoded, refused with the least that suffices."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from safetensors.torch import load_file
+
+from polarguide.capture import Scene
+from polarguide.cli.app import run
+from polarguide.errors import PolarguideError
+from polarguide.options import SceneOptions, gibibytes
+from polarguide.raster import choose_backend
+from polarguide.recipes import RECIPES
+from polarguide.runs import forecast as forecasts
+from polarguide.runs import memory
+from polarguide.runs import train as training
+from polarguide.runs.defaults import MOST_GAUSSIANS, STEPS, with_defaults
+from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
+from polarguide.runs.memory import GIBIBYTE, MemoryPlan, plan_memory
+from polarguide.training.settings import TrainSettings
+
+STOKES = RECIPES["polarguide-stokes"]
+LARGE = [1224 * 1024] * 60
+SMALL = [256 * 192] * 60
+SHORT = ("--downscale", "4", "--steps", "30", "--threads", "1")
+
+
+def least(pixels: list[int], gaussians: int) -> float:
+    """GiB, from the error."""
+    with pytest.raises(PolarguideError, match=r"memory: expected at least .* found 0\.0 GB") as error:
+        plan_memory(pixels, STOKES, gaussians, limit=0.01)
+    found = re.search(r"--memory ([\d.]+GB)", str(error.value))
+    assert found
+    size = gibibytes(found[1])
+    assert size
+    return size
+
+
+def test_the_least_that_is_named_suffices_and_less_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
+    for pixels, gaussians in ((SMALL, 100_000), (LARGE, 50_000), (LARGE, MOST_GAUSSIANS)):
+        size = least(pixels, gaussians)
+        plan = plan_memory(pixels, STOKES, gaussians, limit=size)
+        assert plan.peak <= size * GIBIBYTE
+        with pytest.raises(PolarguideError):
+            plan_memory(pixels, STOKES, gaussians, limit=size - 0.2)
+
+
+def test_pictures_leave_memory_before_targets_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
+    plans = [plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=limit) for limit in (3.7, 5.0, 8.0, 30.0)]
+    assert not plans[0].hold
+    assert plans[-1] == MemoryPlan(True, None, plans[-1].peak)
+    kept = [plan.kept for plan in plans[:-1]]
+    assert None not in kept
+    assert kept == sorted(kept, key=lambda count: count or 0)
+    assert plan_memory(SMALL, STOKES, 154_000, limit=4.0).kept is None
+
+
+def test_without_a_limit_what_is_free_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(memory, "free_memory", lambda: 10**9)
+    assert not plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=0).hold
+    monkeypatch.setattr(memory, "free_memory", lambda: None)
+    assert plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=0).kept is None
+
+
+@pytest.mark.parametrize(
+    ("text", "bytes_"),
+    [
+        ("4GB", 4e9),
+        ("600 mb", 6e8),
+        ("3.5GiB", 3.5 * 2**30),
+        ("2g", 2e9),
+        ("1T", 1e12),
+        ("4", None),
+        ("GB", None),
+    ],
+)
+def test_sizes(text: str, bytes_: float | None) -> None:
+    found = gibibytes(text)
+    assert found == (None if bytes_ is None else pytest.approx(bytes_ / 2**30))
+
+
+def test_too_little_is_refused_before_a_picture_is_decoded(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def decode(*_: object) -> None:
+        raise AssertionError("a picture was decoded")
+
+    monkeypatch.setattr("polarguide.capture.view_reader.decode_picture", decode)
+    assert run(["train", str(demo_scene), "--out", str(tmp_path / "run"), *SHORT, "--memory", "30MB"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--memory: expected at least" in said
+    assert "Give --memory" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_training_in_little_memory_gives_the_same_bits_and_says_what_it_takes(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecasts, "LEAST_STEPS", 30)
+    assert run(["train", str(demo_scene), "--out", str(tmp_path / "a"), *SHORT]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(
+        r"estimate: \d+ s with the [\d,]+ Gaussians of the beginning, \d+ s with [\d,]+; up to", said
+    )
+    assert re.search(
+        r"took \d+ s and [\d.]+ GB of memory \(estimate: \d+ s to \d+ s, up to [\d.]+ GB\)", said
+    )
+    # Nothing is kept in memory.
+    monkeypatch.setattr(training, "plan_memory", lambda *_, **__: MemoryPlan(False, 0, 10**9))
+    assert run(["train", str(demo_scene), "--out", str(tmp_path / "b"), *SHORT, "--memory", "3GB"]) == 0
+    first, second = (load_file(tmp_path / name / CHECKPOINT) for name in "ab")
+    assert first.keys() == second.keys()
+    assert all(first[name].numpy().tobytes() == second[name].numpy().tobytes() for name in first)
+    assert {path.name for path in (tmp_path / "b").iterdir()} == {
+        path.name for path in (tmp_path / "a").iterdir()
+    }
+    settings = json.loads((tmp_path / "b" / CONFIGURATION).read_text())["settings"]
+    assert settings["steps"] == 30
+    assert settings["gaussians"] > 1000
+
+
+def test_defaults_follow_from_the_size_and_are_those_of_the_run_that_goes_on(tiny_scene: Scene) -> None:
+    asked = TrainSettings(steps=0)
+    found = with_defaults(asked, tiny_scene, STOKES)
+    pixels = sum(view.camera.width * view.camera.height for view in tiny_scene.train_views)
+    assert (found.steps, found.gaussians) == (STEPS, int(pixels / STOKES.densification.pixels_each))
+    assert with_defaults(TrainSettings(7, gaussians=9), tiny_scene, STOKES) == TrainSettings(7, gaussians=9)
+    older = TrainSettings(steps=700)
+    assert with_defaults(asked, tiny_scene, STOKES, older) == older
+
+
+def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Scene) -> None:
+    settings, backend = TrainSettings(600), choose_backend("cpu")
+    found = forecasts.forecast(tiny_scene, STOKES, settings, backend, 10**9)
+    assert found is not None
+    assert 0 < found.seconds < 600
+    assert found.most == 4 * found.gaussians
+    assert "1.0 GB" in found.sentence()
+    assert forecasts.forecast(tiny_scene, STOKES, TrainSettings(60), backend, 10**9) is None
+    assert [forecasts.in_words(s) for s in (3.4, 300, 5400, 7260)] == [
+        "3 s",
+        "5 min",
+        "1 h 30 min",
+        "2 h 01 min",
+    ]
+
+
+def test_options_take_a_limit() -> None:
+    assert SceneOptions(memory=2.5).memory == 2.5

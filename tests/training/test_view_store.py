@@ -1,0 +1,168 @@
+"""What a training keeps of its views: the same bits wherever it is kept, and what the coding costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene
+from polarguide.raster import choose_backend
+from polarguide.recipes import RECIPES
+from polarguide.training import view_store
+from polarguide.training.packing import (
+    Entry,
+    Packed,
+    fields_read,
+    holds,
+    pack_priors,
+    packed,
+    unpack_priors,
+    unpacked,
+)
+from polarguide.training.priors import view_priors
+from polarguide.training.recipe import Recipe, Weights
+from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.view_store import ViewStore
+
+STEPS, STOP = 24, 13
+
+
+def entry_of(seed: int, count: int = 1000) -> Entry:
+    values = torch.randn(count, generator=torch.Generator().manual_seed(seed))
+    return {"a": packed(values), "b": Packed(values > 0), "c": Packed(values[:7].double())}
+
+
+def same(a: Entry, b: Entry) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(unpacked(a[name]), unpacked(b[name])) for name in a)
+
+
+def trained(scene: Scene, recipe: Recipe, store: ViewStore, *, until: int = STEPS) -> dict[str, Tensor]:
+    trainer = Trainer(scene, recipe, TrainSettings(60, 3), choose_backend("cpu"), store=store)
+    trainer.run(lambda _: None, until=until)
+    return {name: values.clone() for name, values in trainer.state.tensors().items()}
+
+
+def test_what_a_training_keeps_where_does_not_change_its_bits(
+    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
+) -> None:
+    whole = ViewStore()
+    expected = trained(tiny_scene, busy_recipe, whole)
+    assert whole.in_memory
+    assert whole.in_file == 0
+    for limit, folder in ((0, tmp_path), (whole.in_memory // 2, tmp_path), (0, None)):
+        store = ViewStore(limit, folder)
+        found = trained(tiny_scene, busy_recipe, store)
+        assert store.in_memory <= limit
+        assert (store.in_file > 0) == (folder is not None)
+        assert expected.keys() == found.keys()
+        assert all(expected[n].numpy().tobytes() == found[n].numpy().tobytes() for n in expected), limit
+        assert not list(tmp_path.iterdir()), "the file has no name"
+        store.close()
+
+
+def test_a_training_goes_on_with_another_store_to_the_same_bits(
+    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
+) -> None:
+    expected = trained(tiny_scene, busy_recipe, ViewStore())
+    settings, backend = TrainSettings(60, 3), choose_backend("cpu")
+    begun = Trainer(tiny_scene, busy_recipe, settings, backend)
+    begun.run(lambda _: None, until=STOP)
+    rest = Trainer(tiny_scene, busy_recipe, settings, backend, begun.state, store=ViewStore(3000, tmp_path))
+    rest.run(lambda _: None, until=STEPS)
+    found = rest.state.tensors()
+    assert all(expected[n].numpy().tobytes() == found[n].numpy().tobytes() for n in expected)
+
+
+def test_entries_come_back_from_memory_and_file(tmp_path: Path) -> None:
+    made = []
+
+    def maker(seed: int) -> Callable[[], Entry]:
+        return lambda: made.append(seed) or entry_of(seed)  # type: ignore[func-returns-value]
+
+    store = ViewStore(4000, tmp_path)
+    for _ in range(3):
+        for seed in range(4):
+            assert same(store.get("kind", f"v{seed}", maker(seed)), entry_of(seed))
+    assert made == [0, 1, 2, 3]
+    assert 0 < store.in_memory <= 4000
+    length = store.in_file
+    store.drop("kind")
+    assert store.in_memory == 0
+    for seed in range(4):
+        store.get("kind", f"v{seed}", maker(seed + 10))
+    assert made[4:] == [10, 11, 12, 13]
+    assert store.in_file == length, "places are used again"
+    assert same(store.get("kind", "v3", maker(0)), entry_of(13))
+    store.drop("kind", "v3")
+    assert same(store.get("kind", "v3", maker(20)), entry_of(20))
+
+
+def test_what_can_be_had_cheaply_is_not_put_into_the_file(tmp_path: Path) -> None:
+    store, made = ViewStore(0, tmp_path), []
+    for _ in range(2):
+        store.get("kind", "v", lambda: made.append(0) or entry_of(0), disposable=True)  # type: ignore[func-returns-value]
+    assert len(made) == 2
+    assert store.in_file == 0
+
+
+def test_a_disk_without_room_is_said_once_and_costs_only_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(view_store.tempfile, "TemporaryFile", full)
+    said: list[str] = []
+    store = ViewStore(0, tmp_path, said.append)
+    for seed in (0, 1, 0):
+        assert same(store.get("kind", f"v{seed}", lambda seed=seed: entry_of(seed)), entry_of(seed))
+    (warning,) = said
+    assert "No space left on device" in warning
+
+
+def test_a_file_that_was_cut_is_made_again(tmp_path: Path) -> None:
+    store = ViewStore(0, tmp_path)
+    for seed in range(2):
+        store.get("kind", f"v{seed}", lambda seed=seed: entry_of(seed))
+    assert store._file is not None
+    store._file.truncate(100)
+    assert same(store.get("kind", "v1", lambda: entry_of(1)), entry_of(1))
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3, 40.0])
+def test_coding_keeps_zero_and_the_largest_and_rounds_the_rest(scale: float) -> None:
+    values = scale * torch.linspace(-1, 1, 4001)
+    found = unpacked(packed(values))
+    assert float((found - values).abs().max()) <= scale * 0.51 / 32767
+    assert float(found[2000]) == 0
+    assert float(found[-1]) == pytest.approx(scale, rel=1e-7)
+    assert torch.equal(unpacked(packed(torch.zeros(5))), torch.zeros(5))
+
+
+def test_a_coded_half_or_one_is_itself() -> None:
+    flags = torch.tensor([0.0, 1.0, 1.0])
+    assert torch.equal(unpacked(packed(flags)), flags)
+
+
+def test_terms_find_what_they_read_of_the_priors(tiny_scene: Scene) -> None:
+    view, recipe = tiny_scene.train_views[0], RECIPES["polarguide-stokes"]
+    guide = -view.camera.world_rays()
+    priors = view_priors(view, guide, recipe.priors, 1.5)
+    fields = fields_read(recipe.stages[1].weights)
+    entry = pack_priors(priors, fields)
+    assert holds(entry, fields)
+    assert not holds(entry, fields_read(Weights(normal=1.0)))
+    found = unpack_priors(entry, view.camera)
+    for name in fields:
+        expected, values = getattr(priors, name), getattr(found, name)
+        if name == "stokes":
+            expected, values = expected[1:], values[1:]
+        assert float((expected - values).abs().max()) <= 0.51 / 32767 * max(1, float(expected.abs().max()))
+    assert bool(found.normal.isnan().all()), "nothing reads it, so that nothing is there to be read"
+    assert found.normal.shape == priors.normal.shape
+    pixels = view.camera.width * view.camera.height
+    assert sum(part.bytes for part in entry.values()) == 44 * pixels
