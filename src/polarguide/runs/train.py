@@ -15,11 +15,13 @@ import torch
 from polarguide.capture import Scene
 from polarguide.capture.background import without_surroundings
 from polarguide.capture.layout import refuse_scene
+from polarguide.capture.variants import captured_as
 from polarguide.errors import PolarguideError
 from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import use_threads
 from polarguide.recipes import recipe_named
+from polarguide.runs.angles import report_polarizers
 from polarguide.runs.folder import (
     CHECKPOINT,
     CONFIGURATION,
@@ -103,7 +105,8 @@ def train(
             settings, views_per_step=_views(settings.views_per_step, ranks, out if resume else None, reporter)
         )
         backend = backend_of(ranks, session.device, reporter)
-        loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
+        whole = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
+        loaded = captured_as(whole, settings.exposures)
         if settings.background == "masked":
             loaded = without_surroundings(loaded)
         _check_scene(loaded)
@@ -119,6 +122,11 @@ def train(
         trainer = Trainer(loaded, chosen, settings, backend, state, ranks)
         if trainer.black and settings.background == "auto":
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
+        if trainer.polarizers.ignored:
+            reporter.warn(
+                f"the recipe {chosen.name} has no term for pictures that do not determine polarization: it takes those "
+                "for photographs, filter or not."
+            )
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
@@ -130,9 +138,10 @@ def train(
             _Loop(trainer, out, session, reporter, should_stop, look).run()
         model = GaussianModel(trainer.state, trainer.shading, backend)
         if leads:
+            report_polarizers(out, loaded, trainer.polarizers, reporter)
             centers = torch.stack([view.camera.center for view in loaded.views])
             write_run_ply(out / PLY, model.state, model.shading, centers)
-    return OpenedRun(out, configuration, chosen, model, scene=loaded, reporter=reporter)
+    return OpenedRun(out, configuration, chosen, model, scene=whole, reporter=reporter)
 
 
 class _Loop:

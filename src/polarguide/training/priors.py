@@ -15,6 +15,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture import View
+from polarguide.capture.exposures import FOUR
 from polarguide.color import srgb_encode
 from polarguide.training.recipe import Candidates, Priors
 from polarguide.vectors import dot, unit
@@ -82,22 +83,21 @@ def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: 
     """Compute the priors of one view.
 
     Args:
-        view: the capture.
+        view: the capture; its pictures have to determine the Stokes vector.
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
         refractive_index: of all surfaces.
     """
     view = view.to(normal.device)
     rays = view.camera.rays(device=normal.device)
-    intensities = view.intensities()
-    stokes = optics.stokes(intensities)
+    stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide, known = guide_normals(view.camera.to_camera(normal), rays)
     usable = optics.polarization_mask(
         luminance,
         threshold=settings.threshold,
         invalid=view.invalid,
-        noise_sigma=optics.intensity_noise(intensities.mean(dim=-1)) if settings.snr else 0.0,
+        noise_sigma=_noise(view) if settings.snr else 0.0,
         snr=settings.snr,
         saturated=view.saturated,
     )
@@ -141,6 +141,13 @@ def view_priors(view: View, normal: Tensor, settings: Priors, refractive_index: 
         reliable=(~(view.invalid | view.saturated)).float(),
         candidates=view.camera.to_world(_normals(candidates)) if settings.live else None,
     )
+
+
+def _noise(view: View) -> Tensor | float:
+    """Standard deviation [H, W] of the noise of one of the four intensities; 0 for other pictures: three leave nothing
+    to read it from.
+    """
+    return optics.intensity_noise(view.intensities().mean(dim=-1)) if view.exposures == FOUR else 0.0
 
 
 def _candidates(

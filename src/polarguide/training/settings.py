@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from polarguide.errors import PolarguideError
-from polarguide.options import check_choice, check_count
+from polarguide.options import EXPOSURES, Exposures, check_choice, check_count
 
 MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
 Background = Literal["auto", "scene", "black", "masked"]
@@ -32,6 +32,8 @@ class TrainSettings:
             took). Learning rates grow with its square root; steps are steps, so more views are looked at.
         background: What is behind the subject: a scene to reconstruct, too; black, that is nothing; masked makes it
             nothing (the subject in masks/ alone is read); auto takes black where the edges of the pictures are.
+        exposures: Which pictures of a scene with four to train on, as if no others had been taken: captured, all that
+            there are. See compare.
     """
 
     steps: int = 5000
@@ -39,12 +41,14 @@ class TrainSettings:
     refractive_index: float = 1.5
     views_per_step: int = 1
     background: Background = "auto"
+    exposures: Exposures = "captured"
 
     def __post_init__(self) -> None:
         check_count("steps", self.steps)
         check_count("views_per_step", self.views_per_step, 0, MOST_VIEWS)
         check_count("seed", self.seed, 0, MOST_SEEDS)
         check_choice("background", self.background, BACKGROUNDS)
+        check_choice("exposures", self.exposures, EXPOSURES)
         if not 1.0 < self.refractive_index < 4.0:
             raise PolarguideError(
                 "refractive_index",

@@ -26,6 +26,8 @@ from polarguide.shading.visibility import outward_directions, touching_views
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
+from polarguide.training.partial import PartialView
+from polarguide.training.polarizers import Polarizers
 from polarguide.training.priors import ViewPriors, view_priors
 from polarguide.training.recipe import Action, Recipe, Stage
 from polarguide.training.schedule import Schedule
@@ -38,12 +40,14 @@ ENOUGH_VIEWS = 12
 
 class _Shown(NamedTuple):
     """A training view's photograph [H, W, 3] as shown, 1 where it counts [H, W] (None: everywhere), and 1 where it
-    shows nothing [H, W] (None: where that is not known).
+    shows nothing [H, W] (None: where that is not known). And what was measured
+    where that does not determine the Stokes vector.
     """
 
     picture: Tensor
     valid: Tensor | None
     empty: Tensor | None
+    partial: PartialView | None
 
 
 def is_black(scene: Scene, settings: TrainSettings) -> bool:
@@ -67,6 +71,7 @@ class Trainer:
     Attributes:
         shading: the recipe's, for the run's refractive index.
         black: whether nothing is behind the subject.
+        polarizers: what is found out about those whose angle is not known.
         whole: whether the state is one between two steps; an exception may leave it in the middle of a change.
     """
 
@@ -88,6 +93,7 @@ class Trainer:
         self.state = state or first_state(
             scene, recipe, settings, backend.device, surroundings=not self.black
         )
+        self.polarizers = Polarizers(scene, recipe, settings.steps, self.state.angles)
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
         centers = torch.stack([view.camera.center for view in scene.train_views])
@@ -109,7 +115,9 @@ class Trainer:
         """One optimizer step."""
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
-        self.whole = not position.actions
+        self.whole = not (position.actions or self.polarizers.due(state.step))
+        if self.polarizers.due(state.step):
+            self._fit_polarizers()
         for action in position.actions:
             self._act(action)
         mine = self.ranks.slots(views)
@@ -189,6 +197,7 @@ class Trainer:
             extent=self._extent,
             camera=view.camera,
             empty=shown.empty,
+            partial=shown.partial,
         )
         loss.backward()
         gradient = statistic.gradient if statistic else None
@@ -234,6 +243,26 @@ class Trainer:
         if state.environment is not None:
             state.environment.step()
 
+    @torch.no_grad()
+    def _fit_polarizers(self) -> None:
+        """Find the angles of pictures from the present state."""
+        state = self.state
+
+        def predicted(view: View) -> Tensor:
+            degree = self.schedule.sh_degree(state.step)
+            rasterize, shading = self.backend.rasterize, self.shading
+            result = render(
+                state.gaussians, view.camera, rasterize, sh_degree=degree, shading=shading, light=state.light
+            )
+            return shading.predicted_stokes(result, view.camera)
+
+        table = self.polarizers.fit(predicted).to(self._device)
+        self.ranks.broadcast(table)
+        state.angles = table.cpu()
+        for name in self.polarizers.take(state.angles):
+            self._shown.pop(name, None)
+            self._priors.pop(name, None)
+
     def _act(self, action: Action) -> None:
         if action == "reset_opacity":
             reset_opacity(self.state, self.shading)
@@ -258,18 +287,20 @@ class Trainer:
         views = self.scene.train_views
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
-        return views[int(order[place])]
+        return self.polarizers.believed(views[int(order[place])])
 
     def _shown_photograph(self, view: View) -> _Shown:
         if view.name not in self._shown:
+            partial = None if view.is_determined else PartialView.of(view, self._device)
             picture = srgb_encode(view.photograph().clamp(0, 1)).to(self._device)
+            picture = picture if partial is None else partial.shown
             valid = (~view.invalid).float().to(self._device) if bool(view.invalid.any()) else None
             empty = empty_pixels(view).float().to(self._device) if self.black else None
-            self._shown[view.name] = _Shown(picture, valid, empty)
+            self._shown[view.name] = _Shown(picture, valid, empty, partial)
         return self._shown[view.name]
 
     def _priors_of(self, view: View, stage: Stage) -> ViewPriors | None:
-        if not stage.weights.priors:
+        if not stage.weights.priors or not view.is_determined:
             return None
         if view.name not in self._priors:
             if self.state.frozen is None:
