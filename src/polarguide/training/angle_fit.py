@@ -27,13 +27,15 @@ class FittedAngle:
         angle: degrees in [0, 180), as ``Exposure.angle``.
         gain: brightness over the predicted one.
         certainty: how much of the predicted polarization shows in the picture: 1 behind a polarizer, 0 without one.
-        spread: standard deviation of the angle, degrees.
+        spread: standard deviation of the angle, degrees; at most 90.
+        doubt: standard deviation of the certainty, at most 1.
     """
 
     angle: float
     gain: float
     certainty: float
     spread: float
+    doubt: float
 
 
 def fit_angle(
@@ -78,11 +80,14 @@ def fit_angle(
     length = math.hypot(x, y2)
     if gain <= 0 or length == 0:
         return None
-    scores = (columns * weights * (y - solution @ columns)).reshape(3, *intensity.shape).sum(dim=-1)
-    covariance = _sandwich(moments, scores)
+    covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
+    if mount == "filter":  # turned into the last round's analyzer, which is all but along the first axis
+        x, y2 = length, 0.0
     across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
-    spread = math.sqrt(max(0.0, float(across @ covariance @ across))) / length / 2
-    return FittedAngle(math.degrees(angle) % 180.0, gain, length / gain, math.degrees(spread))
+    spread = math.degrees(math.sqrt(max(0.0, float(across @ covariance @ across))) / length / 2)
+    doubt = math.sqrt(max(0.0, float(torch.linalg.eigvalsh(covariance[1:, 1:])[-1]))) / gain
+    certainty = length / gain
+    return FittedAngle(math.degrees(angle) % 180.0, gain, certainty, min(spread, 90.0), min(doubt, 1.0))
 
 
 def _solvable(moments: Tensor) -> bool:
@@ -90,9 +95,14 @@ def _solvable(moments: Tensor) -> bool:
     return bool(torch.isfinite(values).all()) and float(values[0]) > 1e-9 * max(float(values[-1]), 1e-30)
 
 
-def _sandwich(moments: Tensor, scores: Tensor) -> Tensor:
-    """Covariance [3, 3] of a solution from the scores [3, H, W] of its pixels, summed over squares of ``BLOCK``."""
+def _covariance(columns: Tensor, weights: Tensor, residuals: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Covariance [3, 3] of a solution by least absolute differences: the usual sandwich, with the density of the
+    residuals at zero from those under their median, and errors that may depend on each other within ``BLOCK``.
+    """
+    width = residuals[weights > 0].abs().median().clamp(min=1e-9)
+    slope = (columns * (weights * (residuals.abs() <= width) / width)) @ columns.T
+    scores = (columns * weights * residuals.sign()).reshape(3, *shape).sum(dim=-1)
     blocks = torch.nn.functional.avg_pool2d(scores[None], BLOCK, ceil_mode=True, divisor_override=1)[0]
     sums = blocks.reshape(3, -1)
-    inverse = torch.linalg.inv(moments)
+    inverse = torch.linalg.pinv(slope)
     return inverse @ (sums @ sums.T) @ inverse

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -13,7 +14,7 @@ from polarguide.capture.exposures import Exposure, found
 from polarguide.training.angle_fit import fit_angle
 from polarguide.training.recipe import Recipe
 
-FIRST, EVERY, LAST = 0.5, 0.1, 0.9
+FIRST, EVERY, LAST = 0.5, 0.05, 0.95
 """Shares of all steps: before the first, what is said about unknown angles would confirm itself."""
 NO_FILTER = 0.5
 """Certainty under which a picture was taken without a filter, or through one that is mounted the wrong way round."""
@@ -21,7 +22,7 @@ VAGUE = 8.0
 """Spread (degrees) from which on a fitted angle is not relied on."""
 CONTRADICTS = 20.0
 """Degrees between the angle that is said and the fitted one from which on they contradict each other."""
-COLUMNS = 5
+COLUMNS = 6
 Predict = Callable[[View], Tensor]
 """Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
 
@@ -33,7 +34,7 @@ class Judgment:
     Attributes:
         view, number: the view, and the place of the picture among its exposures.
         said: what the capture says. believed: what the training goes by.
-        angle, gain, certainty, spread: as fitted, see ``FittedAngle``.
+        angle, gain, certainty, spread, doubt: as fitted, see ``FittedAngle``.
     """
 
     view: str
@@ -44,16 +45,17 @@ class Judgment:
     gain: float
     certainty: float
     spread: float
-
-    @property
-    def vague(self) -> bool:
-        """Whether the picture does not tell."""
-        return self.spread > VAGUE
+    doubt: float
 
     @property
     def unfiltered(self) -> bool:
         """Whether it was taken without a filter, as it looks."""
-        return self.certainty < NO_FILTER and not self.vague
+        return self.certainty + 2 * self.doubt < NO_FILTER
+
+    @property
+    def vague(self) -> bool:
+        """Whether the picture does not tell its angle."""
+        return self.spread > VAGUE and not self.unfiltered
 
     @property
     def off(self) -> float:
@@ -73,7 +75,7 @@ class Polarizers:
 
     Args:
         scene: the capture. recipe: the method. steps: of the training.
-        table: what was found before [P, 5] float64, as ``table`` gives it; None: nothing.
+        table: what was found before [P, 6] float64, as ``table`` gives it; None: nothing.
 
     Raises:
         ValueError: the table has another number of rows.
@@ -114,7 +116,7 @@ class Polarizers:
         """Fit all angles.
 
         Returns:
-            [P, 5] float64: of each picture angle, gain, certainty, spread, and 1 where there was anything to go by.
+            [P, 6] float64: of each picture the values of ``FittedAngle``, and 1 where there was anything to go by.
         """
         rows = []
         for view in self._views:
@@ -126,9 +128,9 @@ class Polarizers:
                 if not view.exposures[k].filtered:
                     continue
                 fitted = fit_angle(intensity, stokes, weight, rays, view.mount)
-                row = [0.0, 1.0, 0.0, 90.0, 0.0]
+                row = [0.0, 1.0, 0.0, 90.0, 1.0, 0.0]
                 if fitted is not None:
-                    row = [fitted.angle, fitted.gain, fitted.certainty, min(fitted.spread, 90.0), 1.0]
+                    row = [*dataclasses.astuple(fitted), 1.0]
                 rows.append(row)
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, COLUMNS)
 
@@ -169,9 +171,10 @@ def _judged(
     gain: float,
     certainty: float,
     spread: float,
+    doubt: float,
     fits: float,
 ) -> Judgment:
-    judgment = Judgment(view, number, said, said, angle, gain, certainty, spread if fits else 90.0)
+    judgment = Judgment(view, number, said, said, angle, gain, certainty, spread, doubt)
     if said.known or judgment.vague:
         return judgment
     if judgment.unfiltered:
