@@ -124,8 +124,8 @@ def train(
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
         if trainer.polarizers.ignored:
             reporter.warn(
-                f"the recipe {chosen.name} has no term for pictures that do not determine polarization: it takes those "
-                "for photographs, filter or not."
+                f"the recipe {chosen.name} has no term for single pictures through a filter: it takes them for "
+                "photographs without one."
             )
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()

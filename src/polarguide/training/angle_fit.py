@@ -11,10 +11,12 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.optics import Mount
 
-ROUNDS = 5
+ROUNDS = 6
 """Reweightings on the way from least squares to least absolute differences."""
-SOFT = 0.0025
+SOFT = 0.001
 """Difference of intensities under which one counts no more for being smaller."""
+FLOOR = 0.02
+"""S0 under which a pixel counts no more for being darker."""
 BLOCK = 16
 """Side of the squares of pixels whose errors may depend on each other."""
 
@@ -44,7 +46,8 @@ def fit_angle(
     """Fit ``I = (g S0 + x S1 + y S2) / 2`` with g the gain and (x, y) = g (cos 2t, sin 2t) of the angle t.
 
     Least absolute differences, by least squares with new weights in each of a few rounds, so that what the prediction
-    has not explained yet does not pull at the angle. Of a filter before the lens, whose analyzer depends on the pixel,
+    has not explained yet does not pull at the angle, over the square of S0: what a prediction lacks grows with the
+    light, and what is dark is polarized most. Of a filter before the lens, whose analyzer depends on the pixel,
     (x, y) turns that of the last round.
 
     Args:
@@ -54,7 +57,7 @@ def fit_angle(
     Returns:
         None where there is no polarization to tell an angle by.
     """
-    flat = (weight / (stokes[0].mean(dim=-1).clamp(min=0) + 0.01))[..., None].expand_as(intensity)
+    flat = (weight / (stokes[0].mean(dim=-1).clamp(min=0) + FLOOR) ** 2)[..., None].expand_as(intensity)
     plain, y = flat.reshape(-1).double(), intensity.reshape(-1).double()
     s0, s1, s2 = (part.reshape(-1).double() / 2 for part in stokes)
     angle, weights = 0.0, plain

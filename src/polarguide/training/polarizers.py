@@ -3,25 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from statistics import median
 
 import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.capture.exposures import Exposure, found
+from polarguide.capture.exposures import Exposure
+from polarguide.capture.exposures import found as found_exposure
 from polarguide.training.angle_fit import fit_angle
 from polarguide.training.recipe import Recipe
 
 FIRST, EVERY, LAST = 0.5, 0.05, 0.95
 """Shares of all steps: before the first, what is said about unknown angles would confirm itself."""
-NO_FILTER = 0.5
-"""Certainty under which a picture was taken without a filter, or through one that is mounted the wrong way round."""
-VAGUE = 8.0
+WEAK = 0.22
+"""Certainty under which an angle is not relied on. Predictions that are wrong in places take some of it away, so that a
+picture through a filter seldom has all of it; half of it is usual when angles are first fitted.
+"""
+VAGUE = 15.0
 """Spread (degrees) from which on a fitted angle is not relied on."""
 CONTRADICTS = 20.0
-"""Degrees between the angle that is said and the fitted one from which on they contradict each other."""
+"""Degrees between the angle that is said and the fitted one from which on they contradict each other, if that is three
+times the spread."""
+LOCKED = 0.1
+"""Spread of the logarithms of fitted gains up to which exposures are taken to have been the same: the first fit has
+0.03 to 0.07 for such, and automatic exposure of 0.3 stops each way 0.13.
+"""
+FEWEST = 4
+"""Pictures from which a spread of gains is told."""
 COLUMNS = 6
 Predict = Callable[[View], Tensor]
 """Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
@@ -50,12 +62,12 @@ class Judgment:
     @property
     def unfiltered(self) -> bool:
         """Whether it was taken without a filter, as it looks."""
-        return self.certainty + 2 * self.doubt < NO_FILTER
+        return self.certainty + self.doubt < WEAK
 
     @property
     def vague(self) -> bool:
         """Whether the picture does not tell its angle."""
-        return self.spread > VAGUE and not self.unfiltered
+        return (self.spread > VAGUE or self.certainty < WEAK) and not self.unfiltered
 
     @property
     def off(self) -> float:
@@ -65,7 +77,8 @@ class Judgment:
     @property
     def contradicts(self) -> bool:
         """Whether the picture contradicts what is said."""
-        return not self.vague and not self.unfiltered and abs(self.off) > CONTRADICTS
+        limit = max(CONTRADICTS, 3 * self.spread)
+        return not self.vague and not self.unfiltered and abs(self.off) > limit
 
 
 class Polarizers:
@@ -98,7 +111,7 @@ class Polarizers:
         if table is not None and len(table) != len(self._places):
             raise ValueError(f"angles of {len(table)} pictures, not {len(self._places)}")
         self.table = table
-        self.ignored = not uses and any(not view.is_determined for view in scene.train_views)
+        self.ignored = not uses and any(not view.measures_radiance for view in scene.train_views)
         self._believed = self._beliefs()
 
     def due(self, step: int) -> bool:
@@ -145,13 +158,29 @@ class Polarizers:
         """What is said and believed of each picture; empty before the first fit."""
         if self.table is None:
             return []
-        pairs = zip(self._places, self.table.tolist(), strict=True)
-        return [
-            _judged(view.name, k, view.exposures[k], self._common_gain(), *row) for (view, k), row in pairs
-        ]
+        common = self._common_gain()
+        found = []
+        for (view, k), row in zip(self._places, self.table.tolist(), strict=True):
+            angle, gain, certainty, spread, doubt, _ = row
+            said = view.exposures[k]
+            judgment = Judgment(view.name, k, said, said, angle, gain, certainty, spread, doubt)
+            found.append(judgment if said.known else replace(judgment, believed=_belief(judgment, common)))
+        return found
 
-    def _common_gain(self) -> float:
-        return 1.0
+    def _common_gain(self) -> float | None:
+        """What gains are relative to; None where they differ no more than those of locked exposures, as fitted."""
+        assert self.table is not None
+        rows = [
+            row
+            for (view, k), row in zip(self._places, self.table, strict=True)
+            if not view.exposures[k].known
+        ]
+        gains = [float(row[1]) for row in rows if row[-1]]
+        if len(gains) < FEWEST:
+            return None
+        middle = median(gains)
+        spread = 1.4826 * median(abs(math.log(gain / middle)) for gain in gains)
+        return middle if spread > LOCKED else None
 
     def _beliefs(self) -> dict[str, tuple[Exposure, ...]]:
         believed: dict[str, list[Exposure]] = {}
@@ -162,21 +191,12 @@ class Polarizers:
         return {name: tuple(exposures) for name, exposures in believed.items()}
 
 
-def _judged(
-    view: str,
-    number: int,
-    said: Exposure,
-    common: float,
-    angle: float,
-    gain: float,
-    certainty: float,
-    spread: float,
-    doubt: float,
-    fits: float,
-) -> Judgment:
-    judgment = Judgment(view, number, said, said, angle, gain, certainty, spread, doubt)
-    if said.known or judgment.vague:
-        return judgment
+def _belief(judgment: Judgment, common: float | None) -> Exposure:
+    """What is believed of a picture of which nothing is said: a photograph where it does not tell its angle."""
+    said = judgment.said
+    if judgment.vague:
+        return said
     if judgment.unfiltered:
-        return replace(judgment, believed=replace(said, filtered=False))
-    return replace(judgment, believed=found(said, angle, said.gain * common))
+        return replace(said, filtered=False)
+    gain = said.gain if common is None else said.gain * judgment.gain / common
+    return found_exposure(said, judgment.angle, gain)
