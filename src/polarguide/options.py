@@ -10,13 +10,15 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from polarguide.errors import PolarguideError
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 Transfer = Literal["linear", "srgb"]
 Split = Literal["directions", "every-8th"]
+Exposures = Literal["captured", "four", "three", "two", "one", "unknown", "mixed", "sparse", "none"]
+EXPOSURES: tuple[Exposures, ...] = get_args(Exposures)
 ExportFormat = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {

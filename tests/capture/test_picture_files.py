@@ -266,7 +266,7 @@ def test_pictures_of_one_view_differ(capture: TinyCapture) -> None:
     write_picture(capture.picture("v003", 135), ideal_intensities(0, height=8, width=12)[3])
     fails(capture.root, "v003_135.png", "the size of polar/v003_000.png, 12x10", "found 12x8")
     write_picture(capture.picture("v003", 135), capture.linear["v003"][3], bits=8)
-    fails(capture.root, "v003_135.png", "found 12x10 with 8 bits", "Export the four pictures of a view alike")
+    fails(capture.root, "v003_135.png", "found 12x10 with 8 bits", "Export the pictures of a view alike")
 
 
 def test_a_view_of_another_size_than_its_camera(capture: TinyCapture) -> None:

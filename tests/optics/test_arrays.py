@@ -19,7 +19,9 @@ RAYS = np.array([0.1, -0.2, 1.0], np.float32) / np.float32(np.sqrt(1.05))
 NORMALS = np.broadcast_to(np.array([0.3, 0.2, -0.93], np.float32), (6, 7, 3))
 ANGLE = RNG.uniform(0.1, 1.4, (6, 7)).astype(np.float32)
 SHARE = RNG.uniform(0.05, 0.35, (6, 7)).astype(np.float32)
+CIRCLE = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)
 CALLS: dict[str, tuple[Any, ...]] = {
+    "analyzer": (ANGLE[0, 0], RAYS, "filter"),
     "aolp": (GRAY,),
     "azimuth": (NORMALS, RAYS),
     "brewster": (SHARE + 1,),
@@ -32,6 +34,8 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "dolp_noise": (GRAY, SHARE),
     "dolp_slopes": (SHARE,),
     "exact_separation": (STOKES, NORMALS, RAYS),
+    "filter_analyzer": (ANGLE[0, 0], RAYS),
+    "fitted_stokes": (FOUR, CIRCLE),
     "intensity": (GRAY, ANGLE),
     "intensity_noise": (FOUR[..., 0], 3),
     "lens_frame": (RAYS,),

@@ -49,7 +49,7 @@ class Measures:
 
 
 def sampled(codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """What ``measure`` looks at of the codes of a view [4, H, W, 3], for whoever does not keep them."""
+    """What ``measure`` looks at of the codes of a view [K, H, W, 3], for whoever does not keep them."""
     step = _step(codes.shape[1] * codes.shape[2])
     return codes[:, ::step, ::step].copy()
 
@@ -59,19 +59,20 @@ def _step(pixels: int) -> int:
     return max(1, math.ceil(math.sqrt(pixels / _SAMPLES)))
 
 
-def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_]) -> Measures:
+def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool = True) -> Measures:
     """Measure one view.
 
     Args:
-        codes: linear codes [4, H, W, 3], or ``sampled`` ones.
+        codes: linear codes [K, H, W, 3], or ``sampled`` ones.
         usable: pixels that are neither saturated nor invalid, [H, W].
+        four: whether they are those at 0, 45, 90 and 135 degrees; of others only the brightness is measured.
     """
     step = _step(usable.size)
     sample = (codes if codes.shape[1:3] != usable.shape else codes[:, ::step, ::step]).astype(np.float64)
     bright = float(np.percentile(sample, 99.0)) / FULL_CODE
     gray = sample.mean(axis=3)
     angles = gray[:, usable[::step, ::step] & (gray.min(axis=0) > _LOW_CODE)]
-    if angles.shape[1] < 16:
+    if not four or angles.shape[1] < 16:
         return Measures(bright, (0.0, 0.0, 0.0), np.zeros(5))
     i0, i45, i90, i135 = angles
     s0 = (i0 + i45 + i90 + i135) / 2.0

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from polarguide.capture.angle_table import TABLE, Listed, read_table
+from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.view import ANGLES, listed, unknown_view
 from polarguide.errors import PolarguideError
@@ -29,9 +31,12 @@ class Layout:
 
     Attributes:
         root: the folder.
-        pictures: view name -> angle in degrees -> file. Angles may be missing; ``select_views`` checks.
+        pictures: view name -> angle in degrees -> file, of views with pictures at 0, 45, 90 and 135 degrees. Angles may
+            be missing; ``select_views`` checks.
         masks, invalid, ground_truth: view name -> file, for the views that have one.
         warnings: about files that are not used.
+        others: view name -> its files and what they are, of views with other pictures, which ``angles.csv`` lists.
+        table: ``angles.csv``, if there is one.
     """
 
     root: Path
@@ -40,11 +45,23 @@ class Layout:
     invalid: dict[str, Path]
     ground_truth: dict[str, Path]
     warnings: tuple[str, ...]
+    others: Mapping[str, tuple[tuple[Path, Exposure], ...]] = field(default_factory=dict)
+    table: Path | None = None
 
     @property
     def names(self) -> list[str]:
         """All view names, sorted."""
-        return sorted(self.pictures)
+        return sorted(self.pictures.keys() | self.others.keys())
+
+    def files(self, name: str) -> list[Path]:
+        """The pictures of a view that has all of them, in the order of its exposures."""
+        if name in self.others:
+            return [path for path, _ in self.others[name]]
+        return [self.pictures[name][angle] for angle in ANGLES]
+
+    def exposures(self, name: str) -> tuple[Exposure, ...]:
+        """What the pictures of a view are."""
+        return tuple(e for _, e in self.others[name]) if name in self.others else FOUR
 
 
 def find_layout(root: Path) -> Layout:
@@ -56,30 +73,52 @@ def find_layout(root: Path) -> Layout:
     require_folder(root, expected="a capture folder", remedy=_HINT)
     warnings: list[str] = []
     folders = angle_folders(root)
+    others: dict[str, tuple[tuple[Path, Exposure], ...]] = {}
+    table = root / TABLE if os.path.lexists(root / TABLE) else None
     if (root / "polar").is_dir():
-        pictures = _read_flat(root / "polar", warnings)
+        pictures, others = _read_flat(root / "polar", warnings, table)
     elif folders:
         pictures = pictures_of_folders(root, folders)
     else:
         raise PolarguideError(root, expected="a capture folder", found=describe_contents(root), remedy=_HINT)
-    if not pictures:
+    names = pictures.keys() | others.keys()
+    if not names:
         raise PolarguideError(root, expected="pictures of at least one view", found="none", remedy=_HINT)
     sides: dict[str, dict[str, Path]] = {}
     for folder, suffixes in (("masks", SUFFIXES), ("invalid", SUFFIXES), ("gt", (".npz",))):
         files = index_files(root / folder, suffixes)
-        strangers = sorted(path.name for stem, path in files.items() if stem not in pictures)
+        strangers = sorted(path.name for stem, path in files.items() if stem not in names)
         if strangers:
             warnings.append(
                 f"{folder}/ has files without a view, which are not used ({listed(strangers)}): "
                 "name each file like its view."
             )
         sides[folder] = files
-    without = sorted(pictures.keys() - sides["masks"].keys())
+    without = sorted(names - sides["masks"].keys())
     if sides["masks"] and without:
-        warnings.append(
-            f"masks/ has no file for {len(without)} of {len(pictures)} views ({listed(without)})."
+        warnings.append(f"masks/ has no file for {len(without)} of {len(names)} views ({listed(without)}).")
+    return Layout(
+        root, pictures, sides["masks"], sides["invalid"], sides["gt"], tuple(warnings), others, table
+    )
+
+
+def require_four(layout: Layout, what: str) -> None:
+    """Refuse captures with views that do not have one picture each at 0, 45, 90 and 135 degrees.
+
+    Args:
+        what: what needs them, for the message.
+
+    Raises:
+        PolarguideError: there is such a view.
+    """
+    if layout.others:
+        raise PolarguideError(
+            layout.table or layout.root,
+            expected=f"views with pictures at 0, 45, 90 and 135 degrees, which {what} needs",
+            found=f"other pictures in {len(layout.others)} of {len(layout.names)} views "
+            f"({listed(sorted(layout.others))})",
+            remedy="Train on the scene: polarguide train takes any angles and checks them on the way.",
         )
-    return Layout(root, pictures, sides["masks"], sides["invalid"], sides["gt"], tuple(warnings))
 
 
 def refuse_scene(out: Path) -> None:
@@ -104,7 +143,7 @@ def select_views(layout: Layout, views: Sequence[str] | None) -> list[str]:
         names = layout.names
     else:
         for name in views:
-            if name not in layout.pictures:
+            if name not in layout.names:
                 raise unknown_view(f"{layout.root} (views)", name, layout.names)
         names = sorted(set(views))
         if not names:
@@ -119,7 +158,7 @@ def select_views(layout: Layout, views: Sequence[str] | None) -> list[str]:
 
 
 def _require_complete(layout: Layout, names: list[str]) -> None:
-    incomplete = [name for name in names if len(layout.pictures[name]) < len(ANGLES)]
+    incomplete = [n for n in names if n not in layout.others and len(layout.pictures[n]) < len(ANGLES)]
     if not incomplete:
         return
     name = incomplete[0]
@@ -130,7 +169,7 @@ def _require_complete(layout: Layout, names: list[str]) -> None:
         _sibling(layout, have, missing),
         expected=f"the picture of view {name} at {missing} degrees",
         found=f"only {', '.join(str(angle) for angle in sorted(have))} degrees{others}",
-        remedy="Add the file, or remove the other pictures of the view.",
+        remedy="Add the file, remove the other pictures of the view, or list what there is in angles.csv.",
     )
 
 
@@ -143,22 +182,55 @@ def _sibling(layout: Layout, have: dict[int, Path], angle: int) -> Path:
     return folders.get(angle, path.parent) / path.name
 
 
-def _read_flat(folder: Path, warnings: list[str]) -> dict[str, dict[int, Path]]:
-    """``polar/<view>_<angle>.<suffix>``."""
+def _read_flat(
+    folder: Path, warnings: list[str], table: Path | None
+) -> tuple[dict[str, dict[int, Path]], dict[str, tuple[tuple[Path, Exposure], ...]]]:
+    """``polar/<view>_<angle>.<suffix>``, and what a table lists."""
+    lines = read_table(table) if table is not None else []
+    stored = {path.name: path for path in list_files(folder, SUFFIXES)}
+    for item in lines:
+        if item.file not in stored:
+            raise PolarguideError(
+                f"{table} (line {item.line})",
+                expected="a picture in polar/",
+                found=f"none called {item.file}",
+                remedy="Correct the name, or remove the line.",
+            )
     pictures: dict[str, dict[int, Path]] = {}
     strangers = []
-    for stem, path in index_files(folder, SUFFIXES).items():
+    told = {item.file for item in lines}
+    for stem, path in index_files(folder, SUFFIXES, told).items():
         match = _PICTURE_STEM.fullmatch(stem)
         if match is None:
             strangers.append(path.name)
         else:
             pictures.setdefault(match["view"], {})[int(match["angle"])] = path
     if strangers:
+        beside = "" if table is None else f" and which {TABLE} does not list"
         warnings.append(
-            f"polar/ has pictures whose names do not end in _000, _045, _090 or _135, which "
+            f"polar/ has pictures whose names do not end in _000, _045, _090 or _135{beside}, which "
             f"are not used ({listed(strangers)})."
         )
-    return pictures
+    return pictures, _take_listed(pictures, lines, stored)
+
+
+def _take_listed(
+    pictures: dict[str, dict[int, Path]], lines: Sequence[Listed], stored: Mapping[str, Path]
+) -> dict[str, tuple[tuple[Path, Exposure], ...]]:
+    """Add the views of a table: to ``pictures`` where they have one picture at each of the four angles."""
+    views: dict[str, list[tuple[Path, Exposure]]] = {}
+    for item in lines:
+        views.setdefault(item.view, []).append((stored[item.file], item.exposure))
+    others = {}
+    for view, found in views.items():
+        named = pictures.pop(view, {})
+        found += [(path, FOUR[ANGLES.index(angle)]) for angle, path in sorted(named.items())]
+        of_four = {FOUR.index(exposure): path for path, exposure in found if exposure in FOUR}
+        if len(found) == len(of_four) == len(FOUR):
+            pictures[view] = {angle: of_four[place] for place, angle in enumerate(ANGLES)}
+        else:
+            others[view] = tuple(found)
+    return others
 
 
 def pictures_of_folders(
@@ -228,10 +300,14 @@ def angle_of_folder(path: Path) -> int | None:
     return int(match["angle"]) if match is not None and int(match["angle"]) in ANGLES else None
 
 
-def index_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
-    """Stem -> file for the files of a folder with one of the suffixes; empty if there is no such folder."""
+def index_files(folder: Path, suffixes: tuple[str, ...], besides: Container[str] = ()) -> dict[str, Path]:
+    """Stem -> file for the files of a folder with one of the suffixes, ``besides`` some; empty if there is no such
+    folder.
+    """
     files: dict[str, Path] = {}
     for path in list_files(folder, suffixes):
+        if path.name in besides:
+            continue
         if path.stem in files:
             raise ambiguous(folder, f"one file called {path.stem}", files[path.stem], path)
         files[path.stem] = path

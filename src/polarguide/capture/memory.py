@@ -8,14 +8,13 @@ from pathlib import Path
 
 from polarguide.capture.formats.headers import stated_size
 from polarguide.capture.layout import Layout
-from polarguide.capture.view import ANGLES
 from polarguide.errors import PolarguideError
 from polarguide.system import free_memory
 
 GIBIBYTE = 1 << 30
 SHARE = 0.8
 """Of the free memory, that the pictures may take where nothing else was asked for."""
-# Bytes for each pixel of a view: peak, black, invalid, saturated, mask; with codes of four angles in three channels.
+# Bytes for each pixel of a view: peak, black, invalid, saturated, mask; with codes of four pictures in three channels.
 MASKS = 2 + 4
 KEPT = 4 * 3 * 2 + MASKS
 # While one view is read: what is decoded of it, its copy in linear codes, and channels apart.
@@ -89,6 +88,10 @@ def stated_pixels(layout: Layout, names: Sequence[str]) -> list[int]:
 
 
 def _largest(layout: Layout, name: str) -> int:
-    """Pixels of the largest picture of a view, as the files state; 0 where they do not."""
-    sizes = [stated_size(layout.pictures[name][angle]) for angle in ANGLES]
-    return max((size[0] * size[1] for size in sizes if size is not None), default=0)
+    """Pixels of the largest picture of a view, as the files state, with as much more for more than four pictures as
+    these take; 0 where the files state nothing.
+    """
+    paths = layout.files(name)
+    sizes = [stated_size(path) for path in paths]
+    largest = max((size[0] * size[1] for size in sizes if size is not None), default=0)
+    return max(largest, largest * len(paths) // 4)

@@ -10,6 +10,7 @@ import msgspec
 from polarguide.capture.calibration import Calibration, Sense, combined
 from polarguide.capture.view import unknown_view
 from polarguide.errors import PolarguideError
+from polarguide.optics import Mount
 from polarguide.polarizer import ANGLES
 from polarguide.records import decode
 
@@ -36,6 +37,12 @@ class _Scene(msgspec.Struct):
     refractive_index: Index | None = None
     objects: list[_Object] = []
     prepare: Any = None
+
+
+class _Polarizer(msgspec.Struct):
+    """Where ``scene.json`` says that the polarizer was."""
+
+    polarizer: Mount = "sensor"
 
 
 class _Angles(msgspec.Struct):
@@ -102,6 +109,21 @@ def refractive_index_of(path: Path, data: bytes | None) -> float | None:
     if not found or any(index != found[0] for index in found):
         return None
     return decode(found[0], Index, f"{path} (ior)", remedy=remedy)
+
+
+def mount_of(path: Path, data: bytes | None) -> Mount:
+    """Where the polarizer was: ``polarizer`` in ``scene.json``, "sensor" where it says nothing.
+
+    Args:
+        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+
+    Raises:
+        PolarguideError: it says something else than "sensor" or "filter".
+    """
+    if data is None:
+        return "sensor"
+    remedy = 'Write "sensor" for polarizers behind the lens, "filter" for a sheet before it.'
+    return decode(data, _Polarizer, path, remedy=remedy).polarizer
 
 
 def applied_calibration(path: Path, data: bytes | None) -> Calibration | None:

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unused_poses
+from polarguide.capture.exposures import FOUR
 from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.memory import check_memory, stated_size
-from polarguide.capture.metadata import held_out, refractive_index_of
+from polarguide.capture.metadata import held_out, mount_of, refractive_index_of
 from polarguide.capture.objects import objects_of
 from polarguide.capture.split import chosen_views, far_from_training
 from polarguide.capture.stored_view import StoredView, ViewFiles
@@ -102,10 +103,13 @@ def load_scene(
     tests, stray = _held_out(root / "split.json", files, layout, model, split, test_views)
     about = files.read_if_there(root / "scene.json")
     index = refractive_index_of(root / "scene.json", about)
+    mount = mount_of(root / "scene.json", about)
+    if layout.table is not None:
+        files.read(layout.table)
     for name in names:
         # Missing poses and pictures of another size are found before a picture is decoded.
         camera = model.camera(name)
-        size = stated_size(layout.pictures[name][0])
+        size = stated_size(layout.files(name)[0])
         if size is not None:
             fit_camera(camera, *size, folder=model.folder, view=name)
     check_memory(layout, names, factor=downscale, at_once=_THREADS, limit=memory, hold=hold)
@@ -123,9 +127,9 @@ def load_scene(
         )
     pictures = ViewFiles(layout, downscale, transfer, files.digests)
     posed_views = tuple(
-        item.view(camera, stored.full_scale)
+        item.view(camera, stored.full_scale, mount)
         if hold
-        else StoredView(item, camera, stored.full_scale, pictures)
+        else StoredView(item, camera, stored.full_scale, pictures, mount)
         for item, camera in zip(stored.data, stored.cameras, strict=True)
         if camera is not None
     )
@@ -220,7 +224,10 @@ def read_views(
             advance(len(data))
     largest_value = _largest_value(data)
     scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
-    measures = [checks.measure(item.codes, ~(item.invalid | item.saturated(scale))) for item in data]
+    measures = [
+        checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
+        for item in data
+    ]
     return StoredViews(tuple(data), tuple(cameras), tuple(measures), largest_value, scale)
 
 

@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
+from polarguide.capture.exposures import Exposure
 from polarguide.capture.ground_truth import read_ground_truth
 from polarguide.capture.layout import Layout
 from polarguide.capture.view import GroundTruth, View
 from polarguide.capture.view_reader import Files, ViewData, changed, read_codes
+from polarguide.optics import Mount
 
 
 class ViewFiles:
@@ -63,7 +65,7 @@ class StoredView(View):
     Args:
         data: what was read of it; its codes and ground truth are not looked at.
         camera: of the view. full_scale: as for ``ViewData.view``.
-        files: of its scene. masked: whether only its subject is to be seen.
+        files: of its scene. mount: where the polarizer was. masked: whether only its subject is to be seen.
     """
 
     _files: ViewFiles
@@ -76,6 +78,7 @@ class StoredView(View):
         camera: Camera,
         full_scale: int | None,
         files: ViewFiles,
+        mount: Mount = "sensor",
         *,
         masked: bool = False,
     ) -> None:
@@ -85,6 +88,8 @@ class StoredView(View):
             "invalid": _compact(torch.from_numpy(data.invalid)),
             "saturated": _compact(torch.from_numpy(data.saturated(full_scale))),
             "mask": None if data.mask is None else torch.from_numpy(data.mask),
+            "exposures": data.exposures,
+            "mount": mount,
             "_files": files,
             "_size": (data.size[1], data.size[0]),
             "_masked": masked,
@@ -106,8 +111,15 @@ class StoredView(View):
 
     def subject_alone(self) -> View:
         """As in ``View``."""
+        return self._but(_masked=True)
+
+    def with_exposures(self, exposures: tuple[Exposure, ...]) -> View:
+        """As in ``View``."""
+        return self._but(exposures=exposures)
+
+    def _but(self, **changed: object) -> View:
         other = object.__new__(StoredView)
-        vars(other).update({**vars(self), "_masked": True})
+        vars(other).update({**vars(self), **changed})
         return other
 
 

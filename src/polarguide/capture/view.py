@@ -9,9 +9,19 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from polarguide import optics
 from polarguide.camera import Camera
+from polarguide.capture.exposures import (
+    FOUR,
+    Exposure,
+    analyzers,
+    determine_stokes,
+    measure_radiance,
+    radiance_places,
+)
 from polarguide.capture.objects import SceneObject
 from polarguide.errors import PolarguideError
+from polarguide.optics import Mount
 from polarguide.polarizer import ANGLES as ANGLES
 
 FULL_CODE = 65535
@@ -41,20 +51,22 @@ class GroundTruth:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera pose with four pictures behind a polarizer, and masks of their pixels.
+    """One camera pose with its pictures, mostly four behind a polarizer, and masks of their pixels.
 
     Attributes:
         name: name of the view, unique in its scene.
         camera: pose and intrinsics at the size of the pictures.
-        codes: linear intensities behind the analyzer at 0, 45, 90 and 135 degrees, coded as
-            round(65535 * intensity), [4, H, W, 3] uint16, RGB. Kept coded because big captures do not fit
+        codes: linear intensities of the exposures, at 0, 45, 90 and 135 degrees unless ``exposures`` says otherwise,
+            coded as round(65535 * intensity), [K, H, W, 3] uint16, RGB. Kept coded because big captures do not fit
             into memory as floats.
         invalid: pixels that the capture marks as unusable (``invalid/<view>.png``), [H, W] bool. Metrics exclude these
             pixels and no others.
-        saturated: pixels without polarization information: one angle at full scale in any channel, or all four
+        saturated: pixels without polarization information: one angle at full scale in any channel, or all
             black; [H, W] bool. Priors and losses exclude them.
         mask: the user's foreground mask (``masks/<view>.png``), [H, W] bool, or None.
         ground_truth: or None.
+        exposures: what the K pictures are.
+        mount: where the polarizer was.
     """
 
     name: str
@@ -64,6 +76,23 @@ class View:
     saturated: Tensor
     mask: Tensor | None = None
     ground_truth: GroundTruth | None = None
+    exposures: tuple[Exposure, ...] = FOUR
+    mount: Mount = "sensor"
+
+    @property
+    def is_four(self) -> bool:
+        """Whether it has the four pictures of a polarization camera."""
+        return self.mount == "sensor" and self.exposures == FOUR
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether its pictures determine a Stokes vector at every pixel."""
+        return self.exposures == FOUR or determine_stokes(self.exposures)
+
+    @property
+    def measures_radiance(self) -> bool:
+        """Whether its pictures measure S0."""
+        return self.exposures == FOUR or measure_radiance(self.exposures)
 
     def to(self, device: torch.device) -> View:
         """The view on a device, without its ground truth; the view itself if it is already there."""
@@ -71,7 +100,20 @@ class View:
             return self
         codes, invalid, saturated = (t.to(device) for t in (self.codes, self.invalid, self.saturated))
         mask = None if self.mask is None else self.mask.to(device)
-        return View(self.name, self.camera, codes, invalid, saturated, mask)
+        return View(
+            self.name,
+            self.camera,
+            codes,
+            invalid,
+            saturated,
+            mask,
+            exposures=self.exposures,
+            mount=self.mount,
+        )
+
+    def with_exposures(self, exposures: tuple[Exposure, ...]) -> View:
+        """The view with other knowledge of its pictures."""
+        return replace(self, exposures=exposures)
 
     def subject_alone(self) -> View:
         """The view with black outside its mask, which it has to have."""
@@ -79,12 +121,51 @@ class View:
         return replace(self, codes=self.codes * self.mask.to(self.codes)[None, ..., None])
 
     def intensities(self) -> Tensor:
-        """Linear intensities in [0, 1] at 0, 45, 90, 135 degrees: [4, H, W, 3] float32."""
-        return self.codes.to(torch.float32) / FULL_CODE
+        """Linear intensities of the exposures (0, 45, 90, 135 degrees mostly) on one scale, in [0, 1] unless their
+        gains differ: [K, H, W, 3] float32.
+        """
+        intensities = self.codes.to(torch.float32) / FULL_CODE
+        gains = [exposure.gain for exposure in self.exposures]
+        if all(gain == 1 for gain in gains):
+            return intensities
+        return intensities / intensities.new_tensor(gains)[:, None, None, None]
+
+    def stokes(self) -> Tensor:
+        """Stokes vectors [3, H, W, 3] in the lens frame, by least squares.
+
+        Raises:
+            PolarguideError: the pictures do not determine them; ``is_determined`` tells before.
+        """
+        if self.is_four:
+            return optics.stokes(self.intensities())
+        if not self.is_determined:
+            raise self.undetermined("a Stokes vector")
+        places = [k for k, exposure in enumerate(self.exposures) if exposure.known]
+        rays = self.camera.rays(device=self.codes.device)
+        found = analyzers([self.exposures[k] for k in places], rays, self.mount)
+        return optics.fitted_stokes(self.intensities()[places], found)
 
     def photograph(self) -> Tensor:
-        """The mean of the four pictures: linear S0 / 2 in [0, 1], [H, W, 3] float32."""
-        return self.codes.to(torch.float32).mean(dim=0) / FULL_CODE
+        """Linear S0 / 2 in [0, 1], [H, W, 3] float32: of four pictures, their mean.
+
+        Where the pictures do not measure S0 (``measures_radiance``), it is the mean of what there is.
+        """
+        if self.is_four:
+            return self.codes.to(torch.float32).mean(dim=0) / FULL_CODE
+        if self.is_determined:
+            return self.stokes()[0] / 2
+        places = radiance_places(self.exposures)
+        return (self.intensities()[list(places)] if places else self.intensities()).mean(dim=0)
+
+    def undetermined(self, what: str) -> PolarguideError:
+        """The error that the pictures do not determine ``what``."""
+        angles = ", ".join(exposure.words for exposure in self.exposures)
+        return PolarguideError(
+            f"view {self.name}",
+            expected=f"pictures that determine {what}: at three or more angles that differ enough",
+            found=f"{len(self.exposures)} ({angles})",
+            remedy="Choose views with more pictures.",
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 from polarguide.camera import Camera
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
+from polarguide.capture.exposures import Exposure
 from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes, read_file
 from polarguide.capture.ground_truth import read_ground_truth
 from polarguide.capture.layout import Layout
-from polarguide.capture.view import ANGLES, GroundTruth, View
+from polarguide.capture.view import GroundTruth, View
 from polarguide.errors import PolarguideError
 from polarguide.files import LARGEST_FILE
+from polarguide.optics import Mount
 from polarguide.records import LARGEST_RECORD
 
 
@@ -57,7 +59,7 @@ class ViewData:
     """The pixels of one view, before the full scale of the whole capture is known.
 
     Attributes:
-        name, codes, invalid, mask, ground_truth: as in ``View``, with arrays instead of tensors.
+        name, codes, invalid, mask, ground_truth, exposures: as in ``View``, with arrays instead of tensors.
         size: width and height of the pictures as stored.
         peak: largest stored value over angles, channels and the pixels of a box, [H, W].
         black: whether some pixel of the box is 0 in all angles and channels, [H, W].
@@ -75,12 +77,13 @@ class ViewData:
     mask: NDArray[np.bool_] | None
     ground_truth: GroundTruth | None
     digests: dict[Path, str]
+    exposures: tuple[Exposure, ...]
 
     def saturated(self, scale: int | None) -> NDArray[np.bool_]:
         """``View.saturated``, given the stored value at which the capture saturates (None: it does not)."""
         return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
 
-    def view(self, camera: Camera, scale: int | None) -> View:
+    def view(self, camera: Camera, scale: int | None, mount: Mount = "sensor") -> View:
         """The view with its camera and its saturated pixels."""
         return View(
             name=self.name,
@@ -90,6 +93,8 @@ class ViewData:
             saturated=torch.from_numpy(self.saturated(scale)),
             mask=None if self.mask is None else torch.from_numpy(self.mask),
             ground_truth=self.ground_truth,
+            exposures=self.exposures,
+            mount=mount,
         )
 
 
@@ -100,7 +105,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         PolarguideError: a file is damaged, or the sizes of the files differ.
     """
     files = Files()
-    raw = _read_angles(files, layout.pictures[name])
+    raw = _read_pictures(files, layout.files(name))
     height, width = raw[0].shape[:2]
     if factor > min(height, width):
         raise PolarguideError(
@@ -130,6 +135,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         mask=None if mask is None else boxes.every(mask, factor),
         ground_truth=ground_truth,
         digests=files.digests,
+        exposures=layout.exposures(name),
     )
 
 
@@ -142,7 +148,7 @@ def read_codes(
         PolarguideError: a file has changed since: its SHA-256 is not that of ``digests``.
     """
     files = Files()
-    raw = _read_angles(files, layout.pictures[name])
+    raw = _read_pictures(files, layout.files(name))
     for path, digest in files.digests.items():
         if digests[path] != digest:
             raise changed(path)
@@ -164,11 +170,10 @@ def _codes(raw: Sequence[NDArray[Any]], transfer: str, factor: int) -> NDArray[n
     return np.stack([boxes.mean_codes(linear_codes(pixels, transfer), factor) for pixels in raw])
 
 
-def _read_angles(files: Files, paths: dict[int, Path]) -> list[NDArray[Any]]:
-    """The four stored pictures of a view, [H, W, 3] each, of one size and one depth."""
+def _read_pictures(files: Files, paths: list[Path]) -> list[NDArray[Any]]:
+    """The stored pictures of a view, [H, W, 3] each, of one size and one depth."""
     pictures: list[NDArray[Any]] = []
-    for angle in ANGLES:
-        path = paths[angle]
+    for path in paths:
         data = files.picture(path)
         if pictures:
             require_size(path, data, pictures[0].shape[:2], like=paths[0])
@@ -199,7 +204,7 @@ def _require_same(path: Path, found: tuple[int, int], size: Sequence[int], like:
             found=f"{found[0]}x{found[1]}",
             remedy="Make it anew for these pictures."
             if like is None
-            else "Export the four pictures of a view alike.",
+            else "Export the pictures of a view alike.",
         )
 
 
@@ -214,7 +219,7 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
             path,
             expected=f"{_kind(first)} like {'/'.join(first_path.parts[-2:])}",
             found=_kind(picture),
-            remedy="Export the four pictures of a view alike.",
+            remedy="Export the pictures of a view alike.",
         )
 
 

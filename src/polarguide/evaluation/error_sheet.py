@@ -55,8 +55,8 @@ class ErrorSheet:
         self._chosen = range(0, views, step)
         self._added = 0
         self._rows: list[tuple[str, dict[str, Picture]]] = []
-        # Measured and predicted Stokes vectors, and where they count: their scales depend on all views.
-        self._stokes: list[tuple[Tensor, Tensor | None, Tensor]] = []
+        # Measured (None: not known) and predicted Stokes vectors, and where they count: scales depend on all views.
+        self._stokes: list[tuple[Tensor | None, Tensor | None, Tensor]] = []
 
     def add(self, view: View, target: ViewTarget, result: RenderResult, stokes: Tensor | None) -> None:
         """Add the next view, if it is one of those that are drawn; ``stokes`` [3, H, W, 3] as it is predicted."""
@@ -77,7 +77,8 @@ class ErrorSheet:
         keep = target.valid if target.polarized is None else target.polarized
         predicted = None if stokes is None else stokes.cpu().nan_to_num()
         self._rows.append((view.name, pictures))
-        self._stokes.append((optics.stokes(view.intensities()), predicted, keep.mask.cpu()))
+        measured = view.stokes() if view.is_determined else None
+        self._stokes.append((measured, predicted, keep.mask.cpu()))
 
     def write(self, path: Path) -> None:
         """Write the sheet; nothing where no view was added."""
@@ -85,7 +86,7 @@ class ErrorSheet:
             return
         ends = {**dict.fromkeys(("final", "specular", "diffuse"), PICTURE_HIGH), "normal": NORMAL_HIGH}
         headings = dict(COLUMNS)
-        if any(predicted is not None for _, predicted, _ in self._stokes):
+        if any(measured is not None and predicted is not None for measured, predicted, _ in self._stokes):
             brightest, ends["stokes"] = self._draw_polarization()
             headings["measured"] = f"AoLP x DoLP / {brightest:g}"
         keys = [key for key in COLUMNS if any(key in pictures for _, pictures in self._rows)]
@@ -106,11 +107,13 @@ class ErrorSheet:
 
     def _draw_polarization(self) -> tuple[float, float]:
         """Add the pictures of the polarization; the DoLP that is fully bright, and the end of the errors' scale."""
-        counted = [measured[:, keep] for measured, _, keep in self._stokes]
+        counted = [measured[:, keep] for measured, _, keep in self._stokes if measured is not None]
         degrees = torch.cat([optics.dolp(optics.luminance(values)) for values in counted])
         brightest = min(max(_tenth_above(degrees), BRIGHTEST[0]), BRIGHTEST[1])
         high = _tenth_above(torch.cat([_size(values) for values in counted]))
         for (_, pictures), (measured, predicted, keep) in zip(self._rows, self._stokes, strict=True):
+            if measured is None:
+                continue
             pictures["measured"] = _polarization(measured, brightest)
             if predicted is not None:
                 pictures["predicted"] = _polarization(predicted, brightest)

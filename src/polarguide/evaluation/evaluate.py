@@ -6,6 +6,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,8 +14,10 @@ import torch
 import polarguide
 from polarguide import _native
 from polarguide.capture import View
+from polarguide.capture.view import listed
 from polarguide.evaluation.error_sheet import ERRORS_FILE, ErrorSheet
 from polarguide.evaluation.facts import SceneFacts
+from polarguide.evaluation.held_out import cross_fitted
 from polarguide.evaluation.maps import ErrorsByObject
 from polarguide.evaluation.measures import HAZE_DEPTH
 from polarguide.evaluation.mesh import mesh_scores
@@ -50,6 +53,11 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
     facts = SceneFacts.of(run.scene)
     for warning in facts.warnings:
         reporter.warn(warning)
+    fitted = [view.name for view in tests if not view.measures_radiance]
+    if fitted:
+        reporter.say(
+            f"scored behind an analyzer that is fitted on the other half of the picture: {listed(fitted)}"
+        )
     views, by_object, sheet = {}, ErrorsByObject(facts.objects), ErrorSheet(len(tests))
     with reporter.track("scoring", len(tests)) as advance:
         for view in tests:
@@ -90,6 +98,8 @@ def _score(
     target = ViewTarget.of_view(view, facts, run.model.device)
     result = run.model.render(view.camera, depth=True)
     stokes = run.model.stokes(result, view.camera)
+    if not view.measures_radiance:
+        result = replace(result, final=cross_fitted(view, result.final, stokes))
     in_front = None
     if target.depth is not None:
         in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)

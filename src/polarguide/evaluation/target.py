@@ -14,7 +14,6 @@ from torch import Tensor
 from polarguide.capture import View
 from polarguide.evaluation.facts import SceneFacts, outside
 from polarguide.evaluation.metrics import Selection, has_direction, reflective_mask, window_centers
-from polarguide.polarizer import stokes_of_four
 
 JUMP = 1.05
 """Neighboring true depths whose ratio exceeds this do not belong to one surface."""
@@ -114,8 +113,11 @@ class ViewTarget:
         """All that is known of a test view, on a device."""
         target = cls.of(view.photograph(), view.invalid, view.ground_truth, device)
         masks, known = facts.masks, view.ground_truth
-        _, s1, s2 = stokes_of_four(view.intensities().unbind(0))
-        counts = ~(view.invalid | view.saturated)
+        polarization = polarized = None
+        if view.is_determined:
+            polarization = _there(torch.cat(view.stokes()[1:].unbind(0), dim=-1), device)
+            counts = ~(view.invalid | view.saturated)
+            polarized = Selection.of(counts if masks is None else counts & masks[view.name], device)
         owner = dielectric = None
         if facts.objects and known is not None and known.object_ids is not None:
             owner = torch.full_like(known.object_ids, len(facts.objects), dtype=torch.int64)
@@ -128,8 +130,8 @@ class ViewTarget:
         alone = masks[view.name] if masks is not None and facts.object_only else None
         return replace(
             target,
-            polarization=_there(torch.cat((s1, s2), dim=-1), device),
-            polarized=Selection.of(counts if masks is None else counts & masks[view.name], device),
+            polarization=polarization,
+            polarized=polarized,
             owner=None if owner is None else owner.to(device),
             dielectric=_chosen(dielectric, device),
             mask=None if alone is None else _there(alone, device),

@@ -35,7 +35,7 @@ def collect(
         failures: last words of runs that failed, by their folders.
     """
     runs = [_run_record(comparison, run, failures.get(run.folder)) for run in plan]
-    recipes = [recipe.name for recipe in comparison.recipes]
+    recipes = [row.name for row in comparison.rows]
     record = Results(
         format=FORMAT,
         provenance={
@@ -67,8 +67,7 @@ def collect(
             for s in scenes
         ],
         recipes=[
-            {"name": recipe.name, "about": recipe.about, "data": recipe.data()}
-            for recipe in comparison.recipes
+            {"name": row.name, "about": row.about, "data": row.recipe.data()} for row in comparison.rows
         ],
         runs=runs,
         table=aggregate(runs, [scene.name for scene in scenes], recipes),
@@ -87,7 +86,7 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
             metrics["train_seconds"] = None
     return {
         "scene": run.scene.name,
-        "recipe": run.recipe.name,
+        "recipe": run.row.name,
         "seed": run.settings.seed,
         "folder": run.folder.relative_to(comparison.out).as_posix(),
         "state": "done" if metrics is not None else "failed" if failure is not None else "missing",

@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 from polarguide.errors import PolarguideError
 from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
+from polarguide.experiments.exposure_figure import write_exposure_figure
 from polarguide.experiments.jobs import STDERR, Job, run_jobs
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
@@ -43,7 +44,8 @@ def compare(
     """Train and score every recipe on every scene with every seed, each run in processes of its own.
 
     Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``;
-    paired differences go to ``differences.csv``, scores by object and material to ``parts.csv``, where there are any.
+    paired differences go to ``differences.csv``, scores by object and material to ``parts.csv``, where there are any;
+    with ``options.exposures``, ``exposures.svg`` has the scores over the number of pictures taken.
     Finished runs are found again and not repeated. KeyboardInterrupt is passed on after the runs at work have saved
     their state; the same call goes on with them.
 
@@ -78,7 +80,7 @@ def compare(
     if not scenes:
         raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
     if options.against is not None:
-        check_choice("against", options.against, [recipe.name for recipe in comparison.recipes])
+        check_choice("against", options.against, [row.name for row in comparison.rows])
     choose_backend(options.device)
     entries = scene_entries(comparison, reporter)
     plan = plan_runs(comparison, entries)
@@ -92,6 +94,7 @@ def compare(
         write_tables(comparison.out, results)
         write_report(comparison, entries, plan, results, reporter)
         write_study(comparison.out, results, {entry.name: entry.path for entry in entries})
+        write_exposure_figure(comparison, results)
     return results
 
 

@@ -5,7 +5,16 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from polarguide.options import MOST_THREADS, DeviceName, SceneOptions, check_count
+from polarguide.errors import PolarguideError
+from polarguide.options import (
+    EXPOSURES,
+    MOST_THREADS,
+    DeviceName,
+    Exposures,
+    SceneOptions,
+    check_choice,
+    check_count,
+)
 
 
 @dataclass(frozen=True)
@@ -20,6 +29,10 @@ class CompareOptions(SceneOptions):
         report_views: Test views of each scene in the report; 0 leaves the pictures out.
         device: What to compute on.
         against: One of the recipes: tables have the difference of every other one to it.
+        exposures: A row for each: as if a scene with four pictures of each view had been captured with four; three (0,
+            60, 120 degrees); two at right angles; one; one at an unknown angle; mixed, four of every fourth view and
+            the rest without a filter; sparse, every fourth view alone; none, all without a filter, and without any
+            polarization in the recipe.
     """
 
     seeds: int = 1
@@ -29,6 +42,7 @@ class CompareOptions(SceneOptions):
     report_views: int = 3
     device: DeviceName = "auto"
     against: str | None = None
+    exposures: tuple[Exposures, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -36,6 +50,13 @@ class CompareOptions(SceneOptions):
         check_count("jobs", self.jobs, 0, MOST_THREADS)
         check_count("threads", self.threads, 1, MOST_THREADS)
         check_count("report_views", self.report_views, 0)
+        for name in self.exposures:
+            check_choice("exposures", name, EXPOSURES)
+        if len(set(self.exposures)) < len(self.exposures):
+            found = " ".join(self.exposures)
+            raise PolarguideError(
+                "exposures", expected="every word once", found=found, remedy="Name each once."
+            )
 
     @property
     def parallel(self) -> int:

@@ -22,8 +22,9 @@ from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import model_digest, scoring_digest, training_digest
 from polarguide.experiments.options import CompareOptions
-from polarguide.options import SceneOptions
+from polarguide.options import Exposures, SceneOptions
 from polarguide.progress import SILENT, Reporter
+from polarguide.recipes.registry import ablations_of
 from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration
 from polarguide.runs.opened import read_scene
 from polarguide.training.recipe import Recipe
@@ -34,6 +35,24 @@ RUNS = "runs"
 BLACK = 0.002
 """Share of full scale under which a pixel is black."""
 KEY_DIGITS = 10
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """What a row of the tables is: a recipe, and the pictures that it gets.
+
+    Attributes:
+        name: as the tables and the run folders call it.
+    """
+
+    name: str
+    recipe: Recipe
+    exposures: Exposures = "captured"
+
+    @property
+    def about(self) -> str:
+        """In one line."""
+        return self.recipe.about if self.name == self.recipe.name else f"{self.recipe.name}, {self.exposures}"
 
 
 @dataclass(frozen=True)
@@ -57,6 +76,18 @@ class Comparison:
     seeds_of: Mapping[str, int] = field(default_factory=dict)
     asked: str = ""
 
+    @property
+    def rows(self) -> tuple[TableRow, ...]:
+        """What the tables compare, in their order."""
+        words, recipes = self.options.exposures, self.recipes
+        if not words:
+            return tuple(TableRow(r.name, r, self.settings.exposures) for r in recipes)
+        return tuple(
+            TableRow(word if len(recipes) == 1 else f"{recipe.name} {word}", _for(recipe, word), word)
+            for recipe in recipes
+            for word in words
+        )
+
     def seeds(self, recipe: Recipe) -> range:
         """The seeds of a recipe."""
         first = self.settings.seed
@@ -74,6 +105,7 @@ class Comparison:
         words += ["--downscale", str(options.downscale), "--transfer", options.transfer]
         words += ["--refractive-index", str(settings.refractive_index)]
         words += ["--background", settings.background, "--split", options.split]
+        words += ["--exposures", *options.exposures] if options.exposures else []
         return shlex.join(words)
 
 
@@ -91,10 +123,10 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One training: a scene, a recipe and a seed."""
+    """One training: a scene, a row of the tables with its recipe, and a seed."""
 
     scene: SceneEntry
-    recipe: Recipe
+    row: TableRow
     settings: TrainSettings
     reading: SceneOptions
     folder: Path
@@ -102,7 +134,12 @@ class PlannedRun:
     @property
     def label(self) -> str:
         """What messages call it."""
-        return f"{self.scene.name}, {self.recipe.name}, seed {self.settings.seed}"
+        return f"{self.scene.name}, {self.row.name}, seed {self.settings.seed}"
+
+    @property
+    def recipe(self) -> Recipe:
+        """The method."""
+        return self.row.recipe
 
     def state(self) -> State:
         """How far it is, by what its folder holds."""
@@ -177,23 +214,36 @@ def black_share(view: View) -> float:
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:
     """All runs, scene by scene; within a scene seed by seed, so that first results compare all recipes."""
-    every = {recipe.name: comparison.seeds(recipe) for recipe in comparison.recipes}
+    every = {row.name: comparison.seeds(row.recipe) for row in comparison.rows}
     return [
-        _planned(comparison, scene, recipe, seed)
+        _planned(comparison, scene, row, seed)
         for scene in scenes
         for seed in sorted(set().union(*every.values()))
-        for recipe in comparison.recipes
-        if seed in every[recipe.name]
+        for row in comparison.rows
+        if seed in every[row.name]
     ]
 
 
-def _planned(comparison: Comparison, scene: SceneEntry, recipe: Recipe, seed: int) -> PlannedRun:
-    settings, options = replace(comparison.settings, seed=seed), comparison.options
+def _for(recipe: Recipe, exposures: Exposures) -> Recipe:
+    """What is trained on such pictures: without any of polarization, the recipe without its terms, if there is one."""
+    if exposures != "none":
+        return recipe
+    name = f"{recipe.name}:unpolarized"
+    return next((found for found in ablations_of(recipe.name) if found.name == name), recipe)
+
+
+def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int) -> PlannedRun:
+    recipe, options = row.recipe, comparison.options
+    settings = replace(comparison.settings, seed=seed, exposures=row.exposures)
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
     code = f"{__version__} {training_digest()}{model_digest(type(recipe.shading))}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
-    folder = comparison.out / RUNS / scene.name / recipe.name.replace(":", "__") / f"{seed}-{key}"
-    return PlannedRun(scene, recipe, settings, reading, folder)
+    folder = comparison.out / RUNS / scene.name / _folder_name(row.name) / f"{seed}-{key}"
+    return PlannedRun(scene, row, settings, reading, folder)
+
+
+def _folder_name(name: str) -> str:
+    return name.replace(":", "__").replace(" ", "-")
 
 
 def run_key(

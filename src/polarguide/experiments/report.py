@@ -79,13 +79,13 @@ def write_report(
     sheets: dict[str, list[tuple[str, str]]] = {}
     for scene in scenes:
         shown = _first_finished(comparison, plan, scene)
-        drawn_errors = [(run.recipe.name, run.folder / ERROR_SHEET) for run in shown]
+        drawn_errors = [(run.row.name, run.folder / ERROR_SHEET) for run in shown]
         sheets[scene.name] = [
             (name, path.relative_to(comparison.out).as_posix())
             for name, path in drawn_errors
             if path.exists()
         ]
-        drawn = (read_curve(run.folder, run.recipe.name) for run in shown)
+        drawn = (read_curve(run.folder, run.row.name) for run in shown)
         curves[scene.name] = [curve for curve in drawn if curve is not None]
         if comparison.options.report_views and shown:
             names = chosen_views(scene.test_views, comparison.options.report_views)
@@ -108,9 +108,9 @@ def _first_finished(
     """For every recipe the finished run with the lowest seed."""
     found: dict[str, PlannedRun] = {}
     for run in plan:
-        if run.scene.name == scene.name and run.recipe.name not in found and run.state() == "done":
-            found[run.recipe.name] = run
-    return [found[recipe.name] for recipe in comparison.recipes if recipe.name in found]
+        if run.scene.name == scene.name and run.row.name not in found and run.state() == "done":
+            found[run.row.name] = run
+    return [found[row.name] for row in comparison.rows if row.name in found]
 
 
 def _scene_views(
@@ -123,7 +123,10 @@ def _scene_views(
     for name in names:
         view = scene.view(name)
         tiles = [_ground_truth_tile(view)]
-        tiles += [_tile(run, view, s.get(name, {})) for run, s in zip(opened, scores, strict=True)]
+        tiles += [
+            _tile(run.row.name, model, view, s.get(name, {}))
+            for run, model, s in zip(runs, opened, scores, strict=True)
+        ]
         yield embed(entry.name, name, tiles, limit)
 
 
@@ -132,7 +135,7 @@ def _ground_truth_tile(view: View) -> Tile:
     return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
 
 
-def _tile(run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
+def _tile(row: str, run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
     """What one run shows of one view."""
     result = run.model.render(view.camera).to("cpu")
     pictures: dict[str, Picture] = {}
@@ -151,7 +154,7 @@ def _tile(run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Til
         for layer, key in LAYER_METRICS.items()
         if layer in pictures and (value := scores.get(key)) is not None
     }
-    return Tile(run.recipe.name, pictures, lines)
+    return Tile(row, pictures, lines)
 
 
 def _angles_picture(angles: Tensor, mask: Tensor | None) -> Picture:

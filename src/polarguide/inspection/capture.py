@@ -17,7 +17,7 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.pictures import decode_picture, read_file
-from polarguide.capture.layout import Layout, find_layout, select_views
+from polarguide.capture.layout import Layout, find_layout, require_four, select_views
 from polarguide.capture.metadata import applied_calibration, refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
@@ -116,6 +116,7 @@ def read_capture(
     check_transfer(transfer)
     root = Path(path)
     layout = find_layout(root)
+    require_four(layout, "inspection")
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"

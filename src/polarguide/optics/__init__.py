@@ -4,6 +4,7 @@ They are differentiable, and value and gradient stay finite at every degenerate 
 polarization, normal and grazing incidence).
 """
 
+from polarguide.optics.analyzers import Mount, analyzer, filter_analyzer, fitted_stokes
 from polarguide.optics.chromatic import ChromaticNormals, chromatic_normals
 from polarguide.optics.frames import azimuth, lens_frame, normal_from_angles, zenith
 from polarguide.optics.fresnel import (
@@ -46,9 +47,11 @@ __all__ = [
     "Candidates",
     "ChromaticNormals",
     "Disambiguated",
+    "Mount",
     "PhysicalCandidates",
     "Separation",
     "Uncertainty",
+    "analyzer",
     "aolp",
     "azimuth",
     "brewster",
@@ -61,6 +64,8 @@ __all__ = [
     "dolp_noise",
     "dolp_slopes",
     "exact_separation",
+    "filter_analyzer",
+    "fitted_stokes",
     "intensity",
     "intensity_noise",
     "lens_frame",

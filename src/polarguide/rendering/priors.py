@@ -49,7 +49,8 @@ def write_priors(
         The path of the contact sheet.
 
     Raises:
-        PolarguideError: there is no such view, or the run was trained at another size.
+        PolarguideError: there is no such view, its pictures do not determine its polarization, or the run was trained
+            at another size.
     """
     check_finite("refractive_index", refractive_index, 1.0001, 4.0)
     check_finite("threshold", threshold, 0.0, 1.0)
@@ -63,6 +64,9 @@ def write_priors(
             remedy="Give the same factor.",
         )
     chosen = select_views(scene, views)
+    for view in chosen:
+        if not view.is_determined:
+            raise view.undetermined("polarization at every pixel")
     make_folder(out := Path(out))
     rows: list[list[Picture]] = []
     labels: list[str] = []
@@ -86,7 +90,7 @@ def write_priors(
 def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: float) -> dict[str, Picture]:
     """All prior pictures of one view, by the name their file gets."""
     rays = view.camera.rays()
-    stokes = optics.stokes(view.intensities())
+    stokes = view.stokes()
     luminance = optics.luminance(stokes)
     dolp, aolp = optics.dolp(luminance), optics.aolp(luminance)
     zenith = optics.diffuse_zenith(dolp, index)

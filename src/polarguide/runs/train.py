@@ -15,12 +15,14 @@ import torch
 from polarguide.capture import Scene
 from polarguide.capture.background import without_surroundings
 from polarguide.capture.layout import refuse_scene
+from polarguide.capture.variants import captured_as
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
 from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
+from polarguide.runs.angles import report_polarizers
 from polarguide.runs.defaults import most_gaussians, with_defaults
 from polarguide.runs.folder import (
     CHECKPOINT,
@@ -111,7 +113,10 @@ def train(
         backend = backend_of(ranks, session.device, reporter)
         earlier = RunConfiguration.load(out).settings if resume else None
         plan = _planned(scene, chosen, settings, earlier, reading)
-        loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=plan.hold)
+        # Other pictures are made of those that are held.
+        hold = plan.hold or settings.exposures != "captured"
+        whole = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=hold)
+        loaded = captured_as(whole, settings.exposures)
         if settings.background == "masked":
             loaded = without_surroundings(loaded)
         _check_scene(loaded)
@@ -135,6 +140,11 @@ def train(
         trainer = Trainer(loaded, chosen, settings, backend, state, ranks, store)
         if trainer.black and settings.background == "auto":
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
+        if trainer.polarizers.ignored:
+            reporter.warn(
+                f"the recipe {chosen.name} has no term for single pictures through a filter: it takes them for "
+                "photographs without one."
+            )
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
@@ -148,9 +158,10 @@ def train(
         if expected is not None:
             reporter.say(expected.truth(seconds))
         if leads:
+            report_polarizers(out, loaded, trainer.polarizers, reporter)
             centers = torch.stack([view.camera.center for view in loaded.views])
             write_run_ply(out / PLY, model.state, model.shading, centers)
-    return OpenedRun(out, configuration, chosen, model, scene=loaded, reporter=reporter)
+    return OpenedRun(out, configuration, chosen, model, scene=whole, reporter=reporter)
 
 
 class _Loop:

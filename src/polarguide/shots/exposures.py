@@ -15,6 +15,7 @@ from polarguide.capture.layout import (
     describe_contents,
     find_layout,
     list_files,
+    require_four,
 )
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
@@ -196,6 +197,7 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
     folders = angle_folders(root)
     if (root / "polar").is_dir() or (len(folders) == len(ANGLES) and (root / "sparse").is_dir()):
         layout = find_layout(root)
+        require_four(layout, "one shot")
         return [ExposureSet(name, "scene", layout.pictures[name], root, name) for name in layout.names]
     if options.sensor is not None and not folders:
         files = list_files(root, RAW_SUFFIXES)

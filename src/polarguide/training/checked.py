@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from polarguide.training.polarizers import COLUMNS
 from polarguide.training.recipe import Recipe
 
 LARGEST = {"means": 1e12, "log_scales": 1e4}
@@ -50,6 +51,9 @@ def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
             known.add(f"frozen.{name}")
     _check_statistics(tensors, count)
     _check_scalars(tensors)
+    if "angles" in tensors:
+        _check_angles(tensors["angles"])
+        known.add("angles")
     strangers = sorted(tensors.keys() - known)
     if strangers:
         raise ValueError(f"{strangers[0][:80]}, which is not known")
@@ -121,6 +125,18 @@ def _check_statistics(tensors: Mapping[str, Tensor], count: int) -> None:
         values = _shaped(tensors, name, shape)
         if values.numel() and float(values.min()) < 0:
             raise ValueError(f"{name} with negative values")
+
+
+def _check_angles(values: Tensor) -> None:
+    """Check what was found of polarizers: rows of a float64 table, as ``Polarizers`` leaves it."""
+    if values.dtype != torch.float64 or values.ndim != 2 or values.shape[1] != COLUMNS:
+        raise ValueError(
+            f"angles of shape {list(values.shape)}, {values.dtype}, not [P, {COLUMNS}], torch.float64"
+        )
+    if not bool(torch.isfinite(values).all()) or (values.numel() and float(values.min()) < 0):
+        raise ValueError("angles with values that are negative or not finite")
+    if values.numel() and float(values[:, 1].min()) <= 0:
+        raise ValueError("angles with gains that are not positive")
 
 
 def _check_scalars(tensors: Mapping[str, Tensor]) -> None:

@@ -21,6 +21,7 @@ from polarguide.training.native_terms import (
     fit_native,
     pixel_terms,
 )
+from polarguide.training.partial import PartialView, partial_terms
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Weights
@@ -155,6 +156,7 @@ def step_loss(
     extent: float,
     camera: Camera | None = None,
     empty: Tensor | None = None,
+    partial: PartialView | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The weighted sum of a stage's terms, and its photometric term alone (for the display).
 
@@ -169,12 +171,25 @@ def step_loss(
         log_scales: [N, 3] of the Gaussians. extent: of the scene.
         camera: of the view; needed where a weight asks for the normals of the depth.
         empty: [H, W] 1 where the view shows nothing; None: where that is not known.
+        partial: what a view measured that does not determine the Stokes vector, in place of ``shown``.
     """
-    photometric = photometric_loss(result.final, shown, valid, ssim_weight)
-    total = weights.photometric * photometric
     if result.held is not None:
         specular, diffuse = result.held
         result = replace(result, specular=specular, diffuse=diffuse)
+    if partial is None:
+        photometric = photometric_loss(result.final, shown, valid, ssim_weight)
+        total = weights.photometric * photometric
+    else:
+        assert camera is not None
+        total, photometric = partial_terms(
+            result,
+            partial,
+            weights,
+            valid=valid,
+            ssim_weight=ssim_weight,
+            shading=shading,
+            camera=camera,
+        )
     if priors is not None:
         total = total + _layer_terms(result, weights, priors, ssim_weight)
     if weights.flatness and result.radii is not None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.training.priors import ViewPriors
-from polarguide.training.recipe import Weights
+from polarguide.training.recipe import Priors, Weights
 
 FULL = 32767
 
@@ -27,8 +27,10 @@ _READ = {
     "azimuth": ("plane", "weight"),
     "chromatic": ("chromatic", "chromatic_weight"),
     "stokes": ("stokes", "stokes_weight"),
-    "consistency": ("weight",),
+    "consistency": ("surface",),
 }
+# Of these, what is made of S0, which is not kept.
+_MADE = {"stokes_weight", "surface"}
 _FIELDS = {name for fields in _READ.values() for name in fields}
 
 
@@ -86,18 +88,18 @@ def pack_priors(priors: ViewPriors, fields: Collection[str]) -> Entry:
     for name, values in vars(priors).items():
         if isinstance(values, Tensor) and (name in fields or name not in _FIELDS | {"reliable"}):
             entry[name] = packed(values[1:]) if name == "stokes" else packed(values)
-    if "stokes_weight" in fields:
-        entry["stokes_weight"] = packed(priors.stokes_weight)
+    for name in _MADE & set(fields):
+        entry[name] = packed(getattr(priors, name))
     if priors.candidates is not None:
         entry.pop("normal", None)  # each step chooses
     return entry
 
 
-def unpack_priors(entry: Entry, camera: Camera) -> ViewPriors:
+def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
     """The priors again; what was not kept is not a number, in its shape.
 
     Args:
-        entry: by ``pack_priors``. camera: of the view.
+        entry: by ``pack_priors``. camera: of the view. settings: that they were computed with.
     """
     values = {name: unpacked(kept) for name, kept in entry.items()}
     device = next(iter(values.values())).device
@@ -107,14 +109,13 @@ def unpack_priors(entry: Entry, camera: Camera) -> ViewPriors:
         values.setdefault(name, nothing.expand(*size, 3))
     for name in ("separated", "weight", "chromatic_weight", "reliable"):
         values.setdefault(name, nothing.expand(size))
-    light = values.pop("stokes_weight", None)
+    made = {name: values.pop(name) for name in _MADE & values.keys()}
     measured = values.pop("stokes", None)
     stokes = (
         nothing.expand(3, *size, 3)
         if measured is None
         else torch.nn.functional.pad(measured, (0, 0, 0, 0, 0, 0, 1, 0), value=torch.nan)
     )
-    priors = ViewPriors(camera=camera, stokes=stokes, **values)
-    if light is not None:
-        vars(priors)["stokes_weight"] = light  # it is cached there; S0, of which it is made, is not kept
+    priors = ViewPriors(camera=camera, stokes=stokes, settings=settings, **values)
+    vars(priors).update(made)  # they are cached there
     return priors

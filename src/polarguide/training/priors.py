@@ -16,6 +16,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture import View
+from polarguide.capture.exposures import FOUR
 from polarguide.color import srgb_encode
 from polarguide.training.recipe import Candidates, Priors
 from polarguide.vectors import dot, unit
@@ -86,6 +87,8 @@ class ViewPriors:
     @cached_property
     def surface(self) -> Tensor:
         """[H, W] weight of the agreement of normals and depth, in [0, 1]."""
+        if not self.settings.bright:
+            return self.weight
         shown = optics.luminance(self.stokes)[0] / 2
         return torch.maximum(self.weight, (shown / self.settings.bright).clamp(0, 1))
 
@@ -112,13 +115,12 @@ def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
     Args:
         view: the capture; its device does the work. settings: of the priors. refractive_index: of all surfaces.
     """
-    intensities = view.intensities()
-    stokes = optics.stokes(intensities)
+    stokes = view.stokes()
     usable = optics.polarization_mask(
         optics.luminance(stokes),
         threshold=settings.threshold,
         invalid=view.invalid,
-        noise_sigma=optics.intensity_noise(intensities.mean(dim=-1)) if settings.snr else 0.0,
+        noise_sigma=_noise(view) if settings.snr else 0.0,
         snr=settings.snr,
         saturated=view.saturated,
     )
@@ -145,7 +147,7 @@ def view_priors(
     """Compute the priors of one view.
 
     Args:
-        view: the capture.
+        view: the capture; its pictures have to determine the Stokes vector.
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
         refractive_index: of all surfaces.
@@ -154,7 +156,7 @@ def view_priors(
     view = view.to(normal.device)
     rays = view.camera.rays(device=normal.device)
     usable, *found = known or unguided(view, settings, refractive_index)
-    stokes = optics.stokes(view.intensities())
+    stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide, shown = guide_normals(view.camera.to_camera(normal), rays)
     nearest_to = guide
@@ -200,6 +202,13 @@ def view_priors(
 
 def _total(weight: Tensor, share: float) -> float:
     return max(1.0, float(weight.sum()), share * weight.numel())
+
+
+def _noise(view: View) -> Tensor | float:
+    """Standard deviation [H, W] of the noise of one of the four intensities; 0 for other pictures: three leave nothing
+    to read it from.
+    """
+    return optics.intensity_noise(view.intensities().mean(dim=-1)) if view.exposures == FOUR else 0.0
 
 
 def _candidates(

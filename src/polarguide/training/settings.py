@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from polarguide.errors import PolarguideError
-from polarguide.options import check_choice, check_count
+from polarguide.options import EXPOSURES, Exposures, check_choice, check_count
 
 MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
 Background = Literal["auto", "scene", "black", "masked"]
@@ -35,6 +35,8 @@ class TrainSettings:
             nothing (the subject in masks/ alone is read); auto takes black where the edges of the pictures are.
         gaussians: Most Gaussians that there may be, each of which takes 4 kB; 0 takes one for 20 pixels of all training
             views, 400,000 at most (or what the run to resume took).
+        exposures: Which pictures of a scene with four to train on, as if no others had been taken: captured, all that
+            there are. See compare.
     """
 
     steps: int = 5000
@@ -43,6 +45,7 @@ class TrainSettings:
     views_per_step: int = 1
     background: Background = "auto"
     gaussians: int = 0
+    exposures: Exposures = "captured"
 
     def __post_init__(self) -> None:
         check_count("steps", self.steps, 0)
@@ -50,6 +53,7 @@ class TrainSettings:
         check_count("views_per_step", self.views_per_step, 0, MOST_VIEWS)
         check_count("seed", self.seed, 0, MOST_SEEDS)
         check_choice("background", self.background, BACKGROUNDS)
+        check_choice("exposures", self.exposures, EXPOSURES)
         if not 1.0 < self.refractive_index < 4.0:
             raise PolarguideError(
                 "refractive_index",

@@ -56,6 +56,7 @@ class TrainingState:
         statistics: of the density control.
         frozen: copy of the Gaussians from which the present priors were computed; None before the first refresh.
         opacity_frozen_until: first step at which opacities train again (after a normal propagation).
+        angles: what was found of polarizers, see ``Polarizers.table``; None: nothing yet.
     """
 
     step: int
@@ -64,6 +65,7 @@ class TrainingState:
     statistics: DensityStatistics
     frozen: dict[str, Tensor] | None = None
     opacity_frozen_until: int = 0
+    angles: Tensor | None = None
 
     @property
     def light(self) -> dict[str, Tensor]:
@@ -79,6 +81,8 @@ class TrainingState:
         out["statistics.seen"] = self.statistics.seen
         if self.frozen is not None:
             out.update({f"frozen.{name}": t for name, t in self.frozen.items()})
+        if self.angles is not None:
+            out["angles"] = self.angles
         out["scalars"] = torch.tensor([self.step, self.opacity_frozen_until], dtype=torch.int64)
         return out
 
@@ -92,7 +96,8 @@ class TrainingState:
         frozen = {key[7:]: value for key, value in tensors.items() if key.startswith("frozen.")}
         # The first checkpoints had a third.
         step, frozen_until = (int(x) for x in tensors["scalars"][:2])
-        return cls(step, gaussians, environment, statistics, frozen or None, frozen_until)
+        angles = tensors["angles"].cpu() if "angles" in tensors else None
+        return cls(step, gaussians, environment, statistics, frozen or None, frozen_until, angles)
 
 
 def seeded(*numbers: int) -> torch.Generator:

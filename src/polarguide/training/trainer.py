@@ -36,6 +36,8 @@ from polarguide.training.packing import (
     unpack_priors,
     unpacked,
 )
+from polarguide.training.partial import PartialView
+from polarguide.training.polarizers import Polarizers
 from polarguide.training.priors import Unguided, ViewPriors, unguided, view_priors
 from polarguide.training.recipe import Action, Recipe, Stage
 from polarguide.training.schedule import Schedule
@@ -49,12 +51,14 @@ ENOUGH_VIEWS = 12
 
 class _Shown(NamedTuple):
     """A training view's photograph [H, W, 3] as shown, 1 where it counts [H, W] (None: everywhere), and 1 where it
-    shows nothing [H, W] (None: where that is not known).
+    shows nothing [H, W] (None: where that is not known). And what was measured
+    where that does not determine the Stokes vector.
     """
 
     picture: Tensor
     valid: Tensor | None
     empty: Tensor | None
+    partial: PartialView | None
 
 
 def is_black(scene: Scene, settings: TrainSettings) -> bool:
@@ -81,6 +85,7 @@ class Trainer:
     Attributes:
         shading: the recipe's, for the run's refractive index.
         black: whether nothing is behind the subject.
+        polarizers: what is found out about those whose angle is not known.
         whole: whether the state is one between two steps; an exception may leave it in the middle of a change.
     """
 
@@ -103,6 +108,7 @@ class Trainer:
         self.state = state or first_state(
             scene, recipe, settings, backend.device, surroundings=not self.black
         )
+        self.polarizers = Polarizers(scene, recipe, settings.steps, self.state.angles)
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
         centers = torch.stack([view.camera.center for view in scene.train_views])
@@ -113,6 +119,7 @@ class Trainer:
         empty = free_space(scene.points, [view.camera for view in scene.train_views])
         self._empty = empty.to(self._device)
         self._store = store or ViewStore()
+        self._partial: dict[str, PartialView] = {}
 
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
         """Train until the last step (or ``until``), reporting each step."""
@@ -123,7 +130,9 @@ class Trainer:
         """One optimizer step."""
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
-        self.whole = not position.actions
+        self.whole = not (position.actions or self.polarizers.due(state.step))
+        if self.polarizers.due(state.step):
+            self._fit_polarizers()
         for action in position.actions:
             self._act(action)
         mine = self.ranks.slots(views)
@@ -205,6 +214,7 @@ class Trainer:
             extent=self._extent,
             camera=view.camera,
             empty=shown.empty,
+            partial=shown.partial,
         )
         loss.backward()
         gradient = statistic.gradient if statistic else None
@@ -250,6 +260,27 @@ class Trainer:
         if state.environment is not None:
             state.environment.step()
 
+    @torch.no_grad()
+    def _fit_polarizers(self) -> None:
+        """Find the angles of pictures from the present state."""
+        state = self.state
+
+        def predicted(view: View) -> Tensor:
+            degree = self.schedule.sh_degree(state.step)
+            rasterize, shading = self.backend.rasterize, self.shading
+            result = render(
+                state.gaussians, view.camera, rasterize, sh_degree=degree, shading=shading, light=state.light
+            )
+            return shading.predicted_stokes(result, view.camera)
+
+        table = self.polarizers.fit(predicted).to(self._device)
+        self.ranks.broadcast(table)
+        state.angles = table.cpu()
+        for name in self.polarizers.take(state.angles):
+            self._partial.pop(name, None)
+            for kind in ("shown", "unguided", "priors"):
+                self._store.drop(kind, name)
+
     def _act(self, action: Action) -> None:
         if action == "reset_opacity":
             reset_opacity(self.state, self.shading)
@@ -274,7 +305,7 @@ class Trainer:
         views = self.scene.train_views
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
-        return views[int(order[place])]
+        return self.polarizers.believed(views[int(order[place])])
 
     def _shown_photograph(self, view: View) -> _Shown:
         def make() -> Entry:
@@ -286,11 +317,16 @@ class Trainer:
             return entry
 
         kept = self._store.get("shown", view.name, make)
-        masks = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
-        return _Shown(unpacked(kept["picture"]), *masks)
+        valid, empty = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
+        if view.is_determined:
+            return _Shown(unpacked(kept["picture"]), valid, empty, None)
+        if view.name not in self._partial:
+            self._partial[view.name] = PartialView.of(view, self._device)
+        partial = self._partial[view.name]
+        return _Shown(partial.shown, valid, empty, partial)
 
     def _priors_of(self, view: View, stage: Stage) -> ViewPriors | None:
-        if not stage.weights.priors:
+        if not stage.weights.priors or not view.is_determined:
             return None
         if self.state.frozen is None:
             self._act("refresh_priors")
@@ -299,7 +335,7 @@ class Trainer:
         if not holds(entry, fields):  # the stage reads more than the one before
             self._store.drop("priors", view.name)
             entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields))
-        return unpack_priors(entry, view.camera)
+        return unpack_priors(entry, view.camera, self.recipe.priors)
 
     def _new_priors(self, view: View, fields: frozenset[str]) -> Entry:
         assert self.state.frozen is not None

@@ -9,7 +9,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
-from polarguide.optics import aolp, dolp, luminance, stokes
+from polarguide.optics import aolp, dolp, luminance
 from polarguide.presentation import Crop, Presentation, Vector, balanced
 from polarguide.rendering.picking import SurfacePoint, surface_at
 from polarguide.scene_frame import SceneFrame
@@ -22,6 +22,8 @@ from polarguide.visualization.layers import RADIANCE, depth_range, layer_picture
 
 MEASURED = ("photograph", "DoLP", "AoLP", "error")
 """Layers that only a photograph's pose has."""
+POLARIZED = ("DoLP", "AoLP")
+"""Those of them that need pictures which determine the polarization."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class Painter:
             uint8 [H, W, 3] of the camera's size; None where there is no such layer.
         """
         layer = appearance.layer
-        if layer in MEASURED and view is None:
+        if layer in MEASURED and (view is None or (layer in POLARIZED and not view.is_determined)):
             return None
         size = camera.width, camera.height
         if view is None:
@@ -138,7 +140,7 @@ class Painter:
         if appearance.layer == "error":
             final = self._result(shown, view.camera, appearance).final
             return figures.error_to_rgb(final * brighter, view.photograph() * brighter)
-        gray = luminance(stokes(view.intensities()))
+        gray = luminance(view.stokes())
         if appearance.layer == "DoLP":
             return figures.dolp_to_rgb(dolp(gray), DOLP_HIGH)
         return figures.aolp_to_rgb(aolp(gray), dolp(gray) / AOLP_FULL_DOLP)

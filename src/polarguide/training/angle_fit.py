@@ -1,0 +1,111 @@
+"""The angle and the gain of a picture behind a polarizer, in closed form from predicted Stokes vectors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.optics import Mount
+
+ROUNDS = 6
+"""Reweightings on the way from least squares to least absolute differences."""
+SOFT = 0.001
+"""Difference of intensities under which one counts no more for being smaller."""
+FLOOR = 0.02
+"""S0 under which a pixel counts no more for being darker."""
+BLOCK = 16
+"""Side of the squares of pixels whose errors may depend on each other."""
+
+
+@dataclass(frozen=True)
+class FittedAngle:
+    """What a picture says about its polarizer.
+
+    Attributes:
+        angle: degrees in [0, 180), as ``Exposure.angle``.
+        gain: brightness over the predicted one.
+        certainty: how much of the predicted polarization shows in the picture: 1 behind a polarizer, 0 without one.
+        spread: standard deviation of the angle, degrees; at most 90.
+        doubt: standard deviation of the certainty, at most 1.
+    """
+
+    angle: float
+    gain: float
+    certainty: float
+    spread: float
+    doubt: float
+
+
+def fit_angle(
+    intensity: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount
+) -> FittedAngle | None:
+    """Fit ``I = (g S0 + x S1 + y S2) / 2`` with g the gain and (x, y) = g (cos 2t, sin 2t) of the angle t.
+
+    Least absolute differences, by least squares with new weights in each of a few rounds, so that what the prediction
+    has not explained yet does not pull at the angle, over the square of S0: what a prediction lacks grows with the
+    light, and what is dark is polarized most. Of a filter before the lens, whose analyzer depends on the pixel,
+    (x, y) turns that of the last round.
+
+    Args:
+        intensity: [H, W, 3] linear. stokes: [3, H, W, 3] as predicted. weight: [H, W], 0 where nothing was measured.
+        rays: [H, W, 3] unit, camera axes. mount: where the polarizer was.
+
+    Returns:
+        None where there is no polarization to tell an angle by.
+    """
+    flat = (weight / (stokes[0].mean(dim=-1).clamp(min=0) + FLOOR) ** 2)[..., None].expand_as(intensity)
+    plain, y = flat.reshape(-1).double(), intensity.reshape(-1).double()
+    s0, s1, s2 = (part.reshape(-1).double() / 2 for part in stokes)
+    angle, weights = 0.0, plain
+    solution, columns = torch.zeros(3, dtype=torch.float64), torch.stack((s0, s1, s2))
+    for turn in range(ROUNDS):
+        if mount == "filter":
+            cosine, sine = (
+                part[..., None].expand_as(intensity).reshape(-1).double()
+                for part in optics.filter_analyzer(angle, rays).unbind(0)
+            )
+            columns = torch.stack((s0, s1 * cosine + s2 * sine, s2 * cosine - s1 * sine))
+        moments = (columns * weights) @ columns.T
+        if not _solvable(moments):
+            return None
+        solution = torch.linalg.solve(moments, (columns * weights) @ y)
+        if mount == "filter":
+            angle += math.atan2(float(solution[2]), float(solution[1])) / 2
+        if turn < ROUNDS - 1:
+            weights = plain / ((y - solution @ columns).abs() + SOFT)
+    gain, x, y2 = (float(value) for value in solution)
+    if mount == "sensor":
+        angle = math.atan2(y2, x) / 2
+    length = math.hypot(x, y2)
+    if gain <= 0 or length == 0:
+        return None
+    covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
+    if mount == "filter":  # turned into the last round's analyzer, which is all but along the first axis
+        x, y2 = length, 0.0
+    across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
+    spread = math.degrees(math.sqrt(max(0.0, float(across @ covariance @ across))) / length / 2)
+    doubt = math.sqrt(max(0.0, float(torch.linalg.eigvalsh(covariance[1:, 1:])[-1]))) / gain
+    certainty = length / gain
+    return FittedAngle(math.degrees(angle) % 180.0, gain, certainty, min(spread, 90.0), min(doubt, 1.0))
+
+
+def _solvable(moments: Tensor) -> bool:
+    values = torch.linalg.eigvalsh(moments)
+    return bool(torch.isfinite(values).all()) and float(values[0]) > 1e-9 * max(float(values[-1]), 1e-30)
+
+
+def _covariance(columns: Tensor, weights: Tensor, residuals: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Covariance [3, 3] of a solution by least absolute differences: the usual sandwich, with the density of the
+    residuals at zero from those under their median, and errors that may depend on each other within ``BLOCK``.
+    """
+    width = residuals[weights > 0].abs().median().clamp(min=1e-9)
+    slope = (columns * (weights * (residuals.abs() <= width) / width)) @ columns.T
+    scores = (columns * weights * residuals.sign()).reshape(3, *shape).sum(dim=-1)
+    blocks = torch.nn.functional.avg_pool2d(scores[None], BLOCK, ceil_mode=True, divisor_override=1)[0]
+    sums = blocks.reshape(3, -1)
+    inverse = torch.linalg.pinv(slope)
+    return inverse @ (sums @ sums.T) @ inverse

@@ -1,0 +1,200 @@
+"""What a training finds out about the polarizers of its pictures: unknown angles, and known ones that contradict."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene, View
+from polarguide.capture.exposures import Exposure
+from polarguide.capture.exposures import found as found_exposure
+from polarguide.training.angle_fit import fit_angle
+from polarguide.training.recipe import Recipe
+
+FIRST, EVERY, LAST = 0.5, 0.05, 0.95
+"""Shares of all steps: before the first, what is said about unknown angles would confirm itself."""
+WEAK = 0.22
+"""Certainty under which an angle is not relied on. Predictions that are wrong in places take some of it away, so that a
+picture through a filter seldom has all of it; half of it is usual when angles are first fitted.
+"""
+VAGUE = 15.0
+"""Spread (degrees) from which on a fitted angle is not relied on."""
+CONTRADICTS = 20.0
+"""Degrees between the angle that is said and the fitted one from which on they contradict each other, if that is three
+times the spread."""
+LOCKED = 0.1
+"""Spread of the logarithms of fitted gains up to which exposures are taken to have been the same: the first fit has
+0.03 to 0.07 for such, and automatic exposure of 0.3 stops each way 0.13.
+"""
+FEWEST = 4
+"""Pictures from which a spread of gains is told."""
+COLUMNS = 6
+Predict = Callable[[View], Tensor]
+"""Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """What the training says of a picture.
+
+    Attributes:
+        view, number: the view, and the place of the picture among its exposures.
+        said: what the capture says. believed: what the training goes by.
+        angle, gain, certainty, spread, doubt: as fitted, see ``FittedAngle``.
+    """
+
+    view: str
+    number: int
+    said: Exposure
+    believed: Exposure
+    angle: float
+    gain: float
+    certainty: float
+    spread: float
+    doubt: float
+
+    @property
+    def unfiltered(self) -> bool:
+        """Whether it was taken without a filter, as it looks."""
+        return self.certainty + self.doubt < WEAK
+
+    @property
+    def vague(self) -> bool:
+        """Whether the picture does not tell its angle."""
+        return (self.spread > VAGUE or self.certainty < WEAK) and not self.unfiltered
+
+    @property
+    def off(self) -> float:
+        """Degrees from what is said to what was fitted, in [-90, 90); 0 where nothing is said."""
+        return 0.0 if self.said.angle is None else (self.angle - self.said.angle + 90.0) % 180.0 - 90.0
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the picture contradicts what is said."""
+        limit = max(CONTRADICTS, 3 * self.spread)
+        return not self.vague and not self.unfiltered and abs(self.off) > limit
+
+
+class Polarizers:
+    """The pictures behind polarizers that are to be fitted, and what has been found.
+
+    Pictures of a polarization camera are not; nor is anything where the recipe has no use for it.
+
+    Args:
+        scene: the capture. recipe: the method. steps: of the training.
+        table: what was found before [P, 6] float64, as ``table`` gives it; None: nothing.
+
+    Raises:
+        ValueError: the table has another number of rows.
+    """
+
+    def __init__(self, scene: Scene, recipe: Recipe, steps: int, table: Tensor | None = None) -> None:
+        uses = recipe.shading.reflects and any(stage.weights.stokes for stage in recipe.stages)
+        self._views = [view for view in scene.train_views if uses and not view.is_four]
+        self._places = [
+            (view, k)
+            for view in self._views
+            for k, exposure in enumerate(view.exposures)
+            if exposure.filtered
+        ]
+        self._unknown = any(not view.exposures[k].known for view, k in self._places)
+        times = [FIRST]
+        while self._unknown and times[-1] + EVERY <= LAST + 1e-9:
+            times.append(times[-1] + EVERY)
+        self._due = {round(share * steps) for share in times} if self._places else set()
+        if table is not None and len(table) != len(self._places):
+            raise ValueError(f"angles of {len(table)} pictures, not {len(self._places)}")
+        self.table = table
+        self.ignored = not uses and any(not view.measures_radiance for view in scene.train_views)
+        self._believed = self._beliefs()
+
+    def due(self, step: int) -> bool:
+        """Whether angles are to be fitted before a step."""
+        return step in self._due
+
+    def believed(self, view: View) -> View:
+        """A view with what is believed of its exposures."""
+        exposures = self._believed.get(view.name)
+        return view if exposures is None or exposures == view.exposures else view.with_exposures(exposures)
+
+    def fit(self, predict: Predict) -> Tensor:
+        """Fit all angles.
+
+        Returns:
+            [P, 6] float64: of each picture the values of ``FittedAngle``, and 1 where there was anything to go by.
+        """
+        rows = []
+        for view in self._views:
+            stokes = predict(view)
+            local = view.to(stokes.device)
+            weight = (~(local.invalid | local.saturated)).to(stokes)
+            rays = local.camera.rays(device=stokes.device)
+            for k, intensity in enumerate(local.intensities()):
+                if not view.exposures[k].filtered:
+                    continue
+                fitted = fit_angle(intensity, stokes, weight, rays, view.mount)
+                row = [0.0, 1.0, 0.0, 90.0, 1.0, 0.0]
+                if fitted is not None:
+                    row = [*dataclasses.astuple(fitted), 1.0]
+                rows.append(row)
+        return torch.tensor(rows, dtype=torch.float64).reshape(-1, COLUMNS)
+
+    def take(self, table: Tensor) -> set[str]:
+        """Go by a table from now on; the names of the views of which something else is believed than before."""
+        self.table = table
+        before, self._believed = self._believed, self._beliefs()
+        names = before.keys() | self._believed.keys()
+        return {name for name in names if before.get(name) != self._believed.get(name)}
+
+    def judgments(self) -> list[Judgment]:
+        """What is said and believed of each picture; empty before the first fit."""
+        if self.table is None:
+            return []
+        common = self._common_gain()
+        found = []
+        for (view, k), row in zip(self._places, self.table.tolist(), strict=True):
+            angle, gain, certainty, spread, doubt, _ = row
+            said = view.exposures[k]
+            judgment = Judgment(view.name, k, said, said, angle, gain, certainty, spread, doubt)
+            found.append(judgment if said.known else replace(judgment, believed=_belief(judgment, common)))
+        return found
+
+    def _common_gain(self) -> float | None:
+        """What gains are relative to; None where they differ no more than those of locked exposures, as fitted."""
+        assert self.table is not None
+        rows = [
+            row
+            for (view, k), row in zip(self._places, self.table, strict=True)
+            if not view.exposures[k].known
+        ]
+        gains = [float(row[1]) for row in rows if row[-1]]
+        if len(gains) < FEWEST:
+            return None
+        middle = median(gains)
+        spread = 1.4826 * median(abs(math.log(gain / middle)) for gain in gains)
+        return middle if spread > LOCKED else None
+
+    def _beliefs(self) -> dict[str, tuple[Exposure, ...]]:
+        believed: dict[str, list[Exposure]] = {}
+        views = {view.name: view for view in self._views}
+        for judgment in self.judgments():
+            exposures = believed.setdefault(judgment.view, list(views[judgment.view].exposures))
+            exposures[judgment.number] = judgment.believed
+        return {name: tuple(exposures) for name, exposures in believed.items()}
+
+
+def _belief(judgment: Judgment, common: float | None) -> Exposure:
+    """What is believed of a picture of which nothing is said: a photograph where it does not tell its angle."""
+    said = judgment.said
+    if judgment.vague:
+        return said
+    if judgment.unfiltered:
+        return replace(said, filtered=False)
+    gain = said.gain if common is None else said.gain * judgment.gain / common
+    return found_exposure(said, judgment.angle, gain)

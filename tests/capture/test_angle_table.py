@@ -1,0 +1,170 @@
+"""``angles.csv``: what it says is read, and what is wrong with it is said in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from polarguide import PolarguideError
+from polarguide.capture import load_scene
+from polarguide.capture.angle_table import read_table, table_text
+from polarguide.capture.exposures import FOUR, Exposure
+from polarguide.inspection.capture import read_capture
+from polarguide.polarizer import malus, stokes_of_four
+from tests.helpers.tiny_capture import NAMES, TinyCapture, write_picture, write_tiny_capture
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> TinyCapture:
+    return write_tiny_capture(tmp_path / "tiny")
+
+
+def write(tiny: TinyCapture, *lines: str, header: str = "file,view,angle,gain") -> Path:
+    path = tiny.root / "angles.csv"
+    path.write_text("\n".join((header, *lines)) + "\n")
+    return path
+
+
+def replaced(tiny: TinyCapture, view: str, pictures: dict[str, np.ndarray]) -> None:
+    """Other pictures of a view than its four."""
+    for path in (tiny.root / "polar").glob(f"{view}_*"):
+        path.unlink()
+    for name, values in pictures.items():
+        write_picture(tiny.root / "polar" / name, values)
+
+
+def test_a_table_of_the_four_pictures_changes_nothing(tiny: TinyCapture) -> None:
+    plain = load_scene(tiny.root)
+    write(
+        tiny,
+        *(f"{name}_{angle:03d}.png,{name},{angle + 180}," for name in NAMES for angle in (135, 0, 90, 45)),
+    )
+    listed = load_scene(tiny.root)
+    assert listed.digest != plain.digest
+    for view, other in zip(plain.views, listed.views, strict=True):
+        assert view.is_four
+        assert other.is_four
+        for field in ("codes", "invalid", "saturated"):
+            assert torch.equal(getattr(view, field), getattr(other, field))
+        assert torch.equal(view.photograph(), other.photograph())
+        assert torch.equal(view.stokes(), other.stokes())
+
+
+def test_any_pictures_of_any_view(tiny: TinyCapture) -> None:
+    stokes = np.stack(stokes_of_four(tiny.linear["v001"]))
+    at = {f"shot{angle}.png": malus(stokes, math.radians(angle)) for angle in (10, 70, 130)}
+    replaced(tiny, "v001", at)
+    replaced(tiny, "v002", {"first.png": tiny.linear["v002"].mean(axis=0)})
+    replaced(tiny, "v003", {"v003_x.png": tiny.linear["v003"][1], "v003_y.png": tiny.linear["v003"][3] / 2})
+    replaced(tiny, "v004", {"lost.png": tiny.linear["v004"][0]})
+    write(
+        tiny,
+        *(f"{name},v001,{angle}" for name, angle in zip(at, (10, 250, -50), strict=True)),
+        "first.png, v002, none",
+        "v003_x.png,v003,45.0,1",
+        "v003_y.png,v003,135,0.5",
+        "lost.png,v004,unknown,",
+    )
+    views = {view.name: view for view in load_scene(tiny.root).views}
+    three, plain, pair, lost = (views[f"v00{k}"] for k in (1, 2, 3, 4))
+    assert [e.angle for e in three.exposures] == [10, 70, 130]
+    assert three.is_determined
+    assert np.allclose(three.stokes().numpy(), stokes, atol=5e-5)
+    assert plain.exposures == (Exposure(filtered=False),)
+    assert plain.measures_radiance
+    assert not plain.is_determined
+    assert pair.measures_radiance
+    assert not pair.is_determined
+    assert np.allclose(pair.photograph().numpy(), tiny.linear["v003"][[1, 3]].mean(axis=0), atol=5e-5)
+    assert not lost.measures_radiance
+    assert lost.exposures == (Exposure(),)
+    assert views["v005"].is_four
+    with pytest.raises(
+        PolarguideError, match=r"view v003: expected pictures that determine a Stokes vector.*45, 135"
+    ):
+        pair.stokes()
+
+
+def test_the_frame_of_a_filter(tiny: TinyCapture) -> None:
+    tiny.write_json("scene.json", {"polarizer": "filter"})
+    view = load_scene(tiny.root).views[0]
+    assert view.mount == "filter"
+    assert not view.is_four
+    assert view.is_determined
+    four = dataclasses.replace(view, mount="sensor")
+    assert not torch.allclose(view.stokes(), four.stokes(), atol=1e-3)
+    row, column = view.codes.shape[1] // 2 - 1, view.codes.shape[2] // 2
+    assert torch.allclose(view.stokes()[:, row, column], four.stokes()[:, row, column], atol=2e-3)
+    tiny.write_json("scene.json", {"polarizer": "lens"})
+    with pytest.raises(PolarguideError, match=r"polarizer\): expected filter or sensor, found .lens"):
+        load_scene(tiny.root)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["v000_000.png,v000"], r"line 2\): expected 4 cells"),
+        (["v000_000.png,v000,0,1,2"], r"line 2\): expected 4 cells"),
+        (["v000_000.png,v000,0", "v000_000.png,v000,45"], r"line 3\): expected one line for each file"),
+        (
+            ["v000_000.png,v000,fifty"],
+            r"line 2\): expected a number of degrees, unknown or none as angle, found 'fifty'",
+        ),
+        (["v000_000.png,v000,inf"], r"line 2\): expected a number of degrees"),
+        (["v000_000.png,v000,"], r"line 2\): expected a number of degrees"),
+        (["v000_000.png,v000,0,-1"], r"line 2\): expected a positive number as gain, found '-1'"),
+        (["v000_000.png,,0"], r"line 2\): expected the name of a view"),
+        (["../v000_000.png,v000,0"], r"line 2\): expected the name of a picture inside polar/"),
+        (["", "gone.png,v000,0"], r"line 3\): expected a picture in polar/, found none called gone.png"),
+    ],
+)
+def test_each_fault_is_one_line(tiny: TinyCapture, lines: list[str], message: str) -> None:
+    write(tiny, *lines)
+    with pytest.raises(PolarguideError, match=message) as caught:
+        load_scene(tiny.root)
+    assert "angles.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("header", ["file,view", "file,view,angle,angle", "picture,view,angle"])
+def test_the_header_is_checked(tiny: TinyCapture, header: str) -> None:
+    write(tiny, header=header)
+    with pytest.raises(PolarguideError, match=r"line 1\): expected the header file,view,angle"):
+        load_scene(tiny.root)
+
+
+def test_pictures_that_nothing_names_are_warned_of(tiny: TinyCapture) -> None:
+    write_picture(tiny.root / "polar" / "extra.png", tiny.linear["v000"][0])
+    write(tiny, "v000_000.png,v000,0")
+    assert any(
+        "extra.png" in warning and "angles.csv" in warning for warning in load_scene(tiny.root).warnings
+    )
+
+
+def test_a_view_without_all_four_has_to_be_listed(tiny: TinyCapture) -> None:
+    tiny.picture("v002", 45).unlink()
+    with pytest.raises(PolarguideError, match=r"at 45 degrees.*angles\.csv"):
+        load_scene(tiny.root)
+    write(tiny, "v002_000.png,v002,0", header="file,view,angle")
+    view = load_scene(tiny.root).view("v002")
+    assert sorted(e.angle for e in view.exposures if e.angle is not None) == [0, 90, 135]
+    assert view.is_determined
+
+
+def test_inspection_says_what_it_needs(tiny: TinyCapture) -> None:
+    replaced(tiny, "v002", {"first.png": tiny.linear["v002"][0]})
+    write(tiny, "first.png,v002,0")
+    with pytest.raises(PolarguideError, match=r"0, 45, 90 and 135 degrees, which inspection needs.*v002"):
+        read_capture(tiny.root)
+
+
+def test_a_table_that_is_written_can_be_read(tmp_path: Path) -> None:
+    exposures = [*FOUR, Exposure(12.34, gain=1.25), Exposure(), Exposure(filtered=False)]
+    path = tmp_path / "angles.csv"
+    path.write_text(table_text((f"{k}.png", "a", e, 0.5 if k else None) for k, e in enumerate(exposures)))
+    assert [item.exposure for item in read_table(path)] == exposures

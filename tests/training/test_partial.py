@@ -1,0 +1,161 @@
+"""The loss of views that do not determine the Stokes vector, where its value is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from polarguide import optics
+from polarguide.camera import Camera
+from polarguide.capture import View
+from polarguide.capture.exposures import FOUR, PLAIN, Exposure
+from polarguide.optics import Mount
+from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.result import RenderResult
+from polarguide.training.losses import step_loss
+from polarguide.training.partial import PartialView, partial_terms
+from polarguide.training.photometric import photometric_loss
+from polarguide.training.recipe import Weights
+
+SIZE = (12, 14)
+GLASS = DeferredShading("fresnel").bind(1.5)
+CPU = torch.device("cpu")
+CAMERA = Camera(
+    SIZE[1],
+    SIZE[0],
+    12.0,
+    12.0,
+    7.0,
+    6.0,
+    torch.eye(3, dtype=torch.float64),
+    torch.zeros(3, dtype=torch.float64),
+)
+WEIGHTS = Weights(stokes=1.0)
+
+
+def rendered(seed: int = 0) -> RenderResult:
+    """Layers and slanted normals, as leaves."""
+    generator = torch.Generator().manual_seed(seed)
+    specular, diffuse = (0.1 + 0.1 * torch.rand(*SIZE, 3, generator=generator) for _ in range(2))
+    normal = normalize(torch.randn(*SIZE, 3, generator=generator) - torch.tensor([0.0, 0.0, 2.0]), dim=-1)
+    for leaf in (specular, diffuse, normal):
+        leaf.requires_grad_()
+    alpha = torch.ones(SIZE)
+    return RenderResult(
+        final=specular + diffuse,
+        specular=specular,
+        diffuse=diffuse,
+        base=diffuse,
+        reflection=None,
+        strength=None,
+        normal=normal,
+        depth=None,
+        alpha=alpha,
+    )
+
+
+def measured(result: RenderResult, exposures: tuple[Exposure, ...], mount: Mount = "sensor") -> View:
+    """What a camera would have measured of the layers."""
+    stokes = GLASS.predicted_stokes(result, CAMERA).detach()
+    rays, pictures = CAMERA.rays(), []
+    for exposure in exposures:
+        picture = stokes[0] / 2
+        if exposure.angle is not None:
+            cosine, sine = optics.analyzer(math.radians(exposure.angle), rays, mount)[..., None].unbind(0)
+            picture = picture + (stokes[1] * cosine + stokes[2] * sine) / 2
+        pictures.append(picture * exposure.gain)
+    codes = (torch.stack(pictures) * 65535).round().to(torch.int32).to(torch.uint16)
+    nowhere = torch.zeros(SIZE, dtype=torch.bool)
+    return View("v", CAMERA, codes, nowhere, nowhere, exposures=exposures, mount=mount)
+
+
+def terms(result: RenderResult, view: View, weights: Weights = WEIGHTS) -> tuple[Tensor, Tensor]:
+    partial = PartialView.of(view, CPU)
+    return partial_terms(result, partial, weights, valid=None, ssim_weight=0.2, shading=GLASS, camera=CAMERA)
+
+
+KINDS = {
+    "one": (Exposure(30.0),),
+    "pair": (Exposure(20.0), Exposure(110.0)),
+    "askew": (Exposure(0.0), Exposure(45.0)),
+    "beside a photograph": (*PLAIN, Exposure(70.0)),
+    "brighter": (Exposure(30.0, gain=1.25),),
+}
+
+
+@pytest.mark.parametrize("mount", ["sensor", "filter"])
+@pytest.mark.parametrize("exposures", KINDS.values(), ids=KINDS)
+def test_the_truth_costs_nothing(exposures: tuple[Exposure, ...], mount: Mount) -> None:
+    result = rendered()
+    total, photometric = terms(result, measured(result, exposures, mount))
+    assert float(photometric.detach()) < 2e-4
+    assert float(total.detach()) < 5e-4
+    turned = tuple(replace(e, angle=None if e.angle is None else e.angle + 40) for e in exposures)
+    view = replace(measured(result, exposures, mount), exposures=turned)
+    assert float(terms(result, view)[0].detach()) > 0.01
+
+
+def test_a_pair_compares_the_radiance_and_a_single_picture_what_it_shows() -> None:
+    result = rendered()
+    pair = PartialView.of(measured(result, KINDS["pair"]), CPU)
+    one = PartialView.of(measured(result, KINDS["one"]), CPU)
+    assert pair.mix is None
+    assert pair.measures_radiance
+    assert torch.allclose(pair.picture, result.final.detach(), atol=5e-5)
+    assert one.mix is not None
+    assert not one.measures_radiance
+    # Behind a filter before the lens a pair is not quite one at right angles off the axis.
+    behind = PartialView.of(measured(result, KINDS["pair"], "filter"), CPU)
+    assert behind.mix is not None
+    assert 0.01 < float(behind.mix.norm(dim=0).max()) < 0.5
+
+
+def test_the_intensity_term_leaves_the_picture_alone() -> None:
+    """Brightness is the photometric term's: beside it, only S1 and S2 are pulled."""
+    result = rendered()
+    view = measured(result, KINDS["one"])
+    view = replace(view, codes=(view.codes.to(torch.int32) // 2).to(torch.uint16))
+    alone = replace(WEIGHTS, photometric=0.0)
+    total, _ = terms(result, view, alone)
+    (of_final,) = torch.autograd.grad(total, result.final, retain_graph=True)
+    assert not bool(of_final.any())
+    gradients = torch.autograd.grad(total, (result.specular, result.diffuse, result.normal))
+    assert all(bool(g.isfinite().all()) and float(g.abs().max()) > 0 for g in gradients)
+
+
+def test_without_a_stokes_term_it_is_a_photograph() -> None:
+    result = rendered()
+    view = measured(result, KINDS["one"])
+    total, photometric = terms(result, view, Weights())
+    shown = PartialView.of(view, CPU).shown
+    assert torch.equal(total, photometric)
+    assert torch.equal(photometric, photometric_loss(result.final, shown, None, 0.2))
+    unknown = replace(view, exposures=(Exposure(),))
+    assert torch.equal(terms(result, unknown)[0], photometric)
+
+
+def test_saturated_pixels_say_nothing_about_polarization() -> None:
+    result = rendered()
+    view = replace(measured(result, KINDS["one"]), exposures=(Exposure(75.0),))
+    everywhere = torch.ones(SIZE, dtype=torch.bool)
+    total, photometric = terms(result, replace(view, saturated=everywhere))
+    assert float(total.detach()) == pytest.approx(float(photometric.detach()))
+    assert float(terms(result, view)[0].detach()) > float(photometric.detach()) + 0.01
+
+
+def test_the_step_takes_it_in_place_of_the_photograph() -> None:
+    result = rendered()
+    view = measured(result, KINDS["one"])
+    partial = PartialView.of(view, CPU)
+    options = {"ssim_weight": 0.2, "shading": GLASS, "log_scales": torch.zeros(1, 3), "extent": 1.0}
+    total, _ = step_loss(
+        result, partial.shown, None, WEIGHTS, None, camera=CAMERA, partial=partial, **options
+    )
+    assert torch.equal(total, terms(result, view)[0])
+    assert not measured(result, KINDS["one"]).is_determined
+    assert measured(result, FOUR).is_determined

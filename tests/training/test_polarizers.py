@@ -1,0 +1,152 @@
+"""Unknown angles in training: found, believed, doubted, and the same after a resume."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene, View
+from polarguide.capture.angle_table import read_table
+from polarguide.capture.exposures import FOUR, Exposure
+from polarguide.capture.variants import captured_as
+from polarguide.raster import choose_backend
+from polarguide.recipes import RECIPES, recipe_named
+from polarguide.runs.angles import report_polarizers
+from polarguide.training.polarizers import Polarizers
+from polarguide.training.settings import TrainSettings
+from polarguide.training.state import TrainingState
+from polarguide.training.trainer import Trainer
+from tests.helpers.heard import Heard
+from tests.helpers.tiny import make_scene
+
+STOKES = RECIPES["polarguide-stokes"]
+WHOLE = make_scene()
+TRUTH = {view.name: view.stokes() for view in WHOLE.views}
+STEPS = 40
+CPU = choose_backend("cpu")
+
+
+def predicted(view: View) -> Tensor:
+    """A model that has learned everything."""
+    return TRUTH[view.name]
+
+
+def judged(scene: Scene) -> Polarizers:
+    polarizers = Polarizers(scene, STOKES, STEPS)
+    polarizers.take(polarizers.fit(predicted))
+    return polarizers
+
+
+def with_exposures(scene: Scene, **said: Exposure) -> Scene:
+    """The scene with other words about single pictures."""
+    views = [
+        dataclasses.replace(view, exposures=(said[view.name],)) if view.name in said else view
+        for view in scene.views
+    ]
+    return dataclasses.replace(scene, views=tuple(views))
+
+
+def test_unknown_angles_are_found_and_believed() -> None:
+    scene, true = captured_as(WHOLE, "unknown"), captured_as(WHOLE, "one")
+    polarizers = Polarizers(scene, STOKES, STEPS)
+    assert polarizers.judgments() == []
+    assert next(step for step in range(STEPS) if polarizers.due(step)) == STEPS // 2
+    changed = polarizers.take(polarizers.fit(predicted))
+    assert changed == {view.name for view in scene.train_views}
+    for view, known in zip(scene.train_views, true.train_views, strict=True):
+        believed, said = polarizers.believed(view).exposures[0], known.exposures[0]
+        assert believed.angle is not None
+        assert said.angle is not None
+        assert (believed.angle - said.angle + 90) % 180 - 90 == pytest.approx(0, abs=0.1)
+        assert torch.equal(polarizers.believed(view).codes, view.codes)
+    assert polarizers.take(polarizers.fit(predicted)) == set()
+
+
+def test_four_pictures_of_a_sensor_are_left_alone() -> None:
+    polarizers = Polarizers(WHOLE, STOKES, STEPS)
+    assert not any(polarizers.due(step) for step in range(STEPS))
+    view = WHOLE.train_views[0]
+    assert polarizers.believed(view) is view
+
+
+def test_recipes_without_the_term_ignore_angles() -> None:
+    scene = captured_as(WHOLE, "unknown")
+    for name in ("3dgs", "polarguide", "polarguide-stokes:unpolarized"):
+        polarizers = Polarizers(scene, recipe_named(name), STEPS)
+        assert polarizers.ignored
+        assert not any(polarizers.due(step) for step in range(STEPS))
+    assert not Polarizers(scene, STOKES, STEPS).ignored
+
+
+def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
+    ones = captured_as(WHOLE, "one")
+    plain = {view.name: view for view in captured_as(WHOLE, "none").views}
+    views = [plain[v.name] if v.name == "v3" else v for v in ones.views]
+    said = {"v1": Exposure(90.0), "v3": Exposure(45.0), "v4": Exposure(135.0)}  # true: 0, none, 135
+    polarizers = judged(with_exposures(dataclasses.replace(ones, views=tuple(views)), **said))
+    found = {judgment.view: judgment for judgment in polarizers.judgments()}
+    assert [name for name, judgment in found.items() if judgment.contradicts] == ["v1"]
+    assert abs(abs(found["v1"].off) - 90) < 1
+    assert [name for name, judgment in found.items() if judgment.unfiltered] == ["v3"]
+    assert polarizers.believed(ones.view("v1")).exposures == (Exposure(90.0),)  # it is said, so it holds
+    heard = Heard()
+    report_polarizers(tmp_path, ones, polarizers, heard)
+    warned = "\n".join(heard.said)
+    assert "1 of 5 pictures (v3#0) look as if taken without a filter" in warned
+    assert "1 of 5 pictures (v1#0) contradict their angles: v1#0 is said to be at 90 degrees" in warned
+    lines = {item.view: item.exposure for item in read_table(tmp_path / "angles.csv")}
+    assert lines["v4"].angle == 135
+
+
+def test_exposure_times_are_found() -> None:
+    scene = captured_as(WHOLE, "unknown")
+    brighter = [
+        dataclasses.replace(view, codes=(view.codes.to(torch.int32) * 3 // 4).to(torch.uint16))
+        if view.name == "v2"
+        else view
+        for view in scene.views
+    ]
+    polarizers = judged(dataclasses.replace(scene, views=tuple(brighter)))
+    gains = {judgment.view: judgment.gain for judgment in polarizers.judgments()}
+    assert gains["v2"] == pytest.approx(0.75, abs=0.01)
+    assert gains["v1"] == pytest.approx(1.0, abs=0.01)
+
+
+def trained(scene: Scene, until: int, state: TrainingState | None = None) -> Trainer:
+    trainer = Trainer(scene, STOKES, TrainSettings(steps=STEPS, background="scene"), CPU, state)
+    trainer.run(lambda report: None, until=until)
+    return trainer
+
+
+@pytest.mark.parametrize("until", [STEPS // 2, 27])
+def test_a_resumed_training_gives_the_same_bits(until: int) -> None:
+    scene = captured_as(WHOLE, "unknown")
+    whole = trained(scene, STEPS)
+    stored = {name: values.clone() for name, values in trained(scene, until).state.tensors().items()}
+    resumed = trained(scene, STEPS, TrainingState.from_tensors(stored, STOKES))
+    ours, theirs = whole.state.tensors(), resumed.state.tensors()
+    assert ours.keys() == theirs.keys()
+    assert "angles" in ours
+    assert all(torch.equal(values, theirs[name]) for name, values in ours.items())
+
+
+@pytest.mark.parametrize("exposures", ["three", "two", "one", "mixed", "none", "sparse"])
+def test_all_captures_train(exposures: str) -> None:
+    scene = captured_as(WHOLE, exposures)  # type: ignore[arg-type]
+    trainer = trained(scene, STEPS)
+    assert all(bool(values.isfinite().all()) for values in trainer.state.tensors().values())
+
+
+def test_four_pictures_train_as_ever() -> None:
+    ours = trained(WHOLE, STEPS).state.tensors()
+    listed = [
+        dataclasses.replace(view, exposures=tuple(Exposure(float(e.angle or 0)) for e in FOUR))
+        for view in WHOLE.views
+    ]
+    again = trained(dataclasses.replace(WHOLE, views=tuple(listed)), STEPS).state.tensors()
+    assert ours.keys() == again.keys()
+    assert all(torch.equal(values, again[name]) for name, values in ours.items())
