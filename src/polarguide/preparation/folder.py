@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.polarizer_angles import Angle
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.write import EXACT, intensity_codes, picture_name, write_view
 from polarguide.errors import PolarguideError
@@ -32,6 +34,8 @@ PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
 """What is written into."""
 REMEDY = "Give another --out; nothing was written."
+_LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
+"""Of a picture's angle, in its name."""
 _OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 
 
@@ -125,7 +129,8 @@ class SceneFolder:
         before, now = json.loads(json.dumps(state["request"])), json.loads(json.dumps(self.request))
         if before["settings"].get("white_balance") == "grey":  # its name in earlier journals
             before["settings"]["white_balance"] = "gray"
-        before["settings"].setdefault("analyzers", None)  # earlier journals do not know it
+        for name in ("analyzers", "angles"):  # earlier journals do not know them
+            before["settings"].setdefault(name, None)
         self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
         if self._follows_none:
             for record in (before, now):
@@ -221,10 +226,11 @@ class SceneFolder:
         invalid: NDArray[np.bool_],
         record: dict[str, Any],
         mask: NDArray[np.bool_] | None = None,
+        angles: Sequence[Angle] = ANGLES,
     ) -> None:
         """Write the pictures of a view, then note it."""
         codes = intensity_codes(intensities, invalid, (self.measured or {}).get("rounding", EXACT))
-        sizes = write_view(self.root, view, codes, invalid, mask)
+        sizes = write_view(self.root, view, codes, invalid, mask, angles)
         self.views[view] = {**record, "files": sizes}
         self.save()
 
@@ -244,8 +250,9 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
     Raises:
         PolarguideError: there is one.
     """
-    own = {*(picture_name(view, angle) for angle in ANGLES), f"invalid/{view}.png", f"masks/{view}.png"}
-    strangers = sorted(set(files) - own)
+    pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.png")
+    own = {f"invalid/{view}.png", f"masks/{view}.png"}
+    strangers = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
     if strangers or "/" in view or "\\" in view or "\0" in view:
         raise PolarguideError(
             f"{journal} (views, {shortened(view)})",
