@@ -208,11 +208,7 @@ class SinglesSource(Source):
         whole = len(self._pictures)
         if count == whole:
             return "All files state their exposure (EXIF)."
-        return (
-            f"{count} of {whole} files state their exposure (EXIF)."
-            if count
-            else "No file states its exposure (EXIF)."
-        )
+        return f"{count or 'None'} of {whole} files state their exposure (EXIF)."
 
 
 def _rough(angle: Angle) -> Angle:

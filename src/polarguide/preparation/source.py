@@ -22,7 +22,7 @@ class DevelopedView:
     """The developed picture of one view.
 
     Attributes:
-        intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees; or [K, H, W, 3] at ``angles``.
+        intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees; or [K, H, W, 3].
         invalid: pixels that depend on an unusable sample, [H, W].
         geometry: crop and scale relative to the stored picture.
         mask: object mask, [H, W], or None.

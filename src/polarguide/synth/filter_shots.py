@@ -61,8 +61,8 @@ def plan_shot(seed: int, number: int) -> FilterShot:
 def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
     """Intensities behind an ideal sheet before the lens, [H, W, 3].
 
-    The sheet absorbs along an axis ``c`` in the plane of the picture. A ray ``d`` keeps the field perpendicular to ``d``
-    and ``c``; its angle in the lens frame of the ray, which Stokes vectors refer to, differs from pixel to pixel.
+    The sheet absorbs along an axis ``c`` in the plane of the picture. A ray ``d`` keeps the field perpendicular to
+    ``d`` and ``c``; its angle in the lens frame of the ray, which Stokes vectors refer to, differs from pixel to pixel.
 
     Args:
         stokes: [3, H, W, 3] in the lens frame. rays: [H, W, 3] unit, camera axes.
