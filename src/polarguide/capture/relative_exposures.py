@@ -12,10 +12,12 @@ from scipy.sparse.csgraph import connected_components
 Array = NDArray[np.floating[Any]]
 FEWEST = 20
 """Points of which fewer say nothing about a picture."""
-FILE_ERROR = 0.04
+FILE_ERROR = 0.03
 """Relative error of exposures that files state: shutters and apertures have nominal values."""
-LARGEST_DOUBT = 0.35
-"""Logarithm of half a stop: points that contradict a file by more, and by more than others do, are believed."""
+POINTS_ERROR = 0.05
+"""Relative error of exposures from points, at least: reflections move, and polarization is taken for exposure."""
+LARGEST_DOUBT = 0.5
+"""Logarithm of 0.7 stops: points that contradict a file by more, and by more than others do, are believed."""
 _LEAST_TRACK = 3
 _MOST_POINTS = 20_000
 _ROUNDS = 40
@@ -95,9 +97,10 @@ class Exposures:
 def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Exposures:
     """Exposures from those of points and those of files.
 
-    Where both are known, files count by their usual error (``FILE_ERROR``) and points by the scatter that the two show;
-    a picture whose points contradict its file by far is exposed as its points say. A filter takes the same share of the
-    light from all pictures behind it: the points say which.
+    Where both are known, the file's is corrected towards the points', as far as files usually err (``FILE_ERROR``) and
+    points agree with files in this capture; larger differences are laid to the points, whose errors have long tails. A
+    picture whose points contradict its file by far (``LARGEST_DOUBT``) is exposed as its points say. A filter takes the
+    same share of the light from all pictures behind it: the points say which.
 
     Args:
         points, files: logarithms, [N]; NaN where one is not known.
@@ -114,8 +117,9 @@ def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Ex
             shifted = np.where(group, files + np.median((points - files)[group & both]), shifted)
     difference = np.where(both, points - shifted, 0.0)
     scatter = 1.4826 * float(np.median(np.abs(difference[both])))
-    weight = min(1.0, FILE_ERROR**2 / max(scatter**2, 1e-12))
+    weight = FILE_ERROR**2 / (FILE_ERROR**2 + max(scatter, POINTS_ERROR) ** 2)
     odd = both & (np.abs(difference) > max(LARGEST_DOUBT, 4 * scatter))
-    known = np.where(odd, points, shifted + weight * difference)
+    correction = weight * difference / (1 + (difference / (3 * FILE_ERROR)) ** 2)
+    known = np.where(odd, points, shifted + correction)
     logs = np.where(both, known, np.where(np.isfinite(points), points, shifted))
     return Exposures(logs, tuple(int(k) for k in np.flatnonzero(odd)), scatter)

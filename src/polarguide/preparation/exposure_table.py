@@ -55,8 +55,8 @@ class _Exposure:
 def write_exposure_table(folder: SceneFolder, *, estimate: bool, posed: bool, reporter: Reporter) -> None:
     """Estimate the gain of every picture of a written scene, note it with the views, and write ``angles.csv``.
 
-    Shots of one view share one exposure, but for what their files say. Gains that the user gave stay, and the others fit
-    them; without any, the geometric mean is 1.
+    Shots of one view share one exposure, but for what their files say. Gains that the user gave stay, and the others
+    fit them; without any, the geometric mean is 1.
 
     Args:
         folder: with all views written, and the model if there is one.

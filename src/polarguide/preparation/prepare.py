@@ -268,7 +268,9 @@ def _write_view(
     elif not all(picture.any() for picture in intensities):
         faults.append(f"{view}: a picture of it is black throughout.")
     elif len(intensities) > 1 and all(np.array_equal(intensities[0], other) for other in intensities[1:]):
-        faults.append(f"{view}: its pictures are the same, as copies of one are.")
+        faults.append(
+            f"{view}: its {'four ' * (len(intensities) == 4)}pictures are the same, as copies of one are."
+        )
     return faults, done.notes
 
 

@@ -226,7 +226,8 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
 def _owners(name: str) -> str:
     """The formats that an option is for, in words."""
     words = {"mosaic": "raw mosaics", "filter": "rotating filters", "singles": "single shots"}
-    return " and ".join(words.get(kind, kind) for kind, names in _OPTIONS.items() if name in names)
+    *others, last = (words.get(kind, kind) for kind, names in _OPTIONS.items() if name in names)
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:
