@@ -28,7 +28,7 @@ from polarguide.polarizer import malus
 from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.synth.filter_shots import _exif
+from polarguide.synth.filter_shots import exif_tags
 
 PLAIN = PrepareSettings(poses="none", transfer="linear", align=False)
 
@@ -96,7 +96,7 @@ def test_exif_turns_pixels_and_the_angle(tmp_path: Path, code: int) -> None:
     upright[2] *= -1.0 if code in (2, 4, 5, 7) else 1.0
     path = tmp_path / "in" / "v_a30.jpg"
     write_picture(path, behind(stored, [30])[0], bits=8)
-    data, block = path.read_bytes(), b"Exif\0\0" + _exif(code, None)
+    data, block = path.read_bytes(), b"Exif\0\0" + exif_tags(code, None)
     path.write_bytes(data[:2] + b"\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block + data[2:])
     prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
     (row,) = table(tmp_path / "out")
@@ -187,7 +187,7 @@ def test_a_photograph_without_a_filter_gets_twice_the_light(tmp_path: Path) -> N
 
 def _state_exposure(path: Path) -> None:
     """Put an exposure time into a PNG file."""
-    data, tags = path.read_bytes(), b"eXIf" + _exif(1, Fraction(1, 60))
+    data, tags = path.read_bytes(), b"eXIf" + exif_tags(1, Fraction(1, 60))
     chunk = (len(tags) - 4).to_bytes(4, "big") + tags + crc32(tags).to_bytes(4, "big")
     path.write_bytes(data[:33] + chunk + data[33:])
 

@@ -22,6 +22,7 @@ from polarguide.errors import PolarguideError
 VERBS = {
     "demo": "demo",
     "calibrate": "calibrate",
+    "scale": "scale",
     "prepare": "prepare",
     "inspect": "inspect",
     "train": "train",

@@ -95,12 +95,12 @@ def filter_jpeg(
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), options)
     time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None
-    block = b"Exif\0\0" + _exif(shot.orientation, time)
+    block = b"Exif\0\0" + exif_tags(shot.orientation, time)
     segment = b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block
     return data[:2].tobytes() + segment + data[2:].tobytes()
 
 
-def _exif(orientation: int, time: Fraction | None) -> bytes:
+def exif_tags(orientation: int, time: Fraction | None) -> bytes:
     """A TIFF structure with the orientation and, in its EXIF directory, exposure time, f-number and ISO speed."""
     if time is None:
         return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
