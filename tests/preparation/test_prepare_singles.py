@@ -296,6 +296,10 @@ TABLES = {
     "elsewhere": ("file,angle\n../x.png,0\na.png,0\nb.png,0\n", "expected files in"),
     "no picture": ("file,angle\nangles.csv,0\na.png,0\nb.png,0\n", "expected pictures"),
     "name of a view": ("file,angle,view\na.png,0,a/b\nb.png,0,c\n", "names of views that files may have"),
+    "control characters": (
+        'file,angle,view\na.png,0,"a\nb"\nb.png,0,c\n',
+        "names of views that files may have",
+    ),
     "gain": ("file,angle,gain\na.png,0,0\nb.png,0,1\n", "expected a gain from"),
 }
 

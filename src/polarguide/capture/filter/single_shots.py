@@ -202,7 +202,11 @@ def _checked(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
     """
     seen: dict[tuple[str, object], Path] = {}
     for shot in shots:
-        if any(sign in shot.view for sign in "/\\\0") or shot.view.startswith("."):
+        if (
+            any(sign in shot.view for sign in "/\\")
+            or shot.view.startswith(".")
+            or not shot.view.isprintable()
+        ):
             raise PolarguideError(
                 root / TABLE,
                 expected="names of views that files may have",
