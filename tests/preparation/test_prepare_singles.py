@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -246,6 +247,29 @@ def test_what_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     first.rename(first.with_name("v0_unknown.jpg"))
     with pytest.raises(PolarguideError, match="that was changed, added or removed"):
         prepare_scene(capture.folder, scene, asked)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda view: view.pop("exposures"), "expected the exposures of"),
+        (lambda view: view["exposures"][0].update(angle="left"), "angle"),
+        (lambda view: view["exposures"][0].update(light=-1), "light"),
+        (lambda view: view["exposures"][0].update(given_gain="x"), "given_gain"),
+        (lambda view: view["exposures"][0].update(angle=33), "expected the exposures of"),
+        (lambda view: view["files"].update({"polar/other_045.png": 1}), "expected pictures of this view"),
+    ],
+)
+def test_a_journal_that_was_changed_is_refused(tmp_path: Path, change: Callable, message: str) -> None:
+    write_three(tmp_path / "in", ("a_a30.png",))
+    scene = tmp_path / "scene"
+    prepare_scene(tmp_path / "in", scene, PLAIN)
+    whole = summary(scene)
+    change(whole["prepare"]["views"]["a"])
+    (scene / "scene.json").unlink()
+    (scene / "prepare.json").write_text(json.dumps(whole))
+    with pytest.raises(PolarguideError, match=message):
+        prepare_scene(tmp_path / "in", scene, PLAIN)
 
 
 def test_developed_first_and_posed_later(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.polarizer_angles import Angle
 from polarguide.capture.view import ANGLES, FULL_CODE
-from polarguide.capture.write import EXACT, intensity_codes, picture_name, write_view
+from polarguide.capture.write import EXACT, intensity_codes, picture_name, picture_names, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, holds_files, make_folder, read_file, require_inside, write_whole
 from polarguide.records import decode, read_record, shortened, to_json
@@ -54,11 +54,24 @@ class _Request(msgspec.Struct):
     file: dict[str, tuple[int, int]]
 
 
+_Factor = Annotated[float, msgspec.Meta(gt=0, lt=1e12)]
+
+
+class _Exposure(msgspec.Struct):
+    """One of the single shots of a view."""
+
+    source: str
+    angle: float | Literal["unknown", "none"]
+    light: _Factor | None
+    given_gain: _Factor | None
+
+
 class _View(msgspec.Struct):
     files: dict[str, int]
     geometry: Geometry
     clipped_share: float
     warp: Any
+    exposures: list[_Exposure] = []
 
 
 class _Measured(msgspec.Struct):
@@ -125,6 +138,8 @@ class SceneFolder:
         journal = decode(content, _Journal, path, remedy=REMEDY)
         for view, record in journal.prepare.views.items():
             _require_own_files(path, view, record.files)
+            if journal.prepare.request.format == "singles":
+                _require_exposures(path, view, record)
         state = content["prepare"]
         before, now = json.loads(json.dumps(state["request"])), json.loads(json.dumps(self.request))
         if before["settings"].get("white_balance") == "grey":  # its name in earlier journals
@@ -258,6 +273,23 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
             f"{journal} (views, {shortened(view)})",
             expected=f"pictures of this view, {picture_name('VIEW', 0)} and so on",
             found=shortened(strangers[0] if strangers else view),
+            remedy=REMEDY,
+        )
+
+
+def _require_exposures(journal: Path, view: str, record: _View) -> None:
+    """Refuse a journal that does not say what the pictures of a view are.
+
+    Raises:
+        PolarguideError: it does not.
+    """
+    named = picture_names(view, [exposure.angle for exposure in record.exposures])
+    pictures = sorted(name for name in record.files if name.startswith("polar/"))
+    if sorted(named) != pictures or not named:
+        raise PolarguideError(
+            f"{journal} (views, {shortened(view)})",
+            expected=f"the exposures of {shortened(pictures)}",
+            found=shortened(named),
             remedy=REMEDY,
         )
 
