@@ -226,7 +226,7 @@ def test_datasets(tmp_path: Path, case: str) -> None:
     ("name", "changes", "message"),
     [
         ("nersp", {"sensor": "IMX250MYR"}, "--sensor: expected only flags that apply to the format nersp"),
-        ("pandora", {"transfer": "srgb"}, "--transfer: .*rotating filters and gnerp"),
+        ("pandora", {"transfer": "srgb"}, "--transfer: .*rotating filters, single shots and gnerp"),
         ("pisr", {"align": False}, "--align: .*format pisr"),
         ("gnerp", {"bits": 12}, "--bits: .*format gnerp"),
         ("gnerp", {"calibration": Calibration(gains=(1, 1, 1, 1.1))}, r"calibration \(gains\): .*Stokes"),

@@ -31,7 +31,7 @@ def choices(hint: Any) -> set[str]:
 @pytest.mark.parametrize(
     ("field", "known"),
     [
-        ("format", {"auto", "mosaic", "filter", *DATASETS}),
+        ("format", {"auto", "mosaic", "filter", "singles", *DATASETS}),
         ("sensor", set(SENSORS)),
         ("packing", set(PACKINGS)),
         ("demosaic", set(DEMOSAIC_MODES)),

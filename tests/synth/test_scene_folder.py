@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import shlex
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -19,10 +21,12 @@ from tiny_capture import write_picture
 
 from polarguide import optics
 from polarguide.capture import load_scene
+from polarguide.capture.colmap.model import read_model
 from polarguide.errors import PolarguideError
 from polarguide.progress import Reporter
 from polarguide.synth import render as runner
 from polarguide.synth import sweep as sweeps
+from polarguide.synth.filter_shots import behind_filter
 from polarguide.synth.folder import photograph
 from polarguide.synth.manifest import MANIFEST, scene_digest, verify_scene
 from polarguide.synth.render import synthesize
@@ -234,6 +238,45 @@ def test_mosaics_come_back_through_prepare(sensor: str, variant: Variant, tmp_pa
         assert strong.sum() > 100
         turn = torch.remainder(optics.aolp(found) - optics.aolp(known) + np.pi / 2, np.pi) - np.pi / 2
         assert torch.rad2deg(turn[strong]).abs().median() < 2.5
+
+
+@COMPILED
+def test_photographs_through_a_filter_come_back_through_prepare(variant: Variant, tmp_path: Path) -> None:
+    """By the command that ``synth`` prints; the pictures are what a sheet before the lens passes of the light."""
+    out = tmp_path / "scene"
+    (tmp_path / "tiny.json").write_text(json.dumps(TINY))
+    wishes = [
+        "--sensor",
+        "filter",
+        "--size",
+        "48x32",
+        "--samples",
+        "32",
+        "--threads",
+        "1",
+        "--ground-truth",
+        "all",
+    ]
+    printed = polarguide("synth", str(tmp_path / "tiny.json"), "--out", str(out), *wishes)
+    command = printed.partition("next: polarguide ")[2].splitlines()[0]
+    polarguide(*shlex.split(command))
+    made = json.loads((out / "scene.json").read_text())["shots"]
+    rows = list(csv.DictReader((Path(f"{out}-prepared") / "angles.csv").read_text().splitlines()))
+    assert [(row["view"], float(row["angle"])) for row in rows] == [(n, s["angle"]) for n, s in made.items()]
+    stops = np.log2([float(row["gain"]) for row in rows])
+    known = np.array([shot["stops"] for shot in made.values()])
+    assert np.abs(stops - (known - known.mean())).max() < 0.05
+    assert {shot["orientation"] for shot in made.values()} > {1}
+    model = read_model(out)
+    for row in rows:
+        with np.load(out / "gt" / f"{row['view']}.npz") as ground_truth:
+            stokes = ground_truth["stokes"].astype(float)
+        rays = model.camera(row["view"]).rays(dtype=torch.float64).numpy()
+        light = behind_filter(stokes, rays, float(row["angle"])) * 2 ** made[row["view"]]["stops"]
+        stored = cv2.imread(str(Path(f"{out}-prepared") / "polar" / row["file"]), cv2.IMREAD_UNCHANGED)
+        picture = stored[..., ::-1] / 65535
+        assert picture.shape == light.shape
+        assert np.median(np.abs(picture - light)[light < 0.9]) < 0.01
 
 
 def test_a_sweep_over_views_shares_its_test_views(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.polarizer_angles import Angle, angle_labels
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.files import make_folder, write_whole
 
@@ -46,7 +47,7 @@ def rounding_of(values: NDArray[np.floating[Any]]) -> list[tuple[int, int]]:
 def intensity_codes(
     intensities: NDArray[np.float32], invalid: NDArray[np.bool_], rounding: Rounding = EXACT
 ) -> NDArray[np.uint16]:
-    """Linear intensities [4, H, W, 3] in [0, 1] as 16-bit codes, rounded, but for the largest.
+    """Linear intensities [K, H, W, 3] in [0, 1] as 16-bit codes, rounded, but for the largest.
 
     Only invalid pixels [H, W] may have the largest code, because readers take it for saturation.
     """
@@ -66,22 +67,29 @@ def picture_name(view: str, angle: int) -> str:
     return f"polar/{view}_{angle:03d}.png"
 
 
+def picture_names(view: str, angles: Sequence[Angle] = ANGLES) -> list[str]:
+    """The paths of a view's pictures at any angles in its scene folder."""
+    return [f"polar/{view}_{label}.png" for label in angle_labels(angles)]
+
+
 def write_view(
     root: Path,
     view: str,
     codes: NDArray[np.uint16],
     invalid: NDArray[np.bool_] | None = None,
     mask: NDArray[np.bool_] | None = None,
+    angles: Sequence[Angle] = ANGLES,
 ) -> dict[str, int]:
     """Write the pictures of a view.
 
     Args:
         root: the scene folder.
         view: name of the view.
-        codes: linear 16-bit codes at 0, 45, 90 and 135 degrees, [4, H, W, 3] RGB. Where the channels are equal, as
+        codes: linear 16-bit codes at ``angles``, [K, H, W, 3] RGB. Where the channels are equal, as
             those of a monochrome sensor are, one is written.
         invalid: unusable pixels, [H, W].
         mask: object mask, [H, W].
+        angles: of the pictures, where there are others than four.
 
     Returns:
         The size in bytes of each file that was written, by its path in the scene folder.
@@ -91,9 +99,7 @@ def write_view(
     """
     if (codes == codes[..., :1]).all():
         codes = codes[..., 0]
-    files: dict[str, NDArray[Any]] = {
-        picture_name(view, angle): picture for angle, picture in zip(ANGLES, codes, strict=True)
-    }
+    files: dict[str, NDArray[Any]] = dict(zip(picture_names(view, angles), codes, strict=True))
     for folder, pixels in (("invalid", invalid), ("masks", mask)):
         if pixels is not None:
             files[f"{folder}/{view}.png"] = pixels.astype(np.uint8) * 255

@@ -23,6 +23,7 @@ from polarguide.options import gibibytes
 VERBS = {
     "demo": "demo",
     "calibrate": "calibrate",
+    "scale": "scale",
     "prepare": "prepare",
     "inspect": "inspect",
     "train": "train",

@@ -51,6 +51,10 @@ def synth(
     )
     if settings.sensor == "ideal":
         console.print(f"next: polarguide train {done} --out runs/{done.name}", markup=False)
+    elif settings.sensor == "filter":
+        console.print(
+            f"next: polarguide prepare {done / 'raw'} --out {done}-prepared --poses {done}", markup=False
+        )
     else:
         console.print(
             f"next: polarguide prepare {done / 'raw'} --out {done}-prepared --sensor {settings.sensor.upper()} "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,10 @@ from polarguide.capture.filter.align import Shift, align_shots, estimate_shifts
 from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
-from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
+from polarguide.capture.filter.transfer import decide_transfer, linear_intensities, rounding_of_bytes
 from polarguide.capture.memory import require_memory_of_each
-from polarguide.capture.view import ANGLES, FULL_CODE
-from polarguide.capture.write import EXACT, Rounding, rounding_of
-from polarguide.color import srgb_decode_array
+from polarguide.capture.view import ANGLES
+from polarguide.capture.write import EXACT, Rounding
 from polarguide.errors import PolarguideError
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
@@ -50,22 +50,7 @@ class FilterSource(Source):
         self.views = list(self._files)
         self.paths = [files[angle] for files in self._files.values() for angle in ANGLES]
         self._raw = [path for path in self.paths if is_camera_raw(path)]
-        white = white_gains(settings.white_balance)
-        if white is None or (white != (1.0, 1.0, 1.0) and len(self._raw) < len(self.paths)):
-            raise PolarguideError(
-                "--white-balance",
-                expected="none for pictures; none or three gains for camera raw",
-                found=settings.white_balance,
-                remedy="Omit it.",
-            )
-        self._white = white
-        if self._raw and settings.transfer == "srgb":
-            raise PolarguideError(
-                "--transfer",
-                expected="auto or linear for camera raw, which is developed without tone curve",
-                found="srgb",
-                remedy="Omit it.",
-            )
+        self._white = development_of(self.paths, settings)
 
     def _require_memory(self) -> None:
         """Refuse shots that do not fit into memory, from their headers alone.
@@ -116,8 +101,7 @@ class FilterSource(Source):
             return EXACT
         gains = self._settings.calibration.gains
         smallest = scale / (max(gains) if gains is not None else 1.0 / math.sqrt(1.0 - LARGEST_IMBALANCE))
-        shown = np.arange(256) / 255
-        return rounding_of(FULL_CODE * smallest * (srgb_decode_array(shown) if transfer == "srgb" else shown))
+        return rounding_of_bytes(transfer, smallest)
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the four shots: validity, transfer, shifts, gains, the sense of the angles, then the turn."""
@@ -128,7 +112,7 @@ class FilterSource(Source):
         if asked.align:
             shifts = estimate_shifts(linear)
             linear, bad = align_shots(linear, bad, shifts)
-            notes = _shift_notes(view, shifts)
+            notes = shift_notes(view, shifts)
         invalid = np.asarray(bad.any(axis=0))
         ratio = pair_ratio(linear.mean(axis=3), ~invalid)
         gains = asked.calibration.gains or UNIT_GAINS
@@ -165,7 +149,32 @@ class FilterSource(Source):
         )
 
 
-def _shift_notes(view: str, shifts: list[Shift]) -> list[str]:
+def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[float, float, float]:
+    """Gains of R, G and B for camera raw, after a check that white balance and transfer fit the files.
+
+    Raises:
+        PolarguideError: one does not.
+    """
+    raw = [path for path in paths if is_camera_raw(path)]
+    white = white_gains(settings.white_balance)
+    if white is None or (white != (1.0, 1.0, 1.0) and len(raw) < len(paths)):
+        raise PolarguideError(
+            "--white-balance",
+            expected="none for pictures; none or three gains for camera raw",
+            found=settings.white_balance,
+            remedy="Omit it.",
+        )
+    if raw and settings.transfer == "srgb":
+        raise PolarguideError(
+            "--transfer",
+            expected="auto or linear for camera raw, which is developed without tone curve",
+            found="srgb",
+            remedy="Omit it.",
+        )
+    return white
+
+
+def shift_notes(view: str, shifts: list[Shift]) -> list[str]:
     """Notes about shots that were shifted, and about shots without a reliable estimate."""
     named = list(zip(ANGLES, shifts, strict=True))
     moved = [f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})" for angle, shift in named if shift.corrected]

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.polarizer_angles import Angle
 from polarguide.capture.view import ANGLES, FULL_CODE
-from polarguide.capture.write import EXACT, intensity_codes, picture_name, write_view
+from polarguide.capture.write import EXACT, intensity_codes, picture_name, picture_names, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, holds_files, make_folder, read_file, require_inside, write_whole
 from polarguide.records import decode, read_record, shortened, to_json
@@ -32,6 +34,8 @@ PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
 """What is written into."""
 REMEDY = "Give another --out; nothing was written."
+_LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
+"""Of a picture's angle, in its name."""
 _OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 
 
@@ -50,11 +54,24 @@ class _Request(msgspec.Struct):
     file: dict[str, tuple[int, int]]
 
 
+_Factor = Annotated[float, msgspec.Meta(gt=0, lt=1e12)]
+
+
+class _Exposure(msgspec.Struct):
+    """One of the single shots of a view."""
+
+    source: str
+    angle: float | Literal["unknown", "none"]
+    light: _Factor | None
+    given_gain: _Factor | None
+
+
 class _View(msgspec.Struct):
     files: dict[str, int]
     geometry: Geometry
     clipped_share: float
     warp: Any
+    exposures: list[_Exposure] = []
 
 
 class _Measured(msgspec.Struct):
@@ -121,11 +138,14 @@ class SceneFolder:
         journal = decode(content, _Journal, path, remedy=REMEDY)
         for view, record in journal.prepare.views.items():
             _require_own_files(path, view, record.files)
+            if journal.prepare.request.format == "singles":
+                _require_exposures(path, view, record)
         state = content["prepare"]
         before, now = json.loads(json.dumps(state["request"])), json.loads(json.dumps(self.request))
         if before["settings"].get("white_balance") == "grey":  # its name in earlier journals
             before["settings"]["white_balance"] = "gray"
-        before["settings"].setdefault("analyzers", None)  # earlier journals do not know it
+        for name in ("analyzers", "angles"):  # earlier journals do not know them
+            before["settings"].setdefault(name, None)
         self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
         if self._follows_none:
             for record in (before, now):
@@ -221,10 +241,11 @@ class SceneFolder:
         invalid: NDArray[np.bool_],
         record: dict[str, Any],
         mask: NDArray[np.bool_] | None = None,
+        angles: Sequence[Angle] = ANGLES,
     ) -> None:
         """Write the pictures of a view, then note it."""
         codes = intensity_codes(intensities, invalid, (self.measured or {}).get("rounding", EXACT))
-        sizes = write_view(self.root, view, codes, invalid, mask)
+        sizes = write_view(self.root, view, codes, invalid, mask, angles)
         self.views[view] = {**record, "files": sizes}
         self.save()
 
@@ -244,13 +265,31 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
     Raises:
         PolarguideError: there is one.
     """
-    own = {*(picture_name(view, angle) for angle in ANGLES), f"invalid/{view}.png", f"masks/{view}.png"}
-    strangers = sorted(set(files) - own)
+    pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.png")
+    own = {f"invalid/{view}.png", f"masks/{view}.png"}
+    strangers = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
     if strangers or "/" in view or "\\" in view or "\0" in view:
         raise PolarguideError(
             f"{journal} (views, {shortened(view)})",
             expected=f"pictures of this view, {picture_name('VIEW', 0)} and so on",
             found=shortened(strangers[0] if strangers else view),
+            remedy=REMEDY,
+        )
+
+
+def _require_exposures(journal: Path, view: str, record: _View) -> None:
+    """Refuse a journal that does not say what the pictures of a view are.
+
+    Raises:
+        PolarguideError: it does not.
+    """
+    named = picture_names(view, [exposure.angle for exposure in record.exposures])
+    pictures = sorted(name for name in record.files if name.startswith("polar/"))
+    if sorted(named) != pictures or not named:
+        raise PolarguideError(
+            f"{journal} (views, {shortened(view)})",
+            expected=f"the exposures of {shortened(pictures)}",
+            found=shortened(named),
             remedy=REMEDY,
         )
 

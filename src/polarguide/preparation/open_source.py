@@ -10,10 +10,12 @@ from pathlib import Path
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets import detect_dataset, open_dataset
 from polarguide.capture.datasets.pisr import SENSOR as PISR_SENSOR
+from polarguide.capture.filter.angle_table import TABLE
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
+from polarguide.capture.filter.single_shots import folders_of_angles, split_name
 from polarguide.capture.formats.headers import stated_size
 from polarguide.capture.formats.pictures import SUFFIXES
-from polarguide.capture.layout import angle_folders, describe_contents, index_files
+from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
@@ -24,6 +26,7 @@ from polarguide.preparation.filter_source import FilterSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.object_masks import MaskedSource
 from polarguide.preparation.settings import PrepareSettings, check_format
+from polarguide.preparation.singles_source import SinglesSource
 from polarguide.preparation.source import Source
 from polarguide.preparation.stokes_source import StokesSource
 
@@ -38,7 +41,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
     require_folder(root, expected="a folder of camera files", remedy=remedy)
     kind: str = settings.format
     if kind == "auto":
-        kind = detect_dataset(root) or "filter"
+        kind = detect_dataset(root) or ("singles" if are_single_shots(root, settings) else "filter")
         if kind == "filter" and not angle_folders(root):
             shots = find_shots(root, nested=settings.sensor is None)
             several = any(len(files) > 1 for files in shots.values())
@@ -50,13 +53,33 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
     if not found.views:
         raise PolarguideError(
             root,
-            expected="raw mosaics (PNG, TIFF, .npy, .raw) or four shots per view (folders 0, 45, 90, 135)"
-            if kind in ("mosaic", "filter")
+            expected="raw mosaics (PNG, TIFF, .npy, .raw) or shots through a filter (folders 0, 45, 90, 135, ...)"
+            if kind in ("mosaic", "filter", "singles")
             else f"the files of a {kind} dataset",
             found=describe_contents(root),
             remedy="See docs/reference/formats.md for the layouts.",
         )
     return found if settings.masks is None else MaskedSource(found, settings.masks)
+
+
+def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
+    """Whether a folder holds photographs through a filter that are not four to a view, by what says their angles.
+
+    That is a table or an option, an angle that is none of the four, or one angle a view. Four angles of which some are
+    missing may be a mistake: ``--format singles`` takes what there is.
+    """
+    if settings.sensor is not None:
+        return False
+    if settings.angles is not None or (root / TABLE).exists():
+        return True
+    files = list_files(root, SHOT_SUFFIXES)
+    if not files:
+        return any(angle not in ANGLES for angle in folders_of_angles(root).values())
+    named = [split_name(path.stem) for path in files]
+    found = [name for name in named if name is not None]
+    if any(angle not in ANGLES for _, angle in found):
+        return True
+    return len({view for view, _ in found}) == len(files)
 
 
 def _unknown_layout(root: Path) -> PolarguideError:
@@ -82,13 +105,16 @@ def _unknown_layout(root: Path) -> PolarguideError:
     if mosaics:
         remedy = f"Raw mosaics: polarguide prepare {source} {out} --sensor IMX250MYR (color) or IMX250MZR. {remedy}"
     if photographs and not mosaics:
-        remedy += " Ordinary photographs, one a view, carry no polarization."
+        remedy += (
+            " Photographs through a filter that was turned between them: --angles unknown, or angles.csv with the "
+            "columns file,angle. Ordinary photographs carry no polarization."
+        )
         if len(photographs) % len(ANGLES) == 0:
             remedy += " docs/how-to/prepare.md sorts shots that are numbered in the order they were taken."
     inside = None if named else _folder_of_pictures(root)
     if inside is not None:
         remedy = f"Give the folder that the pictures are in, such as {inside}. {remedy}"
-    expected = "four shots per view, raw mosaics with --sensor, or a published dataset"
+    expected = "shots through a filter, raw mosaics with --sensor, or a published dataset"
     return PolarguideError(root, expected=expected, found=found or "nothing to read", remedy=remedy)
 
 
@@ -116,6 +142,8 @@ def poses_beside(root: Path) -> list[str]:
 def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
     if kind == "filter":
         return FilterSource(root, settings)
+    if kind == "singles":
+        return SinglesSource(root, settings)
     if kind == "mosaic":
         return MosaicSource(root, settings)
     dataset = open_dataset(root, kind, transfer=settings.transfer)

@@ -20,6 +20,7 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
+from polarguide.preparation.exposure_table import write_exposure_table
 from polarguide.preparation.folder import JOURNAL, PARTIAL, SCENE, SFM, SceneFolder
 from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
 from polarguide.preparation.settings import PrepareSettings
@@ -65,7 +66,7 @@ def prepare_scene(
     is ever replaced.
 
     Args:
-        source: folder of raw mosaics or of filter shots.
+        source: folder of raw mosaics, of filter shots, or of single shots.
         out: scene folder: new, empty, or of the same request.
         settings: what to do.
         reporter: where messages and progress go.
@@ -150,6 +151,9 @@ def _write_scene(
     _write_views(folder, pictures, poses, reporter)
     if poses is not None:
         _write_model(folder, poses)
+    if pictures.kind == "singles":
+        estimate = settings.gains == "auto"
+        write_exposure_table(folder, estimate=estimate, posed=poses is not None, reporter=reporter)
     folder.finish(_summary(folder, pictures, settings, points))
     shutil.rmtree(folder.root / SFM, ignore_errors=True)
     return _outcome(folder, pictures, settings, new=True)
@@ -158,6 +162,8 @@ def _write_scene(
 def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> str:
     """What can be done with views that have no poses, for a message."""
     out = f"--out {shlex.quote(root.resolve().name + '-priors')}"
+    if pictures.kind == "singles":
+        return "--poses none develops the photographs without poses."
     if pictures.kind not in ("mosaic", "filter"):
         return (
             f"Without poses: --poses none develops the views, then polarguide priors SCENE {out} shows each."
@@ -255,14 +261,16 @@ def _write_view(
         mask = None if mask is None else warp.apply_mask(mask)
         warped = warp.record()
     record = {**done.record, "geometry": asdict(done.geometry), "warp": warped}
-    folder.write_view(view, intensities, invalid, record, mask)
+    folder.write_view(view, intensities, invalid, record, mask, done.angles)
     faults = []
     if record["clipped_share"] > MOSTLY:
         faults.append(f"{view}: {record['clipped_share']:.0%} of its pixels are saturated.")
     elif not all(picture.any() for picture in intensities):
         faults.append(f"{view}: a picture of it is black throughout.")
-    elif all(np.array_equal(intensities[0], other) for other in intensities[1:]):
-        faults.append(f"{view}: its four pictures are the same, as copies of one are.")
+    elif len(intensities) > 1 and all(np.array_equal(intensities[0], other) for other in intensities[1:]):
+        faults.append(
+            f"{view}: its {'four ' * (len(intensities) == 4)}pictures are the same, as copies of one are."
+        )
     return faults, done.notes
 
 
@@ -286,13 +294,15 @@ def _summary(
 ) -> dict[str, Any]:
     """What ``scene.json`` says to people; everything else is under "prepare"."""
     measured = dict(folder.measured or {})
-    measured.pop(PHOTOGRAPHS, None)
+    for name in (PHOTOGRAPHS, "light"):
+        measured.pop(name, None)
     calibration = settings.calibration.record()
     calibration["sense"] = measured.pop("sense", calibration["sense"])
     shares = [record["clipped_share"] for record in folder.views.values()]
     return {
         "prepared_by": f"polarguide {__version__}",
         "format": pictures.kind,
+        **({"polarizer": "filter"} if pictures.kind in ("filter", "singles") else {}),
         "sensor": settings.sensor,
         "packing": settings.packing,
         **measured,

@@ -16,6 +16,7 @@ from msgspec import Meta
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
 from polarguide.errors import PolarguideError
+from polarguide.polarizer import ANGLES
 from polarguide.records import check_options, option_name
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
@@ -29,6 +30,7 @@ _OPTIONS = {
     "mosaic": _MOSAIC_ONLY,
     "pisr": _MOSAIC_ONLY,
     "filter": ("transfer", "align", "white_balance", "precision"),
+    "singles": ("transfer", "align", "white_balance", "precision", "angles"),
     "gnerp": ("transfer",),
 }
 """Options that mean something for some formats only."""
@@ -41,7 +43,8 @@ class PrepareSettings:
     """What a scene folder is made from, and how.
 
     Attributes:
-        format: What the source is; auto looks for datasets and the four shots of a filter, else takes mosaics.
+        format: What the source is; auto looks for datasets, the four shots of a filter, and singles (photographs
+            through a filter at any angles, each with a pose of its own), else takes mosaics.
         sensor: Sensor of raw mosaics: MYR are color, MZR is monochrome.
         packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
         width: Width of .raw files in pixels.
@@ -58,8 +61,10 @@ class PrepareSettings:
         register: Bring the four angles of half size, which lie half a pixel apart, to one place.
         transfer: Encoding of filter shots (auto: by the curvature of the response, as inspect judges it) and of GNeRP.
         align: Estimate and correct small shifts between the four shots of a filter.
-        gains: auto corrects what the light tells of the gains of the angles; none leaves them. Gains of a calibration
-            go first.
+        angles: Polarizer angles of singles: unknown or none for all, numbers in the order of the files that repeat
+            (such as 0,60,120), or the path of a table (.csv); without it angles.csv, folders or names say them.
+        gains: auto corrects what the light tells of the gains of the angles, and estimates the exposure of every single
+            shot; none leaves them. Gains of a calibration go first.
         calibration: gains, order, sense and zero of the angles.
         analyzers: calibration of the sensor that polarguide calibrate wrote; takes the place of gains.
         precision: source rounds the intensities to less than a fifth of a step of the camera's values, full to 16 bits,
@@ -74,7 +79,7 @@ class PrepareSettings:
         seed: Seed of SfM.
     """
 
-    format: Literal["auto", "mosaic", "filter"] | Dataset = "auto"
+    format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
     sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
     packing: Literal["10p", "12p", "12packed"] | None = None
     width: _Positive | None = None
@@ -91,6 +96,7 @@ class PrepareSettings:
     register: bool = True
     transfer: Literal["auto", "linear", "srgb"] = "auto"
     align: bool = True
+    angles: str | None = None
     gains: Literal["auto", "none"] = "auto"
     calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
     analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
@@ -133,6 +139,7 @@ class PrepareSettings:
             white_balance="gray" if self.white_balance == "grey" else self.white_balance,
             dark_frame=_absolute(self.dark_frame),
             analyzers=_absolute(self.analyzers),
+            angles=_table_path(self.angles),
             poses=self.poses if self.poses in ORIGINS else os.path.realpath(self.poses),
             masks=_absolute(self.masks),
         )
@@ -199,6 +206,14 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
                 found=f"one for {_owners(name)}",
                 remedy="Leave it out, or choose another --format.",
             )
+    calibration = settings.calibration
+    if kind == "singles" and (calibration.gains is not None or calibration.order != ANGLES):
+        raise PolarguideError(
+            "calibration (gains, order)",
+            expected="only sense and zero for single shots",
+            found=f"gains {calibration.gains}, order {calibration.order}",
+            remedy="Say the angle and gain of every shot in angles.csv.",
+        )
     if kind not in ("mosaic", "filter", "pisr") and settings.calibration.gains is not None:
         raise PolarguideError(
             "calibration (gains)",
@@ -210,8 +225,9 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
 
 def _owners(name: str) -> str:
     """The formats that an option is for, in words."""
-    words = {"mosaic": "raw mosaics", "filter": "rotating filters"}
-    return " and ".join(words.get(kind, kind) for kind, names in _OPTIONS.items() if name in names)
+    words = {"mosaic": "raw mosaics", "filter": "rotating filters", "singles": "single shots"}
+    *others, last = (words.get(kind, kind) for kind, names in _OPTIONS.items() if name in names)
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:
@@ -269,6 +285,11 @@ def _four_angles(text: str) -> tuple[int, int, int, int]:
             remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
         ) from None
     return first, second, third, fourth
+
+
+def _table_path(angles: str | None) -> str | None:
+    """``--angles``, with an absolute path where it names a table."""
+    return os.path.realpath(angles) if angles is not None and angles.lower().endswith(".csv") else angles
 
 
 def _absolute(path: Path | None) -> Path | None:

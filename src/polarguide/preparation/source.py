@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.colmap.write import PosedCamera
+from polarguide.capture.polarizer_angles import Angle
+from polarguide.polarizer import ANGLES
 from polarguide.progress import Advance
 
 
@@ -20,10 +22,11 @@ class DevelopedView:
     """The developed picture of one view.
 
     Attributes:
-        intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees.
+        intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees; or [K, H, W, 3].
         invalid: pixels that depend on an unusable sample, [H, W].
         geometry: crop and scale relative to the stored picture.
         mask: object mask, [H, W], or None.
+        angles: of the pictures, counter-clockwise as displayed.
         record: measurements for ``scene.json``.
         notes: messages for the user.
     """
@@ -34,6 +37,7 @@ class DevelopedView:
     record: dict[str, Any]
     notes: tuple[str, ...] = ()
     mask: NDArray[np.bool_] | None = None
+    angles: Sequence[Angle] = ANGLES
 
 
 class Source(Protocol):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from polarguide.camera import Camera
 from polarguide.capture.write import write_png, write_view
@@ -17,6 +18,7 @@ from polarguide.synth import folder
 from polarguide.synth.build import BuiltScene, build_scene
 from polarguide.synth.cameras import held_out_names, place_cameras, view_names
 from polarguide.synth.film import LobeRadiance, render_lobes
+from polarguide.synth.filter_shots import FilterShot, filter_jpeg, plan_shot
 from polarguide.synth.geometry import ground_truth_maps
 from polarguide.synth.manifest import verify_scene, write_manifest
 from polarguide.synth.mesh import Array
@@ -50,7 +52,14 @@ class Job:
     @property
     def mosaics(self) -> bool:
         """Whether raw mosaics are written."""
-        return self.settings.sensor != "ideal"
+        return self.settings.sensor.startswith("imx")
+
+    def photograph(self, number: int) -> tuple[FilterShot, Path] | None:
+        """How a view is photographed through a filter, and the file; None where it is not."""
+        if self.settings.sensor != "filter":
+            return None
+        shot = plan_shot(self.settings.seed, number)
+        return shot, self.out / "raw" / f"{self.names[number]}_a{shot.body_angle}.jpg"
 
     def has_ground_truth(self, name: str) -> bool:
         """Whether a view gets ground truth."""
@@ -58,7 +67,9 @@ class Job:
 
     def files(self, name: str) -> list[Path]:
         """The files of a view."""
-        return folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name), raw=self.mosaics)
+        files = folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name), raw=self.mosaics)
+        photograph = self.photograph(self.names.index(name))
+        return files if photograph is None else [*files, photograph[1]]
 
 
 def synthesize(
@@ -100,6 +111,8 @@ def synthesize(
         gains = {str(45 * k): gain for k, gain in enumerate(job.sensor.gains)}
         folder.write_file(out / "calibration.json", json.dumps({"gains": gains}).encode())
         record["sensor"] = {"name": settings.sensor.upper(), **job.sensor.data()}
+    if settings.sensor == "filter":
+        record["shots"] = {name: asdict(plan_shot(settings.seed, k)) for k, name in enumerate(names)}
     with_truth = [number for number, name in enumerate(names) if job.has_ground_truth(name)]
     if with_truth:
         write_sheet(out, [names[k] for k in with_truth], [cameras[k] for k in with_truth])
@@ -144,8 +157,13 @@ def _render_view(job: Job, number: int) -> None:
         data = io.BytesIO()
         np.savez_compressed(data, **arrays)
         folder.write_file(job.out / "gt" / f"{name}.npz", data.getvalue())
-    # With a sensor the noise is in its mosaics, and these pictures are what they should lead to.
-    noise = 0.0 if job.mosaics else settings.noise
+    photograph = job.photograph(number)
+    if photograph is not None:
+        rays = camera.rays(dtype=torch.float64).numpy()
+        shot, path = photograph
+        folder.write_file(path, filter_jpeg(stokes, rays, shot, settings.noise, random, job.sensor))
+    # With a sensor the noise is in its files, and these pictures are what they should lead to.
+    noise = settings.noise if settings.sensor == "ideal" else 0.0
     codes = folder.sensor_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
     write_view(job.out, name, codes)
 

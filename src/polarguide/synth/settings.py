@@ -28,10 +28,11 @@ class SynthSettings:
     """How a scene is rendered and recorded.
 
     Attributes:
-        size: Width and height of the pictures; a simulated sensor has twice as many pixels each way.
+        size: Width and height of the pictures; a simulated polarization sensor has twice as many pixels each way.
         samples: Paths per pixel and lobe; test views take four times as many.
         seed: Seed of every random draw.
-        sensor: A sensor whose 12-bit raw mosaics are written, too, for polarguide prepare.
+        sensor: A sensor whose 12-bit raw mosaics are written, too, for polarguide prepare; filter: one 8-bit JPEG of
+            each view, through a filter before an ordinary camera.
         noise: Photon and read noise: 1 is a sensor exposed to full scale, 2 a quarter of that light, 0 none.
         color: Three channels with exact values, or a sampled spectrum.
         ground_truth: Views that get ground truth.
@@ -42,7 +43,7 @@ class SynthSettings:
     size: str = "256x192"
     samples: Annotated[int, Meta(ge=1, le=65536)] = 64
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
-    sensor: Literal["ideal", "imx250myr", "imx250mzr"] = "ideal"
+    sensor: Literal["ideal", "imx250myr", "imx250mzr", "filter"] = "ideal"
     noise: Annotated[float, Meta(ge=0, le=100)] = 0.0
     color: Color = "rgb"
     ground_truth: Literal["test", "all"] = "test"

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +67,7 @@ def match_features(
     Raises:
         PolarguideError: COLMAP failed; the database is removed because it may be the cause.
     """
-    kinds = set(sizes.values()) if cameras is None else {camera.intrinsics for camera in cameras.values()}
-    single = len(kinds) == 1
-    mode = pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE
+    groups = _sharing_a_camera(sizes, cameras)
     count = len(sizes)
     verify = pycolmap.TwoViewGeometryOptions()
     set_seed(verify.ransac, seed)
@@ -82,7 +80,7 @@ def match_features(
     try:
         with _counted_rows(database, "keypoints") as rows:
             run_step(
-                lambda: pycolmap.extract_features(database, images, camera_mode=mode, **reading),
+                lambda: _extract(database, images, groups, reading),
                 seed, reporter, "extracting features", count, rows,
             )  # fmt: skip
         numbers: dict[str, tuple[int, int]] = {}
@@ -101,6 +99,29 @@ def match_features(
                 path.unlink()
         raise
     return numbers
+
+
+def _sharing_a_camera(
+    sizes: Mapping[str, tuple[int, int]], cameras: Mapping[str, PosedCamera] | None
+) -> list[list[str]]:
+    """The views, in groups that share their intrinsics: those of one size, as where a camera was held upright or not.
+
+    Known intrinsics that differ are each view's own.
+    """
+    if cameras is not None and len({camera.intrinsics for camera in cameras.values()}) > 1:
+        return [[view] for view in sizes]
+    return [[view for view in sizes if sizes[view] == size] for size in dict.fromkeys(sizes.values())]
+
+
+def _extract(database: Path, images: Path, groups: Sequence[Sequence[str]], reading: dict[str, Any]) -> None:
+    """Features of all pictures, with one camera for each group of views."""
+    mode = pycolmap.CameraMode.SINGLE
+    if all(len(group) == 1 for group in groups):
+        pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, **reading)
+        return
+    for group in groups:
+        names = [f"{view}.png" for view in group]
+        pycolmap.extract_features(database, images, image_names=names, camera_mode=mode, **reading)
 
 
 def _named_for_colmap(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:

@@ -19,6 +19,9 @@ from polarguide.files import make_folder
 from polarguide.progress import Reporter
 
 _FEW_SHARE = 0.8
+_ENOUGH_SHARE = 0.9
+"""With a smaller share of the views, mapping is tried again with fewer matches."""
+_WEAK_PAIR, _WEAK_START, _WEAK_POSE = 10, 50, 15
 LEAST_VIEWS = 3
 ADVICE = (
     "More views with more overlap (15 degrees or less between neighbors), a textured ground under the object and "
@@ -56,7 +59,8 @@ def reconstruct(
     """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
 
     With a mask ``folder/masks/<view>.png``, features come from its white parts only. Features and matches are kept
-    in a database, so that an interrupted run does not repeat them. The largest model is used.
+    in a database, so that an interrupted run does not repeat them. Where less than nine tenths of the views are
+    registered, mapping is tried again with half as many matches. The largest model is used.
 
     Args:
         folder: holds the pictures; the database and the model are written there.
@@ -86,12 +90,16 @@ def reconstruct(
         database, images, sizes,
         matching=matching, seed=seed, reporter=reporter, cameras=cameras, masks=folder / "masks",
     )  # fmt: skip
-    shutil.rmtree(trial, ignore_errors=True)
-    make_folder(trial)
     free = intrinsics is None or refine
-    models = _map(database, images, trial, len(sizes), seed, reporter, free)
+    models = _map(database, images, trial, len(sizes), seed, reporter, free, weak=False)
+    if _registered(models) < _ENOUGH_SHARE * len(sizes):
+        reporter.say(
+            f"{_registered(models)} of {len(sizes)} views registered; trying with fewer matches a view."
+        )
+        others = _map(database, images, trial, len(sizes), seed, reporter, free, weak=True)
+        models = max(models, others, key=_registered)
     best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
-    registered = 0 if best is None else best.num_reg_images()
+    registered = _registered(models)
     if best is None or registered < LEAST_VIEWS:
         raise NotConnectedError(
             images,
@@ -114,12 +122,34 @@ def reconstruct(
     return model
 
 
+def _registered(models: dict[int, Any]) -> int:
+    """Views of the largest model."""
+    return max((found.num_reg_images() for found in models.values()), default=0)
+
+
 def _map(
-    database: Path, images: Path, trial: Path, count: int, seed: int, reporter: Reporter, free: bool
+    database: Path,
+    images: Path,
+    trial: Path,
+    count: int,
+    seed: int,
+    reporter: Reporter,
+    free: bool,
+    *,
+    weak: bool,
 ) -> dict[int, Any]:
-    """Incremental mapping: pycolmap's models, by number; ``free`` intrinsics are estimated."""
+    """Incremental mapping: pycolmap's models, by number; ``free`` intrinsics are estimated.
+
+    ``weak`` asks for half as many matches as COLMAP usually does: small pictures have few, and fewer still where
+    reflections change from shot to shot behind a filter.
+    """
+    shutil.rmtree(trial, ignore_errors=True)
+    make_folder(trial)
     options = pipeline_options(seed)
     options.min_model_size = LEAST_VIEWS
+    if weak:
+        options.min_num_matches, options.mapper.init_min_num_inliers = _WEAK_PAIR, _WEAK_START
+        options.mapper.abs_pose_min_num_inliers = _WEAK_POSE
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
     placed: list[None] = []
     step = functools.partial(placed.append, None)

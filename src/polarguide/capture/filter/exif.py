@@ -19,7 +19,7 @@ _QUARTER = (5, 6, 7, 8)
 def orientation(data: bytes) -> int:
     """The orientation tag of a picture file, 1 to 8; 1 (as stored) where there is none that can be read."""
     try:
-        value = _tag(_exif(data))
+        value = _tag(tags_of(data))
     except struct.error:
         value = 1
     return value if 1 <= value <= 8 else 1
@@ -40,7 +40,7 @@ def orientation_calibration(code: int) -> Calibration:
     return Calibration(sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in _QUARTER else 0.0)
 
 
-def _exif(data: bytes) -> bytes:
+def tags_of(data: bytes) -> bytes:
     """The TIFF structure that holds the tags of a picture file; empty if there is none."""
     if data.startswith(b"\xff\xd8"):
         segments = (content for kind, content in jpeg_segments(data) if kind == 0xE1)

@@ -37,12 +37,12 @@ _READ = 4 * 3 * (2 + 2)
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """The four shots of a view as stored.
+    """The shots of a view as stored: four, or K at other angles.
 
     Attributes:
-        pictures: [4, H, W, 3] uint8 or uint16, by the names of the angles.
+        pictures: [4, H, W, 3] uint8 or uint16, by the names of the angles; or [K, H, W, 3].
         orientation: their EXIF orientation.
-        clipped: pixels with a channel of a shot at full scale, [4, H, W].
+        clipped: pixels with a channel of a shot at full scale, [4, H, W] or [K, H, W].
         dark: pixels that are 0 in all shots and channels, [H, W].
     """
 
@@ -148,7 +148,7 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
                 root,
                 expected=f"the shots of view {view} at 0, 45, 90 and 135 degrees",
                 found=f"none at {' and '.join(missing)}",
-                remedy="Add the file, or remove the other shots of the view.",
+                remedy="Add the file, or remove the other shots of the view (prepare --format singles takes any).",
             )
 
 
@@ -160,23 +160,32 @@ def read_shots(files: dict[int, Path], gains: tuple[float, float, float] = (1.0,
     """
     remedy = "Make the pictures smaller, all by the same factor."
     require_memory_of_each(list(files.values()), _READ, "four shots", remedy=remedy)
+    return read_stack([files[angle] for angle in ANGLES], gains)
+
+
+def read_stack(paths: Sequence[Path], gains: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Shots:
+    """Read the shots of a view, any number; ``gains`` of R, G and B are for camera raw files.
+
+    Raises:
+        PolarguideError: one cannot be read, or they differ in size, depth or orientation.
+    """
     pictures: list[NDArray[Any]] = []
     codes: list[int] = []
-    for angle in ANGLES:
-        picture, code = _read_shot(files[angle], gains)
+    for path in paths:
+        picture, code = _read_shot(path, gains)
         if pictures:
-            require_alike(files[angle], picture, files[0], pictures[0])
+            require_alike(path, picture, paths[0], pictures[0])
         pictures.append(picture)
         codes.append(code)
         if codes[-1] != codes[0]:
             raise PolarguideError(
-                files[angle],
-                expected=f"EXIF orientation {codes[0]} like {files[0].name}",
+                path,
+                expected=f"EXIF orientation {codes[0]} like {paths[0].name}",
                 found=str(codes[-1]),
-                remedy="Keep the camera still between the four shots, or export them all alike.",
+                remedy="Keep the camera still between the shots of a view, or export them all alike.",
             )
     stack = np.stack(pictures)
-    jpeg = files[0].suffix.lower() in (".jpg", ".jpeg")
+    jpeg = paths[0].suffix.lower() in (".jpg", ".jpeg")
     full = _JPEG_FULL if jpeg else int(np.iinfo(stack.dtype).max)
     clipped, lit = np.asarray((stack >= full).any(axis=3)), np.asarray(stack.any(axis=(0, 3)))
     return Shots(stack, codes[0], clipped, ~lit)

@@ -13,6 +13,8 @@ from polarguide.capture import checks
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.view import FULL_CODE
+from polarguide.capture.write import Rounding, rounding_of
+from polarguide.color import srgb_decode_array
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,16 @@ class TransferDecision:
 def linear_intensities(pictures: NDArray[Any], transfer: str) -> NDArray[np.float32]:
     """Stored values -> linear intensities in [0, 1], same shape, float32."""
     return linear_codes(pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
+
+
+def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
+    """What codes of 8-bit pictures are rounded to: by their steps, which grow with sRGB's.
+
+    Args:
+        transfer: "linear" or "srgb". smallest: factor of the linear intensities.
+    """
+    shown = np.arange(256) / 255
+    return rounding_of(FULL_CODE * smallest * (srgb_decode_array(shown) if transfer == "srgb" else shown))
 
 
 def decide_transfer(shots: Sequence[Shots], *, jpeg: bool) -> TransferDecision:

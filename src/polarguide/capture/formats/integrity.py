@@ -101,14 +101,18 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
         at = end
 
 
-def tiff_entries(data: bytes) -> Iterator[tuple[int, int, int, int]]:
-    """Tag, type and count of the entries in the first directory of a TIFF file, and where their values stand.
+def tiff_entries(data: bytes, start: int | None = None) -> Iterator[tuple[int, int, int, int]]:
+    """Tag, type and count of the entries in a directory of a TIFF file, and where their values stand.
+
+    Args:
+        data: the file. start: where the directory stands; the first one's place if None.
 
     Raises:
         struct.error: the file is too short.
     """
     order = tiff_order(data)
-    (start,) = struct.unpack_from(order + "I", data, 4)
+    if start is None:
+        (start,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, start)
     for entry in range(start + 2, start + 2 + 12 * count, 12):
         tag, kind, length = struct.unpack_from(order + "HHI", data, entry)

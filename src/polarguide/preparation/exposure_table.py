@@ -1,0 +1,259 @@
+"""The exposures of single shots: their gains relative to one another, and the table ``angles.csv`` of a scene."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.camera import Camera
+from polarguide.capture.colmap.model import read_model
+from polarguide.capture.filter.angle_table import TABLE
+from polarguide.capture.formats.headers import read_picture
+from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes
+from polarguide.capture.polarizer_angles import angle_text
+from polarguide.capture.relative_exposures import FEWEST, exposures_of_points, reconciled
+from polarguide.capture.view import FULL_CODE, listed
+from polarguide.capture.write import picture_names
+from polarguide.files import write_whole
+from polarguide.preparation.folder import SceneFolder
+from polarguide.progress import Reporter
+
+_DARK = 0.004
+"""Linear intensity below which noise and rounding of 8 bits hide the exposure."""
+_FAR = math.log(2.0) * 1.5
+"""Logarithm of a gain that is warned of where files do not state it: one and a half stops from the others."""
+_LISTED = 40
+_PATCH = (3, 3)
+
+
+@dataclass
+class _Exposure:
+    """A picture of the scene.
+
+    Attributes:
+        view, file: its view, and its name in ``polar/``.
+        record: what is noted of it in ``scene.json``.
+        points: how many points its view was compared at.
+        log: logarithm of its gain.
+    """
+
+    view: str
+    file: str
+    record: dict[str, Any]
+    points: int = 0
+    log: float = math.nan
+
+
+def write_exposure_table(folder: SceneFolder, *, estimate: bool, posed: bool, reporter: Reporter) -> None:
+    """Estimate the gain of every picture of a written scene, note it with the views, and write ``angles.csv``.
+
+    Shots of one view share one exposure, but for what their files say. Gains that the user gave stay, and the others
+    fit them; without any, the geometric mean is 1.
+
+    Args:
+        folder: with all views written, and the model if there is one.
+        estimate: whether to estimate gains; else they are 1, or as given.
+        posed: whether there is a model.
+        reporter: for messages.
+    """
+    pictures = [
+        _Exposure(view, Path(name).name, record)
+        for view in sorted(folder.views)
+        for name, record in _named(view, folder.views[view]["exposures"])
+    ]
+    if estimate:
+        _estimate(folder.root, pictures, posed, reporter)
+    else:
+        for picture in pictures:
+            picture.log = 0.0
+    _apply_given(pictures)
+    for picture in pictures:
+        gain = float(f"{math.exp(picture.log):.6g}")
+        picture.record |= {"gain": gain, "points": picture.points}
+    _tell(pictures, reporter)
+    write_whole(folder.root / TABLE, _table(pictures).encode())
+
+
+def _named(view: str, exposures: list[dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
+    """The exposures of a view with the paths of their pictures."""
+    return list(zip(picture_names(view, [item["angle"] for item in exposures]), exposures, strict=True))
+
+
+def _table(pictures: list[_Exposure]) -> str:
+    """The table of a scene: files are named exactly, as they are read again."""
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(("file", "view", "angle", "gain"))
+    for picture in pictures:
+        angle, gain = angle_text(picture.record["angle"]), f"{picture.record['gain']:.6g}"
+        lines.writerow((picture.file, picture.view, angle, gain))
+    return text.getvalue()
+
+
+def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Reporter) -> None:
+    """Gains of all pictures, from points in common and what the files say."""
+    views = list(dict.fromkeys(picture.view for picture in pictures))
+    noted = [picture.record["light"] for picture in pictures]
+    files = np.log(np.array([math.nan if light is None else light for light in noted], np.float64))
+    within = _within_views(pictures, files)
+    rows = {view: [k for k, picture in enumerate(pictures) if picture.view == view] for view in views}
+    points, numbers = np.full(len(views), math.nan), np.zeros(len(views), np.int64)
+    if posed and len(views) > 1:
+        points, numbers = exposures_of_points(_values(root, pictures, rows, within, reporter))
+    of_view = np.array([float(np.mean((files - within)[rows[view]])) for view in views])
+    # Views that were photographed both ways: whatever the shots are compared at, most of it passed the filter.
+    bare = np.array([all(pictures[k].record["angle"] == "none" for k in rows[view]) for view in views])
+    found = reconciled(points, of_view, bare)
+    lost = [view for view, log in zip(views, found.logs, strict=True) if not math.isfinite(log)]
+    middle = float(np.nanmean(found.logs)) if len(lost) < len(views) else 0.0
+    for place, view in enumerate(views):
+        log = found.logs[place] if math.isfinite(found.logs[place]) else middle
+        for k in rows[view]:
+            pictures[k].log, pictures[k].points = float(log + within[k]), int(numbers[place])
+    _say_how(views, points, of_view, found.scatter, lost, reporter)
+    _warn([views[k] for k in found.contradicted], pictures, of_view, reporter)
+
+
+def _within_views(pictures: list[_Exposure], files: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Logarithms of exposures relative to the mean of their view, as the files say; 0 where not all of them do."""
+    found = np.zeros(len(pictures))
+    for view in {picture.view for picture in pictures}:
+        places = [k for k, picture in enumerate(pictures) if picture.view == view]
+        bare = np.array([pictures[k].record["angle"] == "none" for k in places])
+        # Beside shots through the filter, one without gets twice the light at the same exposure.
+        extra = np.where(bare & (not bare.all()), math.log(2.0), 0.0)
+        logs = files[places] + extra if np.isfinite(files[places]).all() else extra
+        found[places] = logs - logs.mean()
+    return found
+
+
+def _values(
+    root: Path,
+    pictures: list[_Exposure],
+    rows: dict[str, list[int]],
+    within: NDArray[np.float64],
+    reporter: Reporter,
+) -> NDArray[np.float64]:
+    """Intensities of the model's points in the views that observe them, [points, views]; NaN elsewhere."""
+    model = read_model(root)
+    views = list(rows)
+    observed = model.observations(views).numpy()
+    values = np.full(observed.shape, math.nan)
+    places = model.points.double().numpy()
+    with reporter.track("comparing exposures", len(views)) as advance:
+        for column, view in enumerate(views):
+            seen = np.flatnonzero(observed[:, column])
+            if len(seen):
+                files = [root / "polar" / pictures[k].file for k in rows[view]]
+                gray = np.mean(
+                    [_gray(path) / math.exp(within[k]) for path, k in zip(files, rows[view], strict=True)],
+                    axis=0,
+                )
+                path = root / "invalid" / f"{view}.png"
+                bad = decode_mask(path, read_picture(path), any_value=True)
+                values[seen, column] = _at(places[seen], model.camera(view), gray, bad)
+            advance(column + 1)
+    return values
+
+
+def _gray(path: Path) -> NDArray[np.float64]:
+    """The mean of the colors of a picture, linear, [H, W]."""
+    codes = linear_codes(decode_picture(path, read_picture(path)), "linear")
+    return codes.mean(axis=2) / FULL_CODE
+
+
+def _at(
+    places: NDArray[np.float64], camera: Camera, gray: NDArray[np.float64], bad: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Means of a picture around the projections of points [N, 3]; NaN outside, where dark, or beside bad pixels."""
+    local = places @ camera.rotation.numpy().T + camera.translation.numpy()
+    depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
+    column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
+    row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
+    height, width = gray.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    found = np.full(len(places), math.nan)
+    at = row[inside].astype(int), column[inside].astype(int)
+    means, spoiled = cv2.blur(gray, _PATCH), cv2.dilate(bad.astype(np.uint8), np.ones(_PATCH, np.uint8)) > 0
+    found[inside] = np.where(spoiled[at] | (means[at] < _DARK), math.nan, means[at])
+    return found
+
+
+def _apply_given(pictures: list[_Exposure]) -> None:
+    """Take the gains that the user gave, and fit the others to them; without any, their geometric mean becomes 1."""
+    given = [math.nan if (gain := p.record["given_gain"]) is None else math.log(gain) for p in pictures]
+    known = np.isfinite(given)
+    logs = np.array([picture.log for picture in pictures])
+    shift = float(np.median((np.array(given) - logs)[known])) if known.any() else -float(logs.mean())
+    for picture, fixed, is_fixed in zip(pictures, given, known, strict=True):
+        picture.log = fixed if is_fixed else picture.log + shift
+
+
+def _say_how(
+    views: list[str],
+    points: NDArray[np.float64],
+    files: NDArray[np.float64],
+    scatter: float | None,
+    lost: list[str],
+    reporter: Reporter,
+) -> None:
+    """Where the gains come from."""
+    by_points, by_files = int(np.isfinite(points).sum()), int(np.isfinite(files).sum())
+    if scatter is not None:
+        said = f"Gains: exposures that the files state, and points in common ({by_points} of {len(views)} views); "
+        reporter.say(f"{said}the two differ by {scatter:.1%} (robust standard deviation).")
+    elif by_points:
+        reporter.say(
+            f"Gains: from points in common ({by_points} of {len(views)} views); the files do not state exposures. "
+            "Reflections and polarization mislead them by some percent."
+        )
+    elif by_files:
+        reporter.say(f"Gains: exposures that the files state ({by_files} of {len(views)} views).")
+    if lost:
+        reporter.warn(
+            f"The gains of {len(lost)} of {len(views)} views are not known ({listed(lost)}): their files state no "
+            f"exposure, and fewer than {FEWEST} points tell it. They are taken for average; {TABLE} may say better."
+        )
+
+
+def _warn(
+    contradicted: list[str], pictures: list[_Exposure], files: NDArray[np.float64], reporter: Reporter
+) -> None:
+    """Name exposures that are out of the ordinary."""
+    if contradicted:
+        reporter.warn(
+            f"{len(contradicted)} views are brighter or darker than the exposure in their files says "
+            f"({listed(contradicted)}); the points are believed. A filter that was taken off, or edited pictures?"
+        )
+    if not np.isfinite(files).any():
+        logs = np.array([picture.log for picture in pictures])
+        far = [p.file for p in pictures if abs(p.log - float(np.median(logs))) > _FAR]
+        if far:
+            reporter.warn(
+                f"{len(far)} pictures are exposed by more than 1.5 stops differently ({listed(far)})."
+            )
+
+
+def _tell(pictures: list[_Exposure], reporter: Reporter) -> None:
+    """Print the table: all pictures, or the most unusual ones of many."""
+    shown = pictures
+    if len(pictures) > _LISTED:
+        shown = sorted(sorted(pictures, key=lambda p: -abs(p.log))[:_LISTED], key=lambda p: (p.view, p.file))
+    width = max(len("picture"), *(len(picture.file) for picture in shown))
+    rows = [f"{'picture':<{width}}   angle    gain  stops  points"]
+    for picture in shown:
+        gain = picture.record["gain"]
+        angle = angle_text(picture.record["angle"])
+        stops = f"{math.log2(gain):+.2f}"
+        rows.append(f"{picture.file:<{width}} {angle:>7} {gain:>7.3f} {stops:>6} {picture.points:>7}")
+    if len(shown) < len(pictures):
+        rows.append(f"... and {len(pictures) - len(shown)} nearer to the mean; {TABLE} has all.")
+    reporter.say("\n".join(rows))

@@ -1,0 +1,391 @@
+"""``prepare`` on photographs through a filter at any angles, one or several a view."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from zlib import crc32
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from camera_files import ANGLES, behind, read_invalid, smooth_light, write_shots
+from filter_photographs import Photographed, photograph_plane
+from heard import Heard
+from raw_photographs import write_dng
+from tiny_capture import encode_srgb, write_picture
+
+from polarguide.capture.calibration import Calibration
+from polarguide.capture.colmap.model import read_model
+from polarguide.capture.filter.exif import apply_orientation
+from polarguide.errors import PolarguideError
+from polarguide.polarizer import malus
+from polarguide.preparation import prepare as prepare_module
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
+from polarguide.synth.filter_shots import exif_tags
+
+PLAIN = PrepareSettings(poses="none", transfer="linear", align=False)
+
+
+def table(scene: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((scene / "angles.csv").read_text().splitlines()))
+
+
+def summary(scene: Path) -> dict:
+    return json.loads((scene / "scene.json").read_text())
+
+
+def read_one(path: Path) -> np.ndarray:
+    """Linear values of a picture in a scene."""
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert stored.dtype == np.uint16
+    return (stored[..., ::-1] if stored.ndim == 3 else np.repeat(stored[..., None], 3, axis=2)) / 65535.0
+
+
+def gain_errors(capture: Photographed, scene: Path) -> np.ndarray:
+    """Relative errors of the gains, whose common factor is free."""
+    rows = table(scene)
+    found = np.log([float(row["gain"]) for row in rows])
+    known = np.array([capture.shots[row["view"]].stops for row in rows]) * math.log(2)
+    assert found.mean() == pytest.approx(0, abs=1e-5)
+    return found - (known - known.mean())
+
+
+@pytest.mark.parametrize("noted", [True, False])
+def test_hand_held_photographs_become_a_scene(tmp_path: Path, noted: bool) -> None:
+    """Noise, 8 bits, sRGB, automatic exposure, a sheet before the lens, and a camera held in four ways."""
+    capture = photograph_plane(tmp_path, noted=noted)
+    scene, heard = tmp_path / "scene", Heard()
+    done = prepare_scene(capture.folder, scene, PrepareSettings(poses=str(capture.model)), heard)
+    assert done.views == sorted(capture.shots)
+    assert summary(scene)["polarizer"] == "filter"
+    rows = table(scene)
+    assert list(rows[0]) == ["file", "view", "angle", "gain"]
+    assert [row["view"] for row in rows] == sorted(capture.shots)
+    for row in rows:
+        shot = capture.shots[row["view"]]
+        assert float(row["angle"]) == shot.angle
+        assert row["file"] == f"{row['view']}_{int(shot.angle):03d}.png"
+        exposed = capture.light(row["view"]) * 2**shot.stops
+        picture = read_one(scene / "polar" / row["file"])
+        valid = ~read_invalid(scene, row["view"])
+        assert np.median(np.abs(picture - exposed)[valid] / exposed[valid]) < 0.03
+        assert abs(np.mean((picture - exposed)[valid]) / exposed[valid].mean()) < 0.01
+    assert np.abs(gain_errors(capture, scene)).max() < (0.01 if noted else 0.04)
+    model = read_model(scene)
+    for view, camera in capture.cameras.items():
+        np.testing.assert_allclose(model.camera(view).rotation, camera.rotation, atol=1e-6)
+        np.testing.assert_allclose(model.camera(view).center, camera.center, atol=1e-6)
+    (shown,) = (text for text in heard.said if text.startswith("picture"))
+    assert [line.split()[0] for line in shown.splitlines()[1:]] == [row["file"] for row in rows]
+    assert prepare_scene(capture.folder, scene, PrepareSettings(poses=str(capture.model))).new is False
+
+
+@pytest.mark.parametrize("code", range(1, 9))
+def test_exif_turns_pixels_and_the_angle(tmp_path: Path, code: int) -> None:
+    """The angle is said relative to the camera's body; the picture behind it belongs to the turned angle."""
+    stored = smooth_light(96, 128)
+    upright = np.stack([apply_orientation(plane, code) for plane in stored])
+    upright[1:] *= -1.0 if code in (5, 6, 7, 8) else 1.0
+    upright[2] *= -1.0 if code in (2, 4, 5, 7) else 1.0
+    path = tmp_path / "in" / "v_a30.jpg"
+    write_picture(path, behind(stored, [30])[0], bits=8)
+    data, block = path.read_bytes(), b"Exif\0\0" + exif_tags(code, None)
+    path.write_bytes(data[:2] + b"\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block + data[2:])
+    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
+    (row,) = table(tmp_path / "out")
+    # Worked out by hand: a quarter adds 90, a mirror changes the sign.
+    assert float(row["angle"]) == {1: 30, 2: 150, 3: 30, 4: 150, 5: 60, 6: 120, 7: 60, 8: 120}[code]
+    expected = malus(upright, np.radians(float(row["angle"])))
+    assert np.abs(read_one(tmp_path / "out" / "polar" / row["file"]) - expected).max() < 0.03
+
+
+def test_views_with_any_number_of_shots(tmp_path: Path) -> None:
+    light, source = smooth_light(), tmp_path / "in"
+    said = {"four": ANGLES, "three": (0, 60, 120), "pair": (10, 100), "one": (165,)}
+    for view, angles in said.items():
+        for angle, values in zip(angles, behind(light, angles), strict=True):
+            write_picture(source / f"{view}_a{angle}.png", values)
+    write_picture(source / "half_unknown.png", behind(light, [20])[0])
+    write_picture(source / "bare_none.png", light[0] / 2)
+    done = prepare_scene(source, tmp_path / "out", replace(PLAIN, gains="none"))
+    assert done.views == sorted([*said, "half", "bare"])
+    rows = table(tmp_path / "out")
+    for row in rows:
+        expected = light[0] / 2
+        if row["angle"] not in ("unknown", "none"):
+            assert int(row["angle"]) in said[row["view"]]
+            expected = malus(light, np.radians(float(row["angle"])))
+        elif row["angle"] == "unknown":
+            expected = behind(light, [20])[0]
+        np.testing.assert_allclose(read_one(tmp_path / "out" / "polar" / row["file"]), expected, atol=2e-5)
+    assert {row["gain"] for row in rows} == {"1"}
+    assert sorted(path.stem for path in (tmp_path / "out" / "invalid").iterdir()) == done.views
+    assert {row["view"]: row["angle"] for row in rows} | {"half": "unknown", "bare": "none"} == {
+        row["view"]: row["angle"] for row in rows
+    }
+
+
+def write_three(folder: Path, names: tuple[str, ...]) -> None:
+    for name in names:
+        write_picture(folder / name, behind(smooth_light(), [0])[0])
+
+
+@pytest.mark.parametrize(
+    ("names", "angles", "expected"),
+    [
+        (("c_000.jpg", "d-30.jpg", "e 15deg.jpg"), None, {"c": "0", "d": "30", "e": "15"}),
+        (("IMG_0012_045.jpg", "IMG_0013_a7.5.jpg"), None, {"IMG_0012": "45", "IMG_0013": "7.5"}),
+        (("0/x.png", "30/y.png", "none/z.png"), None, {"x": "0", "y": "30", "z": "none"}),
+        (("IMG_1.jpg", "IMG_2.jpg"), "unknown", {"IMG_1": "unknown", "IMG_2": "unknown"}),
+        (("IMG_1.jpg", "IMG_2.jpg"), "0, 60", {"IMG_1": "0", "IMG_2": "60"}),
+        (("DSC_015_unknown.jpg", "DSC_016_none.jpg"), None, {"DSC_015": "unknown", "DSC_016": "none"}),
+    ],
+)
+def test_names_folders_and_options_say_angles(
+    tmp_path: Path, names: tuple[str, ...], angles: str | None, expected: dict[str, str]
+) -> None:
+    write_three(tmp_path / "in", names)
+    prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, angles=angles))
+    assert {row["view"]: row["angle"] for row in table(tmp_path / "out")} == expected
+
+
+def test_a_table_says_angles_views_and_gains(tmp_path: Path) -> None:
+    source = tmp_path / "in"
+    write_three(source, ("a.png", "b.png", "c.png"))
+    (source / "angles.csv").write_text(
+        "\ufefffile,angle,view,gain\r\na.png,-30,first,\r\nb.png, 60 ,first,\r\n\r\nc.png,Unknown,,0.5\r\n",
+        "utf-8",
+    )
+    clockwise = replace(PLAIN, calibration=Calibration(sense="cw", zero=10.0))
+    prepare_scene(source, tmp_path / "out", clockwise)
+    found = {row["file"]: (row["view"], row["angle"], row["gain"]) for row in table(tmp_path / "out")}
+    assert found == {
+        "first_040.png": ("first", "40", "0.5"),
+        "first_130.png": ("first", "130", "0.5"),
+        "c_unknown.png": ("c", "unknown", "0.5"),
+    }
+
+
+def test_a_photograph_without_a_filter_gets_twice_the_light(tmp_path: Path) -> None:
+    light = smooth_light(peak=0.45)
+    for view in "abcd":
+        write_picture(tmp_path / "in" / f"{view}_a20.png", behind(light, [20])[0])
+    write_picture(tmp_path / "in" / "e_none.png", light[0])
+    for path in (tmp_path / "in").iterdir():
+        _state_exposure(path)
+    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
+    gains = {row["view"]: float(row["gain"]) for row in table(tmp_path / "out")}
+    assert gains["e"] / gains["a"] == pytest.approx(2.0, rel=1e-4)
+
+
+def _state_exposure(path: Path) -> None:
+    """Put an exposure time into a PNG file."""
+    data, tags = path.read_bytes(), b"eXIf" + exif_tags(1, Fraction(1, 60))
+    chunk = (len(tags) - 4).to_bytes(4, "big") + tags + crc32(tags).to_bytes(4, "big")
+    path.write_bytes(data[:33] + chunk + data[33:])
+
+
+def test_a_file_that_lies_about_its_exposure_is_named(tmp_path: Path) -> None:
+    capture, heard = photograph_plane(tmp_path), Heard()
+    path = next(capture.folder.glob("v3_*"))
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    linear = np.where(stored <= 10, stored / 255 / 12.92, ((stored / 255 + 0.055) / 1.055) ** 2.4)
+    _, data = cv2.imencode(".jpg", np.rint(255 * encode_srgb(linear / 2)), [cv2.IMWRITE_JPEG_QUALITY, 98])
+    head = path.read_bytes()
+    length = int.from_bytes(head[4:6], "big")
+    path.write_bytes(head[: 4 + length] + data[2:].tobytes())
+    prepare_scene(capture.folder, tmp_path / "scene", PrepareSettings(poses=str(capture.model)), heard)
+    assert any("1 views are brighter or darker than the exposure" in t and "(v3)" in t for t in heard.said)
+    errors = gain_errors(capture, tmp_path / "scene")
+    assert errors[3] - np.median(errors) == pytest.approx(-math.log(2), abs=0.05)
+
+
+def test_no_gains_on_request(tmp_path: Path) -> None:
+    capture = photograph_plane(tmp_path, views=3)
+    asked = PrepareSettings(poses=str(capture.model), gains="none")
+    prepare_scene(capture.folder, tmp_path / "scene", asked)
+    assert {row["gain"] for row in table(tmp_path / "scene")} == {"1"}
+
+
+def test_camera_raw(tmp_path: Path) -> None:
+    light = smooth_light(64, 96)
+    for view, angle in (("a", 20), ("b", 70)):
+        write_dng(tmp_path / "in" / f"{view}_a{angle}.dng", behind(light, [angle])[0], orientation=6)
+    prepare_scene(tmp_path / "in", tmp_path / "out", PrepareSettings(poses="none"))
+    rows = table(tmp_path / "out")
+    assert [(row["view"], row["angle"]) for row in rows] == [("a", "110"), ("b", "160")]
+    expected = np.rot90(behind(light, [20])[0], -1)
+    off = np.abs(read_one(tmp_path / "out" / "polar" / rows[0]["file"]) - expected)[4:-4, 4:-4]
+    assert off.max() < 0.01
+
+
+def test_what_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = photograph_plane(tmp_path, views=4)
+    asked, scene = PrepareSettings(poses=str(capture.model)), tmp_path / "scene"
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(prepare_module, "write_exposure_table", stop)
+        with pytest.raises(KeyboardInterrupt):
+            prepare_scene(capture.folder, scene, asked)
+    assert not (scene / "scene.json").exists()
+    before = {path: path.stat().st_mtime_ns for path in (scene / "polar").iterdir()}
+    assert prepare_scene(capture.folder, scene, asked).new
+    assert {path: path.stat().st_mtime_ns for path in (scene / "polar").iterdir()} == before
+    assert len(table(scene)) == 4
+    first = next(capture.folder.glob("v0_*"))
+    first.rename(first.with_name("v0_unknown.jpg"))
+    with pytest.raises(PolarguideError, match="that was changed, added or removed"):
+        prepare_scene(capture.folder, scene, asked)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda view: view.pop("exposures"), "expected the exposures of"),
+        (lambda view: view["exposures"][0].update(angle="left"), "angle"),
+        (lambda view: view["exposures"][0].update(light=-1), "light"),
+        (lambda view: view["exposures"][0].update(given_gain="x"), "given_gain"),
+        (lambda view: view["exposures"][0].update(angle=33), "expected the exposures of"),
+        (lambda view: view["files"].update({"polar/other_045.png": 1}), "expected pictures of this view"),
+    ],
+)
+def test_a_journal_that_was_changed_is_refused(tmp_path: Path, change: Callable, message: str) -> None:
+    write_three(tmp_path / "in", ("a_a30.png",))
+    scene = tmp_path / "scene"
+    prepare_scene(tmp_path / "in", scene, PLAIN)
+    whole = summary(scene)
+    change(whole["prepare"]["views"]["a"])
+    (scene / "scene.json").unlink()
+    (scene / "prepare.json").write_text(json.dumps(whole))
+    with pytest.raises(PolarguideError, match=message):
+        prepare_scene(tmp_path / "in", scene, PLAIN)
+
+
+def test_developed_first_and_posed_later(tmp_path: Path) -> None:
+    capture = photograph_plane(tmp_path, views=5, noted=False)
+    scene = tmp_path / "scene"
+    prepare_scene(capture.folder, scene, PrepareSettings(poses="none"))
+    assert {row["gain"] for row in table(scene)} == {"1"}
+    prepare_scene(capture.folder, scene, PrepareSettings(poses=str(capture.model)))
+    assert np.abs(gain_errors(capture, scene)).max() < 0.05
+
+
+def test_four_shots_of_a_tripod_stay_what_they_were(tmp_path: Path) -> None:
+    write_shots(tmp_path / "in", "v", behind(smooth_light()))
+    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
+    found = summary(tmp_path / "out")
+    assert (found["format"], found["polarizer"]) == ("filter", "filter")
+    assert not (tmp_path / "out" / "angles.csv").exists()
+    (tmp_path / "in" / "90" / "v.png").unlink()
+    with pytest.raises(PolarguideError, match=r"none at 90.*--format singles"):
+        prepare_scene(tmp_path / "in", tmp_path / "less", PLAIN)
+    prepare_scene(tmp_path / "in", tmp_path / "less", replace(PLAIN, format="singles"))
+    assert [row["angle"] for row in table(tmp_path / "less")] == ["0", "45", "135"]
+
+
+TABLES = {
+    "missing line": (
+        "file,angle\na.png,0\n",
+        r"angles.csv: expected a line for every photograph.*none for 1 \(b.png\)",
+    ),
+    "doubled line": ("file,angle\na.png,0\nb.png,1\na.png,2\n", "found two for a.png, lines 2 and 4"),
+    "no number": ("file,angle\na.png,0\nb.png,left\n", r"line 3\), b.png: expected an angle.*found \"left\""),
+    "not finite": ("file,angle\na.png,nan\nb.png,0\n", "line 2.*expected an angle"),
+    "infinite": ("file,angle\na.png,inf\nb.png,0\n", "line 2.*expected an angle"),
+    "empty angle": ("file,angle\na.png,\nb.png,0\n", "line 2.*expected an angle"),
+    "no file": ("file,angle\na.png,0\nb.png,0\nc.png,0\n", "expected the file .*c.png, found nothing"),
+    "no header": ("a.png,0\nb.png,0\n", "expected the header file,angle"),
+    "semicolons": ("file;angle\na.png;0\n", "with commas between"),
+    "strange column": ("file,angle,size\na.png,0,1\nb.png,0,1\n", "expected the header"),
+    "too few cells": ("file,angle\na.png\nb.png,0\n", "line 2.: expected 2 cells, found 1"),
+    "too many cells": ("file,angle\na.png,0,1\nb.png,0\n", "line 2.: expected 2 cells, found 3"),
+    "empty": ("", "found an empty file"),
+    "no text": (b"\xff\xfe\x00", "expected CSV text in UTF-8"),
+    "twice one angle": ("file,angle,view\na.png,0,v\nb.png,180,v\n", "one photograph of v at 180 degrees"),
+    "twice no filter": (
+        "file,angle,view\na.png,none,v\nb.png,none,v\n",
+        "one photograph of v without a filter",
+    ),
+    "elsewhere": ("file,angle\n../x.png,0\na.png,0\nb.png,0\n", "expected files in"),
+    "no picture": ("file,angle\nangles.csv,0\na.png,0\nb.png,0\n", "expected pictures"),
+    "name of a view": ("file,angle,view\na.png,0,a/b\nb.png,0,c\n", "names of views that files may have"),
+    "control characters": (
+        'file,angle,view\na.png,0,"a\nb"\nb.png,0,c\n',
+        "names of views that files may have",
+    ),
+    "gain": ("file,angle,gain\na.png,0,0\nb.png,0,1\n", "expected a gain from"),
+}
+
+
+@pytest.mark.parametrize("fault", TABLES)
+def test_faults_of_the_table(tmp_path: Path, fault: str) -> None:
+    content, message = TABLES[fault]
+    write_three(tmp_path / "in", ("a.png", "b.png"))
+    write_picture(tmp_path / "x.png", np.zeros((8, 8, 3)))
+    data = content if isinstance(content, bytes) else content.encode()
+    (tmp_path / "in" / "angles.csv").write_bytes(data)
+    refused(tmp_path, PLAIN, message)
+
+
+def refused(root: Path, settings: PrepareSettings, message: str) -> None:
+    """One line, and nothing is written."""
+    with pytest.raises(PolarguideError, match=message) as error:
+        prepare_scene(root / "in", root / "out", settings)
+    assert "\n" not in str(error.value)
+    assert not (root / "out" / "scene.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "changes", "message"),
+    [
+        (("a_a30.jpg", "IMG_0012.jpg"), {}, r"1 of 2 without one \(IMG_0012.jpg\)"),
+        (("img_001.jpg", "img_002.jpg"), {"format": "singles"}, "2 of 2 without one"),
+        (("img_001.jpg", "img_002.jpg"), {}, "--angles unknown, or angles.csv"),
+        (("a_a30.jpg", "a-30.png"), {}, "one photograph of a at 30 degrees"),
+        (("a_a30.jpg", "b_a30.png"), {}, "one kind of file.*JPEG and PNG or TIFF"),
+        (("IMG_1.jpg", "IMG_1.png"), {"angles": "unknown"}, "one file called IMG_1"),
+        (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "0,60,120"}, "a multiple of 3 photographs.*found 2"),
+        (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "0,left"}, "--angles: expected unknown, none"),
+        (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "there.csv"}, "there.csv: expected a readable file"),
+        (("a_a30.jpg",), {"poses": "sfm"}, "at least 3 views"),
+        (("a_a30.jpg",), {"calibration": Calibration(order=(90, 45, 0, 135))}, "only sense and zero"),
+        (("a_a30.jpg",), {"demosaic": "full"}, "--demosaic"),
+    ],
+)
+def test_faults_of_names_and_options(
+    tmp_path: Path, names: tuple[str, ...], changes: dict[str, object], message: str
+) -> None:
+    write_three(tmp_path / "in", names)
+    refused(tmp_path, replace(PLAIN, **changes), message)
+
+
+def test_a_table_and_an_option_contradict_each_other(tmp_path: Path) -> None:
+    write_three(tmp_path / "in", ("a.png", "b.png"))
+    (tmp_path / "in" / "angles.csv").write_text("file,angle\na.png,0\nb.png,0\n")
+    refused(tmp_path, replace(PLAIN, angles="unknown"), "--angles: expected nothing beside .*angles.csv")
+
+
+def test_several_sizes_and_cameras(tmp_path: Path) -> None:
+    write_picture(tmp_path / "in" / "a_a30.png", behind(smooth_light(48, 64), [0])[0])
+    write_picture(tmp_path / "in" / "b_a30.png", behind(smooth_light(64, 48), [0])[0])
+    prepare_scene(tmp_path / "in", tmp_path / "held", PLAIN)  # on its side: the same camera
+    write_picture(tmp_path / "in" / "c_a30.png", behind(smooth_light(32, 64), [0])[0])
+    refused(tmp_path, PLAIN, "photographs of one size, found 64x48 .*64x32")
+    (tmp_path / "in" / "c_a30.png").unlink()
+    for name, model in (("a", "one"), ("b", "two")):
+        (tmp_path / "in" / f"{name}_a30.png").unlink()
+        pixels = np.full((48, 64, 3), 20_000, np.uint16)
+        tags = [(272, "s", 0, model, True)]
+        tifffile.imwrite(tmp_path / "in" / f"{name}_a30.tif", pixels, extratags=tags, photometric="rgb")
+    refused(tmp_path, PLAIN, "photographs of one camera, found one .*and two")
