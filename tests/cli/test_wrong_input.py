@@ -43,8 +43,8 @@ def test_a_folder_without_pictures(refused, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flag", "value"),
     [
-        ("--steps", 0),
         ("--steps", -3),
+        ("--gaussians", -1),
         ("--checkpoint-every", 0),
         ("--downscale", 0),
         ("--downscale", 1000),
