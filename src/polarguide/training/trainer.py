@@ -258,7 +258,8 @@ class Trainer:
 
         table = self.polarizers.fit(predicted).to(self._device)
         self.ranks.broadcast(table)
-        state.angles = table.cpu()
+        earlier = [] if state.angles is None else [*state.angles]
+        state.angles = torch.stack([*earlier, table.cpu()])
         for name in self.polarizers.take(state.angles):
             self._shown.pop(name, None)
             self._priors.pop(name, None)
