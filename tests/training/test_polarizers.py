@@ -16,6 +16,7 @@ from polarguide.capture.variants import captured_as
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.angles import report_polarizers
+from polarguide.training.checked import refuse_foreign
 from polarguide.training.polarizers import Polarizers
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
@@ -37,7 +38,7 @@ def predicted(view: View) -> Tensor:
 
 def judged(scene: Scene) -> Polarizers:
     polarizers = Polarizers(scene, STOKES, STEPS)
-    polarizers.take(polarizers.fit(predicted))
+    polarizers.take(polarizers.fit(predicted)[None])
     return polarizers
 
 
@@ -55,7 +56,7 @@ def test_unknown_angles_are_found_and_believed() -> None:
     polarizers = Polarizers(scene, STOKES, STEPS)
     assert polarizers.judgments() == []
     assert next(step for step in range(STEPS) if polarizers.due(step)) == STEPS // 2
-    changed = polarizers.take(polarizers.fit(predicted))
+    changed = polarizers.take(polarizers.fit(predicted)[None])
     assert changed == {view.name for view in scene.train_views}
     for view, known in zip(scene.train_views, true.train_views, strict=True):
         believed, said = polarizers.believed(view).exposures[0], known.exposures[0]
@@ -63,7 +64,7 @@ def test_unknown_angles_are_found_and_believed() -> None:
         assert said.angle is not None
         assert (believed.angle - said.angle + 90) % 180 - 90 == pytest.approx(0, abs=0.1)
         assert torch.equal(polarizers.believed(view).codes, view.codes)
-    assert polarizers.take(polarizers.fit(predicted)) == set()
+    assert polarizers.take(polarizers.fit(predicted)[None]) == set()
 
 
 def test_four_pictures_of_a_sensor_are_left_alone() -> None:
@@ -127,6 +128,7 @@ def test_a_resumed_training_gives_the_same_bits(until: int) -> None:
     scene = captured_as(WHOLE, "unknown")
     whole = trained(scene, STEPS)
     stored = {name: values.clone() for name, values in trained(scene, until).state.tensors().items()}
+    refuse_foreign(stored, STOKES)
     resumed = trained(scene, STEPS, TrainingState.from_tensors(stored, STOKES))
     ours, theirs = whole.state.tensors(), resumed.state.tensors()
     assert ours.keys() == theirs.keys()

@@ -123,10 +123,8 @@ def _scene_views(
     for name in names:
         view = scene.view(name)
         tiles = [_ground_truth_tile(view)]
-        tiles += [
-            _tile(run.row.name, model, view, s.get(name, {}))
-            for run, model, s in zip(runs, opened, scores, strict=True)
-        ]
+        rows = zip(runs, opened, scores, strict=True)
+        tiles += [_tile(planned.row.name, run, view, s.get(name, {})) for planned, run, s in rows]
         yield embed(entry.name, name, tiles, limit)
 
 
@@ -135,8 +133,8 @@ def _ground_truth_tile(view: View) -> Tile:
     return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
 
 
-def _tile(row: str, run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
-    """What one run shows of one view."""
+def _tile(name: str, run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
+    """What a run, called ``name``, shows of one view."""
     result = run.model.render(view.camera).to("cpu")
     pictures: dict[str, Picture] = {}
     for layer in ("final", "diffuse", "specular", "normal"):
@@ -154,7 +152,7 @@ def _tile(row: str, run: OpenedRun, view: View, scores: Mapping[str, float | Non
         for layer, key in LAYER_METRICS.items()
         if layer in pictures and (value := scores.get(key)) is not None
     }
-    return Tile(row, pictures, lines)
+    return Tile(name, pictures, lines)
 
 
 def _angles_picture(angles: Tensor, mask: Tensor | None) -> Picture:

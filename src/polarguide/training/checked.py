@@ -129,13 +129,13 @@ def _check_statistics(tensors: Mapping[str, Tensor], count: int) -> None:
 
 def _check_angles(values: Tensor) -> None:
     """Check what was found of polarizers: rows of a float64 table, as ``Polarizers`` leaves it."""
-    if values.dtype != torch.float64 or values.ndim != 2 or values.shape[1] != COLUMNS:
+    if values.dtype != torch.float64 or values.ndim != 3 or values.shape[2] != COLUMNS or not len(values):
         raise ValueError(
-            f"angles of shape {list(values.shape)}, {values.dtype}, not [P, {COLUMNS}], torch.float64"
+            f"angles of shape {list(values.shape)}, {values.dtype}, not [F, P, {COLUMNS}], torch.float64"
         )
     if not bool(torch.isfinite(values).all()) or (values.numel() and float(values.min()) < 0):
         raise ValueError("angles with values that are negative or not finite")
-    if values.numel() and float(values[:, 1].min()) <= 0:
+    if values.numel() and float(values[..., 1].min()) <= 0:
         raise ValueError("angles with gains that are not positive")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -17,8 +17,10 @@ from polarguide.capture.exposures import found as found_exposure
 from polarguide.training.angle_fit import fit_angle
 from polarguide.training.recipe import Recipe
 
-FIRST, EVERY, LAST = 0.5, 0.05, 0.95
-"""Shares of all steps: before the first, what is said about unknown angles would confirm itself."""
+FIRST, EVERY, LAST = 0.5, 0.05, 0.65
+"""Shares of all steps at which angles are fitted: earlier, what is believed of them would confirm itself, and later,
+what the model has made of them meanwhile does. Their mean holds.
+"""
 WEAK = 0.22
 """Certainty under which an angle is not relied on. Predictions that are wrong in places take some of it away, so that a
 picture through a filter seldom has all of it; half of it is usual when angles are first fitted.
@@ -46,7 +48,8 @@ class Judgment:
     Attributes:
         view, number: the view, and the place of the picture among its exposures.
         said: what the capture says. believed: what the training goes by.
-        angle, gain, certainty, spread, doubt: as fitted, see ``FittedAngle``.
+        angle: the mean of the fits that tell one, degrees. gain, certainty, spread, doubt: of the last of these, see
+            ``FittedAngle``.
     """
 
     view: str
@@ -88,7 +91,7 @@ class Polarizers:
 
     Args:
         scene: the capture. recipe: the method. steps: of the training.
-        table: what was found before [P, 6] float64, as ``table`` gives it; None: nothing.
+        table: what was found before, [F, P, 6] float64: what each ``fit`` gave; None: nothing.
 
     Raises:
         ValueError: the table has another number of rows.
@@ -108,8 +111,8 @@ class Polarizers:
         while self._unknown and times[-1] + EVERY <= LAST + 1e-9:
             times.append(times[-1] + EVERY)
         self._due = {round(share * steps) for share in times} if self._places else set()
-        if table is not None and len(table) != len(self._places):
-            raise ValueError(f"angles of {len(table)} pictures, not {len(self._places)}")
+        if table is not None and table.shape[1] != len(self._places):
+            raise ValueError(f"angles of {table.shape[1]} pictures, not {len(self._places)}")
         self.table = table
         self.ignored = not uses and any(not view.measures_radiance for view in scene.train_views)
         self._believed = self._beliefs()
@@ -146,7 +149,7 @@ class Polarizers:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, COLUMNS)
 
     def take(self, table: Tensor) -> set[str]:
-        """Go by a table from now on; the names of the views of which something else is believed than before."""
+        """Go by a table of all fits [F, P, 6] from now on; the views of which another thing is believed."""
         self.table = table
         before, self._believed = self._believed, self._beliefs()
         names = before.keys() | self._believed.keys()
@@ -158,21 +161,21 @@ class Polarizers:
             return []
         common = self._common_gain()
         found = []
-        for (view, k), row in zip(self._places, self.table.tolist(), strict=True):
-            angle, gain, certainty, spread, doubt, _ = row
+        for (view, k), fits in zip(self._places, self.table.unbind(1), strict=True):
             said = view.exposures[k]
-            judgment = Judgment(view.name, k, said, said, angle, gain, certainty, spread, doubt)
+            rows = [Judgment(view.name, k, said, said, *row[:5]) for row in fits.tolist()]
+            telling = [row for row in rows if not row.vague and not row.unfiltered]
+            judgment = (telling or rows)[-1]
+            if telling:
+                judgment = replace(judgment, angle=mean_angle([row.angle for row in telling]))
             found.append(judgment if said.known else replace(judgment, believed=_belief(judgment, common)))
         return found
 
     def _common_gain(self) -> float | None:
         """What gains are relative to; None where they differ no more than those of locked exposures, as fitted."""
         assert self.table is not None
-        rows = [
-            row
-            for (view, k), row in zip(self._places, self.table, strict=True)
-            if not view.exposures[k].known
-        ]
+        last = zip(self._places, self.table[-1], strict=True)
+        rows = [row for (view, k), row in last if not view.exposures[k].known]
         gains = [float(row[1]) for row in rows if row[-1]]
         if len(gains) < FEWEST:
             return None
@@ -198,3 +201,9 @@ def _belief(judgment: Judgment, common: float | None) -> Exposure:
         return replace(said, filtered=False)
     gain = said.gain if common is None else said.gain * judgment.gain / common
     return found_exposure(said, judgment.angle, gain)
+
+
+def mean_angle(angles: Sequence[float]) -> float:
+    """Mean of angles in degrees that count modulo 180."""
+    doubled = [math.radians(2 * angle) for angle in angles]
+    return math.degrees(math.atan2(sum(map(math.sin, doubled)), sum(map(math.cos, doubled))) / 2) % 180.0

@@ -56,7 +56,7 @@ class TrainingState:
         statistics: of the density control.
         frozen: copy of the Gaussians from which the present priors were computed; None before the first refresh.
         opacity_frozen_until: first step at which opacities train again (after a normal propagation).
-        angles: what was found of polarizers, see ``Polarizers.table``; None: nothing yet.
+        angles: what was found of polarizers, see ``Polarizers``; None: nothing yet.
     """
 
     step: int

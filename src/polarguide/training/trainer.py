@@ -275,7 +275,8 @@ class Trainer:
 
         table = self.polarizers.fit(predicted).to(self._device)
         self.ranks.broadcast(table)
-        state.angles = table.cpu()
+        earlier = [] if state.angles is None else [*state.angles]
+        state.angles = torch.stack([*earlier, table.cpu()])
         for name in self.polarizers.take(state.angles):
             self._partial.pop(name, None)
             for kind in ("shown", "unguided", "priors"):
