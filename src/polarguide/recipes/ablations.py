@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -108,7 +107,7 @@ _COMMON = (
     (
         "consistency-by-dolp",
         "Normals agree with the depth where polarization says something, and nowhere else.",
-        priors(bright=math.inf),
+        priors(bright=0.0),
     ),
     (
         "layers-turn-normals",

@@ -85,6 +85,8 @@ class ViewPriors:
     @cached_property
     def surface(self) -> Tensor:
         """[H, W] weight of the agreement of normals and depth, in [0, 1]."""
+        if not self.settings.bright:
+            return self.weight
         shown = optics.luminance(self.stokes)[0] / 2
         return torch.maximum(self.weight, (shown / self.settings.bright).clamp(0, 1))
 

@@ -6,7 +6,6 @@ Nothing in the loop compares a step with a constant: boundaries are fractions of
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
@@ -154,7 +153,7 @@ class Priors:
         azimuth_share, chromatic_share: of the pixels, the least that the terms on directions are averaged over, so that
             a view whose few pixels are polarized does not pull as hard as one that is polarized all over.
         bright: S0/2 from which on consistency counts fully whatever the DoLP, and below in proportion: where a surface
-            shows something, its depth is known. Infinity: by the DoLP alone.
+            shows something, its depth is known. 0: by the DoLP alone.
     """
 
     candidates: Candidates = "physical"
@@ -167,7 +166,7 @@ class Priors:
     chromatic: bool = False
     azimuth_share: float = 0.0
     chromatic_share: float = 0.0
-    bright: float = math.inf
+    bright: float = 0.0
 
 
 @dataclass(frozen=True)
