@@ -156,7 +156,7 @@ def test_terms_find_what_they_read_of_the_priors(tiny_scene: Scene) -> None:
     entry = pack_priors(priors, fields)
     assert holds(entry, fields)
     assert not holds(entry, fields_read(Weights(normal=1.0)))
-    found = unpack_priors(entry, view.camera)
+    found = unpack_priors(entry, view.camera, recipe.priors)
     for name in fields:
         expected, values = getattr(priors, name), getattr(found, name)
         if name == "stokes":
@@ -165,4 +165,4 @@ def test_terms_find_what_they_read_of_the_priors(tiny_scene: Scene) -> None:
     assert bool(found.normal.isnan().all()), "nothing reads it, so that nothing is there to be read"
     assert found.normal.shape == priors.normal.shape
     pixels = view.camera.width * view.camera.height
-    assert sum(part.bytes for part in entry.values()) == 44 * pixels
+    assert sum(part.bytes for part in entry.values()) == 46 * pixels

@@ -224,9 +224,10 @@ def _layer_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssi
         (weights.diffuse, result.diffuse, priors.diffuse),
     ):
         if weight and layer is not None:
-            total = total + weight * photometric_loss(layer, target, priors.separated, ssim_weight)
-    # Over all pixels like the picture's own term, so that before nothing it does not outweigh it.
-    return priors.separated_share * total
+            # Over all pixels like the picture's own term, so that before nothing it does not outweigh it.
+            share = weight * priors.separated_share
+            total = total + share * photometric_loss(layer, target, priors.separated, ssim_weight)
+    return total
 
 
 def normal_terms(
@@ -253,7 +254,7 @@ def normal_terms(
     if priors is not None:
         assert result.normal is not None
         directions = [
-            Directions(target, weight, factor / total, plane)
+            Directions(target, weight, factor / float(total), plane)
             for factor, target, weight, total, plane in (
                 (weights.normal, nearest_target(result.normal, priors), priors.weight, priors.total, False),
                 (weights.azimuth, priors.plane, priors.weight, priors.total, True),

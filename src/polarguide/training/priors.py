@@ -70,19 +70,19 @@ class ViewPriors:
         return self.reliable * (self.stokes[0].mean(dim=-1) + 0.01).rsqrt()
 
     @cached_property
-    def total(self) -> float:
+    def total(self) -> Tensor:
         """What sums with ``weight`` are divided by: its sum, or the least share of the pixels."""
         return _total(self.weight, self.settings.azimuth_share)
 
     @cached_property
-    def chromatic_total(self) -> float:
+    def chromatic_total(self) -> Tensor:
         """What sums with ``chromatic_weight`` are divided by: its sum, or the least share of the pixels."""
         return _total(self.chromatic_weight, self.settings.chromatic_share)
 
     @cached_property
-    def separated_share(self) -> float:
+    def separated_share(self) -> Tensor:
         """The mean of ``separated``."""
-        return float(self.separated.mean())
+        return self.separated.mean()
 
     @cached_property
     def surface(self) -> Tensor:
@@ -200,8 +200,8 @@ def view_priors(
     )
 
 
-def _total(weight: Tensor, share: float) -> float:
-    return max(1.0, float(weight.sum()), share * weight.numel())
+def _total(weight: Tensor, share: float) -> Tensor:
+    return weight.sum().clamp(min=max(1.0, share * weight.numel()))
 
 
 def _noise(view: View) -> Tensor | float:
