@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
-from polarguide.cli.app import run
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -45,16 +43,3 @@ def test_angles_count_from_behind_the_camera_and_are_read_from_the_front() -> No
     assert seen == {angle: 2 for angle in range(0, 180, 15)}
     assert place(90, 0, 1) == pytest.approx((0, -1))
     assert place(45, 0, 1) == pytest.approx((-math.sqrt(0.5), -math.sqrt(0.5)))
-
-
-def test_the_command_writes_it_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "a.svg"
-    assert run(["scale", "--diameter", "70", "--out", str(out)]) == 0
-    assert out.read_text() == ring_scale(70.0)
-    assert run(["scale", "--diameter", "70", "--out", str(out)]) == 0
-    assert run(["scale", "--diameter", "60", "--out", str(out)]) == 2
-    assert "Give another --out" in capsys.readouterr().err
-    assert out.read_text() == ring_scale(70.0)
-    for wrong in ("nan", "3", "1000"):
-        assert run(["scale", "--diameter", wrong, "--out", str(tmp_path / "b.svg")]) == 2
-    assert "--diameter: expected 20 to 160" in capsys.readouterr().err
