@@ -15,7 +15,7 @@ from polarguide.cli.app import VERBS, function_of, options_of, run
 
 # Fields that a verb sets by other options of its own.
 ELSEWHERE = {
-    *((verb, name) for verb in ("compare", "ablate") for name in ("seed", "views_per_step")),
+    *((verb, name) for verb in ("compare", "ablate") for name in ("seed", "views_per_step", "gaussians")),
     ("prepare", "calibration"),
     ("prepare", "analyzers"),
     ("measure", "calibration"),

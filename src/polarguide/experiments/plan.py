@@ -22,7 +22,7 @@ from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import model_digest, scoring_digest, training_digest
 from polarguide.experiments.options import CompareOptions
-from polarguide.options import Exposures, SceneOptions
+from polarguide.options import Exposures, SceneOptions, check_count
 from polarguide.progress import SILENT, Reporter
 from polarguide.recipes.registry import ablations_of
 from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration
@@ -75,6 +75,9 @@ class Comparison:
     out: Path
     seeds_of: Mapping[str, int] = field(default_factory=dict)
     asked: str = ""
+
+    def __post_init__(self) -> None:
+        check_count("steps", self.settings.steps)  # they do not follow from the size: scenes are compared
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
