@@ -51,8 +51,7 @@ def exposure_svg(results: Results, counts: dict[tuple[str, str], int]) -> str | 
         points = {scene: _points(results, scene, metric.key, counts) for scene in scenes}
         if any(points.values()):
             left, top = len(panels) % 2 * WIDTH, len(panels) // 2 * HEIGHT
-            title = f"{metric.heading} ({metric.unit})" if metric.unit else metric.heading
-            panels.append(_panel(points, title, left, top))
+            panels.append(_panel(points, metric.heading, left, top))
     if not panels:
         return None
     bottom = (len(panels) + 1) // 2 * HEIGHT

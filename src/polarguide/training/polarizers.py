@@ -149,7 +149,7 @@ class Polarizers:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, COLUMNS)
 
     def take(self, table: Tensor) -> set[str]:
-        """Go by a table of all fits [F, P, 6] from now on; the views of which another thing is believed."""
+        """Go by a table of all fits [F, P, 6] from now on; the names of the views of which it changes the beliefs."""
         self.table = table
         before, self._believed = self._believed, self._beliefs()
         names = before.keys() | self._believed.keys()
