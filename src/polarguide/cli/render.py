@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from polarguide.cli.console import console
+from polarguide.cli.console import say
 from polarguide.cli.runs import RunFolder, opened
 from polarguide.errors import PolarguideError, require_package
 from polarguide.options import ComputeOptions, PictureFormat, check_range
@@ -81,4 +81,4 @@ def render(
     sheet = trained.write_pictures(
         out, views=views, layers=names, format=format, transparent=transparent, reporter=reporter
     )
-    console.print(f"pictures: {sheet.parent}   contact sheet: {sheet}")
+    say(f"pictures: {sheet.parent}   contact sheet: {sheet}")

@@ -40,12 +40,17 @@ class FilterSource(Source):
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
+    needs = ("transfer", "scale")
     cameras = None
 
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
         self._settings = settings
         shots = find_shots(root, nested=True)
         require_four_shots(root, shots)
+        unused = [path.name for files in shots.values() for a, path in files.items() if a not in ANGLES]
+        if unused:
+            found = f"{root} has pictures at other angles than 0, 45, 90 and 135 degrees"
+            warnings.warn(f"{found}, which are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
         self._files = dict(sorted(shots.items()))
         self.views = list(self._files)
         self.paths = [files[angle] for files in self._files.values() for angle in ANGLES]
