@@ -66,9 +66,6 @@ def options_of(function: Callable[..., Any]) -> dict[str, Any]:
 
 def run(arguments: Sequence[str]) -> int:
     """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input, or what the verb says)."""
-    if list(arguments) == ["--version"]:
-        print(f"polarguide {__version__}")
-        return 0
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
     for stream in (
         sys.stdout,
@@ -82,9 +79,7 @@ def run(arguments: Sequence[str]) -> int:
     except PolarguideError as error:
         return _failed(_as_flag(error, verb))
     except KeyboardInterrupt:
-        with contextlib.suppress(OSError):
-            _errors().print("stopped.")
-        return 130
+        return _stopped()
     except BrokenPipeError:
         sys.stderr.close()
         return 1
@@ -94,6 +89,8 @@ def run(arguments: Sequence[str]) -> int:
         )
         return _failed(f"{said} Check the name, the rights, and the room on the disk.")
     except Exception as error:
+        if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
+            return _stopped()  # what C code makes of one that comes while it imports
         said = _of_the_machine(error)
         if not said:
             raise
@@ -103,6 +100,13 @@ def run(arguments: Sequence[str]) -> int:
 
 def _errors() -> Console:
     return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def _stopped() -> int:
+    """Say that a signal ended the command, if anybody can be told; returns the exit status."""
+    with contextlib.suppress(OSError):
+        _errors().print("stopped.")
+    return 130
 
 
 def _failed(text: str) -> int:
@@ -141,6 +145,9 @@ _MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --thread
 
 def _call(verb: str | None, arguments: Sequence[str]) -> int:
     """Call a verb; returns the exit status that it gives, 0 where it gives none."""
+    if list(arguments) == ["--version"]:
+        print(f"polarguide {__version__}", flush=True)
+        return 0
     if verb is not None:
         _require_place()
         _refuse_empty_paths(verb, arguments[1:])

@@ -52,7 +52,10 @@ def measure(
     for name in ("settle", "patience", "idle"):
         if watching.watch is None and getattr(watching, name) != getattr(WatchOptions, name):
             raise PolarguideError(
-                f"--{name}", expected="--watch", found="one pass over files", remedy="Leave it out, or watch a folder."
+                f"--{name}",
+                expected="--watch",
+                found="one pass over files",
+                remedy="Leave it out, or watch a folder.",
             )
     reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
     said = _Lines()

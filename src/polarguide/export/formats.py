@@ -261,7 +261,10 @@ def _cameras(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
     require_inside(folder, model)
     if model.is_dir() and holds_files(model) and not (folder / TRANSFORMS).exists():
         raise PolarguideError(
-            model, expected="no model, or one of an earlier export", found="another", remedy="Give another --out."
+            model,
+            expected="no model, or one of an earlier export",
+            found="another",
+            remedy="Give another --out.",
         )
     cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     points = placement.points(scene.points)

@@ -245,4 +245,5 @@ def measure_shots(
                 heard(entry)
             counts[status] += 1
             advance(number)
+        line.table.require_there()
     return Outcome(Path(out), counts, earlier)

@@ -148,12 +148,14 @@ def watch_folder(
             begin = time.monotonic()
             shots = there.shots()
             took = time.monotonic() - begin
+            line.table.require_there()
             for entry in watch.look(shots):
                 heard(entry)
                 counts[entry.status] += 1
                 if should_stop():
                     break
             time.sleep(max(step, 4 * took))
+        line.table.require_there()
         return Outcome(Path(out), counts, 0, watch.waiting(), there.trouble())
 
 

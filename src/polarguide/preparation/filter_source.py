@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,13 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.filter.align import Shift, align_shots, estimate_shifts
 from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
-from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
+from polarguide.capture.filter.shots import find_shots, list_shots, read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
 from polarguide.capture.memory import require_memory_of_each
-from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.capture.write import EXACT, Rounding, rounding_of
 from polarguide.color import srgb_decode_array
-from polarguide.errors import PolarguideError
+from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
@@ -47,9 +48,10 @@ class FilterSource(Source):
         self._settings = settings
         shots = find_shots(root, nested=True)
         require_four_shots(root, shots)
-        unused = [path.name for files in shots.values() for a, path in files.items() if a not in ANGLES]
+        unused = [path.name for path in list_shots(root, nested=True)[1]]
+        unused += [path.name for files in shots.values() for a, path in files.items() if a not in ANGLES]
         if unused:
-            found = f"{root} has pictures at other angles than 0, 45, 90 and 135 degrees"
+            found = f"{root} has pictures without an angle in their names, or at other angles than 0, 45, 90 and 135"
             warnings.warn(f"{found}, which are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
         self._files = dict(sorted(shots.items()))
         self.views = list(self._files)

@@ -282,7 +282,10 @@ def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
     layout = find_layout(shot.root)
     select_views(layout, [shot.view])
     require_memory_of_each(
-        shot.paths, KEPT + READ + _MAPS, "a view", remedy="Free memory, or prepare the scene in a smaller size."
+        shot.paths,
+        KEPT + READ + _MAPS,
+        "a view",
+        remedy="Free memory, or prepare the scene in a smaller size.",
     )
     transfer = "srgb" if options.transfer == "srgb" else "linear"
     data = read_view(layout, shot.view, factor=shot.downscale, transfer=transfer)

@@ -126,8 +126,9 @@ def _user_mesh(path: Path) -> Mesh:
         ) from None
     points = np.array(params["vertex_positions"], float).reshape(-1, 3)
     faces = np.array(params["faces"], np.int64).reshape(-1, 3)
-    if not len(faces) or faces.min() < 0 or faces.max() >= len(points):
-        found = f"corners {faces.min()} to {faces.max()} of {len(points)}" if len(faces) else "no triangle"
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # Mitsuba takes a negative corner for the first
+    if not whole.any() or faces.min() < 0 or faces.max() >= len(points):
+        found = f"corners {faces.min()} to {faces.max()} of {len(points)}" if whole.any() else "no triangle"
         raise PolarguideError(
             path, expected="triangles between its points", found=found, remedy="Export it again."
         )
