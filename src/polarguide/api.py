@@ -192,7 +192,11 @@ def priors(
     if formats:
         chosen = {view.name for view in select_views(scene, views)}
         options = replace(shots or ShotOptions(), transfer=reading.transfer)
-        sets = [found for found in find_shots([scene.root], options) if found.view in chosen]
+        sets = [
+            replace(found, downscale=reading.downscale)
+            for found in find_shots([scene.root], options)
+            if found.view in chosen
+        ]
         write_shots(sets, out, options, formats=formats, refractive_index=refractive_index, reporter=reporter)
     return sheet
 

@@ -251,7 +251,24 @@ def process_count() -> int:
         raise _no_rank(
             "RANK", f"one of up to {MOST_PROCESSES} processes, counted from 0", f"{rank} of {world}"
         )
+    if world > 1:
+        _require_meeting_place()
     return max(1, world)
+
+
+def _require_meeting_place() -> None:
+    """Check what several processes need to find each other.
+
+    Raises:
+        PolarguideError: the variables that torchrun sets hold something else.
+    """
+    local, host, port = (os.environ.get(name, "") for name in ("LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"))
+    if not _is_count(local):
+        raise _no_rank("LOCAL_RANK", "the number of this process on its machine", repr(local))
+    if not host:
+        raise _no_rank("MASTER_ADDR", "the machine of the first process", "none")
+    if not (_is_count(port) and 0 < int(port) < 65536):
+        raise _no_rank("MASTER_PORT", "a port from 1 to 65535", repr(port))
 
 
 def _is_count(text: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections.abc import Container, Mapping, Sequence
@@ -17,6 +18,7 @@ from polarguide.files import require_folder
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
+_READ_FOLDERS = ("polar", "masks", "invalid", "gt", "sparse")
 _NUMBER = re.compile(r"(?<!\d)\d{1,3}(?!\d)")
 _HINT = (
     "Camera files become one by polarguide prepare FOLDER --out SCENE. Else give a folder that holds "
@@ -122,15 +124,27 @@ def require_four(layout: Layout, what: str) -> None:
 
 
 def refuse_scene(out: Path) -> None:
-    """Refuse to write into a scene: what lies beside its pictures means something.
+    """Refuse to write into a scene, or into a folder that it is read from: what lies there means something.
 
     Raises:
         PolarguideError: there is one.
     """
-    if out.is_dir() and ((out / "polar").is_dir() or len(angle_folders(out)) == len(ANGLES)):
+    real = Path(os.path.realpath(out))
+    found = "a scene" if _is_scene(real) else ""
+    for folder in (real, *real.parents):
+        known = folder.name in _READ_FOLDERS or _ANGLE_FOLDER.fullmatch(folder.name)
+        if known and _is_scene(folder.parent):
+            found = f"{folder.name}/ of a scene"
+    if found:
         raise PolarguideError(
-            out, expected="a folder for what is written", found="a scene", remedy="Give another --out."
+            out, expected="a folder for what is written", found=found, remedy="Give another --out."
         )
+
+
+def _is_scene(folder: Path) -> bool:
+    with contextlib.suppress(PolarguideError, OSError):  # two folders of one angle, or no right to look
+        return folder.is_dir() and ((folder / "polar").is_dir() or len(angle_folders(folder)) == len(ANGLES))
+    return False
 
 
 def select_views(layout: Layout, views: Sequence[str] | None) -> list[str]:

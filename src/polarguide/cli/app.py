@@ -6,8 +6,10 @@ import contextlib
 import dataclasses
 import difflib
 import importlib
+import io
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -16,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from polarguide import __version__
-from polarguide.cli.console import printable, warnings_printed
+from polarguide.cli.console import say, warnings_printed
 from polarguide.errors import PolarguideError
 from polarguide.options import gibibytes
 
@@ -66,19 +68,20 @@ def options_of(function: Callable[..., Any]) -> dict[str, Any]:
 
 def run(arguments: Sequence[str]) -> int:
     """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input, or what the verb says)."""
-    if list(arguments) == ["--version"]:
-        print(f"polarguide {__version__}")
-        return 0
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
+    for stream in (
+        sys.stdout,
+        sys.stderr,
+    ):  # names of files may have bytes that are no text, or that it cannot say
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         with warnings_printed():
             status = _call(verb, arguments)
     except PolarguideError as error:
         return _failed(_as_flag(error, verb))
     except KeyboardInterrupt:
-        with contextlib.suppress(OSError):
-            _errors().print("stopped.")
-        return 130
+        return _stopped()
     except BrokenPipeError:
         sys.stderr.close()
         return 1
@@ -87,7 +90,9 @@ def run(arguments: Sequence[str]) -> int:
             f"{error.filename or 'files'}: expected to read or write there, found {error.strerror or error}."
         )
         return _failed(f"{said} Check the name, the rights, and the room on the disk.")
-    except (MemoryError, ImportError, RuntimeError) as error:
+    except Exception as error:
+        if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
+            return _stopped()  # what C code makes of one that comes while it imports
         said = _of_the_machine(error)
         if not said:
             raise
@@ -99,11 +104,18 @@ def _errors() -> Console:
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
+def _stopped() -> int:
+    """Say that a signal ended the command, if anybody can be told; returns the exit status."""
+    with contextlib.suppress(OSError):
+        _errors().print("stopped.")
+    return 130
+
+
 def _failed(text: str) -> int:
     """Print an error, if anybody can be told; returns the exit status."""
     with contextlib.suppress(OSError):
         _errors().print("[bold red]error:[/] ", end="")
-        _errors().print(printable(text), markup=False)
+        say(text, to=_errors())
     return 2
 
 
@@ -112,17 +124,32 @@ def _of_the_machine(error: Exception) -> str:
     if isinstance(error, MemoryError) or any(words in str(error) for words in _RUN_OUT):
         said = (str(error).splitlines() or ["none is left"])[0]
         return f"memory: expected enough of it, and of threads, found {said[:200]}. {_MORE_ROOM}"
-    if isinstance(error, ImportError) and not isinstance(error, ModuleNotFoundError):
+    if isinstance(error, ModuleNotFoundError):
+        return ""
+    if isinstance(error, ImportError):
         return f"packages: expected installed ones that can be loaded, found {str(error)[:200]}. {_MORE_ROOM}"
+    if _while_loading(error):
+        return f"packages: expected installed ones that can be loaded, found {str(error)[:200]}. {_SETTINGS}"
     return ""
 
 
+def _while_loading(error: Exception) -> bool:
+    """Whether an installed package failed while it was imported, as PyTorch does with variables that it cannot read."""
+    frames = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
+    ours = [number for number, name in enumerate(frames) if f"{os.sep}polarguide{os.sep}" in name]
+    return any(name.startswith("<frozen importlib") for name in frames[ours[-1] + 1 :]) if ours else False
+
+
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
+_SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
 _MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --threads 1 takes less."
 
 
 def _call(verb: str | None, arguments: Sequence[str]) -> int:
     """Call a verb; returns the exit status that it gives, 0 where it gives none."""
+    if list(arguments) == ["--version"]:
+        print(f"polarguide {__version__}", flush=True)
+        return 0
     if verb is not None:
         _require_place()
         _refuse_empty_paths(verb, arguments[1:])

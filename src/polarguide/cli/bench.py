@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from polarguide.cli.compare import print_results
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.cli.job_progress import JobReporter
 from polarguide.experiments.bench_options import BenchOptions
 from polarguide.system import signals_as_interrupts
@@ -33,6 +33,6 @@ def bench(
     with signals_as_interrupts():
         results = run_bench(out, options, reporter=JobReporter())
     if results is None:
-        console.print(f"scenes: {out / 'scenes'}", markup=False)
+        say(f"scenes: {out / 'scenes'}")
     else:
         print_results(results, out / options.half)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.options import ThreadOptions
 from polarguide.sensor_calibration.settings import CalibrateSettings
@@ -35,6 +35,6 @@ def calibrate(
     use_threads(compute.threads)
     calibration = importlib.import_module("polarguide.sensor_calibration.calibrate")
     done = calibration.calibrate_sensor(shots, out, settings, ConsoleReporter())
-    console.print(f"calibration: {done.path}   picture: {done.picture}", markup=False)
+    say(f"calibration: {done.path}   picture: {done.picture}")
     option = f"--sensor {settings.sensor} --calibration {shlex.quote(str(done.path))}"
-    console.print(f"next: polarguide prepare RAW --out SCENE {option}", markup=False)
+    say(f"next: polarguide prepare RAW --out SCENE {option}")

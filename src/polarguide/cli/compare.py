@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.cli.job_progress import JobReporter
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
@@ -67,7 +67,7 @@ def print_results(results: Results, out: Path) -> None:
     Raises:
         PolarguideError: runs have failed.
     """
-    console.print(f"tables: {out}/results.md, .csv, .tex, .json   report: {out}/report.html", markup=False)
+    say(f"tables: {out}/results.md, .csv, .tex, .json   report: {out}/report.html")
     failed = [run for run in results["runs"] if run["state"] == "failed"]
     if failed:
         errors = ", ".join(f"{r['scene']}, {r['recipe']}, seed {r['seed']}: {r['error']}" for r in failed)

@@ -31,10 +31,15 @@ def printable(text: str, *, lines: bool = False) -> str:
     )
 
 
+def say(text: object, *, lines: bool = False, to: Console = console) -> None:
+    """Print a text, of several ``lines``: names in it are neither markup, nor anything that a terminal obeys."""
+    to.print(printable(str(text), lines=lines), markup=False)
+
+
 def warn(text: object) -> None:
     """Print a warning; names in it are shown as they are, but for control characters."""
     console.print("[yellow]warning:[/] ", end="")
-    console.print(printable(str(text)), markup=False)
+    say(text)
 
 
 def size_text(size: int) -> str:

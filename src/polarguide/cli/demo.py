@@ -6,7 +6,7 @@ import importlib
 from pathlib import Path
 
 import polarguide
-from polarguide.cli.console import console
+from polarguide.cli.console import say
 from polarguide.cli.evaluate import evaluate
 from polarguide.cli.render import render
 from polarguide.cli.train import train
@@ -35,19 +35,19 @@ def demo(
         seed: Seed of every random draw.
     """
     with polarguide.demo_scene() as scene:
-        console.print(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
+        say(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
         settings = TrainSettings(steps, seed, views_per_step=0)
         session = SessionOptions(threads=machine.threads)
         train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
         evaluate(out, compute=ComputeOptions(machine.threads))
         render(out)
         picture = _first_picture(out)
-    console.print(f"look at {picture}: {FIRST_VIEW}, which training has not seen, and its layers")
-    console.print(
+    say(f"look at {picture}: {FIRST_VIEW}, which training has not seen, and its layers")
+    say(
         f"then at {out / 'render' / 'contact_sheet.png'}: rows are views, columns are layers, each beside the true "
         "one if it is known"
     )
-    console.print(f"look around: polarguide view {out}")
+    say(f"look around: polarguide view {out}")
 
 
 def _first_picture(out: Path) -> Path:

@@ -6,8 +6,9 @@ import importlib
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
-from polarguide.cli.console import console
+from polarguide.cli.console import console, printable, say
 from polarguide.cli.runs import RunFolder, opened
 from polarguide.errors import PolarguideError, require_package
 from polarguide.options import EXPORT_PACKAGES, ComputeOptions
@@ -33,12 +34,12 @@ def evaluate(
     )
     console.print(_table(record, title))
     for line in _without_value(record):
-        console.print(line, markup=False)
+        say(line)
     if record["objects"]:
         console.print(_errors(record))
     sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE
-    console.print(f"metrics: {run / 'metrics.json'}")
-    console.print(f"where the errors are: {run / sheet}")
+    say(f"metrics: {run / 'metrics.json'}")
+    say(f"where the errors are: {run / sheet}")
 
 
 def _without_value(record: dict[str, Any]) -> list[str]:
@@ -68,7 +69,7 @@ def _errors(record: dict[str, Any]) -> Table:
     def add(name: str, errors: dict[str, Any]) -> None:
         values = [errors[metric.key] for metric in columns]
         texts = ["n/a" if v is None else f"{v:.{m.digits}f}" for m, v in zip(columns, values, strict=True)]
-        table.add_row(name, f"{errors['pixels']:,}", *texts)
+        table.add_row(Text(printable(name)), f"{errors['pixels']:,}", *texts)
 
     for name, errors in record["objects"].items():
         add(name, errors)
@@ -79,7 +80,7 @@ def _errors(record: dict[str, Any]) -> Table:
 
 
 def _table(record: dict[str, Any], title: str) -> Table:
-    table = Table(title=title)
+    table = Table(title=Text(printable(title)))
     table.add_column("metric")
     table.add_column("value", justify="right")
     for label, text in importlib.import_module("polarguide.evaluation.table").shown_metrics(record):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from polarguide.cli.console import console, size_text
+from polarguide.cli.console import say, size_text
 from polarguide.cli.runs import RunFolder, opened
 from polarguide.errors import require_package
 from polarguide.options import EXPORT_PACKAGES, ExportFormat, ThreadOptions
@@ -41,4 +41,4 @@ def export(
         format, out, resolution=resolution, spz_version=spz_version, reporter=reporter
     ):
         size = f" ({size_text(path.stat().st_size)})" if path.is_file() else ""
-        console.print(f"{format}: {path}{size}", markup=False)
+        say(f"{format}: {path}{size}")

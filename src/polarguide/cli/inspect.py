@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import console, say, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.inspection.settings import InspectSettings
@@ -55,7 +55,7 @@ def inspect(
     _print_checks(found.checks)
     _print_angles(found.angles)
     _print_verdict(found)
-    console.print(f"page: {page}   figures: {record}", markup=False)
+    say(f"page: {page}   figures: {record}")
     if fix is not None:
         _fix(found, fix, reporter)
 
@@ -65,20 +65,20 @@ def _fix(found: Any, out: Path, reporter: ConsoleReporter) -> None:
     fixing = importlib.import_module("polarguide.inspection.fix")
     change = fixing.correction(found.capture, found.angles)
     if change is None:
-        console.print("fix: order, sense and zero are right; nothing was written.")
+        say("fix: order, sense and zero are right; nothing was written.")
         return
     done = fixing.fix_scene(found.capture, change, out, reporter)
-    console.print(f"fixed: {out}: {done}. {found.capture.root} is as it was.", markup=False)
+    say(f"fixed: {out}: {done}. {found.capture.root} is as it was.")
 
 
 def _print_checks(checks: Any) -> None:
     said = ""
     for check in checks:
         console.print(f"[{COLORS[check.verdict]}]{check.verdict:>12}[/]  ", end="")
-        console.print(f"{check.title}: {check.finding}", markup=False)
+        say(f"{check.title}: {check.finding}")
         if check.remedy not in ("", said) and check.verdict != "ok":
             said = check.remedy
-            console.print(f"{'':14}{check.remedy}", markup=False)
+            say(f"{'':14}{check.remedy}")
 
 
 def _print_verdict(found: Any) -> None:
@@ -92,12 +92,12 @@ def _print_verdict(found: Any) -> None:
 def _print_angles(angles: Any) -> None:
     """The odds of the orders, and what they come from."""
     if angles.hypotheses:
-        console.print("order of the pictures called 0, 45, 90, 135: probability (log-odds to the best)")
+        say("order of the pictures called 0, 45, 90, 135: probability (log-odds to the best)")
     for row in sorted(angles.hypotheses, key=lambda row: -row.probability):
         files = ", ".join(f"{angle:3d}" for angle in row.files)
-        console.print(
-            f"  {files}   {row.probability:7.2%}  ({0.0 - row.log_odds:.1f})  {row.order.label}", markup=False
+        say(
+            f"  {files}   {row.probability:7.2%}  ({0.0 - row.log_odds:.1f})  {row.order.label}",
         )
     for evidence in angles.sources:
         used = "" if evidence.usable else " (not used)"
-        console.print(f"  {evidence.source}{used}: {evidence.note}", markup=False)
+        say(f"  {evidence.source}{used}: {evidence.note}")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import console, say, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.measurement.options import MeasureOptions, WatchOptions
@@ -49,6 +49,14 @@ def measure(
             found="both" if paths else "neither",
             remedy="Give files and folders for one pass, or --watch FOLDER.",
         )
+    for name in ("settle", "patience", "idle"):
+        if watching.watch is None and getattr(watching, name) != getattr(WatchOptions, name):
+            raise PolarguideError(
+                f"--{name}",
+                expected="--watch",
+                found="one pass over files",
+                remedy="Leave it out, or watch a folder.",
+            )
     reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
     said = _Lines()
     if watching.watch is None:
@@ -95,14 +103,14 @@ class _Lines:
         elif entry.status == "beyond":
             console.print("[bold red]beyond:[/] ", end="")
             faults = (f"{row['region']} {row['why']}" for row in entry.regions if row["why"])
-            console.print(f"{entry.shot}: {'; '.join(faults)}", markup=False)
+            say(f"{entry.shot}: {'; '.join(faults)}")
         elif self.all:
-            console.print(f"{entry.status}: {entry.shot}", markup=False)
+            say(f"{entry.status}: {entry.shot}")
 
     def error(self, text: str) -> None:
         """Print an error."""
         self._errors.print("[bold red]error:[/] ", end="")
-        self._errors.print(text, markup=False)
+        say(text, to=self._errors)
 
 
 def _print_outcome(outcome: Any) -> None:
@@ -113,6 +121,6 @@ def _print_outcome(outcome: Any) -> None:
         if counts[status]
     )
     before = f" ({outcome.earlier} of them earlier)" if outcome.earlier else ""
-    console.print(f"shots: {shots or 'none'}{before}", markup=False)
+    say(f"shots: {shots or 'none'}{before}")
     pictures = f"   pictures: {outcome.folder}/beyond" if counts["beyond"] else ""
-    console.print(f"table: {outcome.folder}/table.csv, .jsonl{pictures}", markup=False)
+    say(f"table: {outcome.folder}/table.csv, .jsonl{pictures}")

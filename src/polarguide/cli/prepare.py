@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.options import ThreadOptions
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
@@ -37,12 +37,12 @@ def prepare(
     asked = replace(settings, calibration=angles.read(), analyzers=angles.analyzers())
     done = preparation.prepare_scene(source, out, asked, ConsoleReporter())
     without = f", {len(done.left_out)} left out" if done.left_out else ""
-    console.print(f"scene: {done.folder} ({len(done.views)} views{without})", markup=False)
+    say(f"scene: {done.folder} ({len(done.views)} views{without})")
     if done.posed:
-        console.print(f"next: polarguide inspect {done.folder}", markup=False)
-        console.print(f"then: polarguide train {done.folder} --out runs/{done.folder.name}", markup=False)
+        say(f"next: polarguide inspect {done.folder}")
+        say(f"then: polarguide train {done.folder} --out runs/{done.folder.name}")
     else:
-        console.print("it has no poses: repeat the command with --poses sfm or --poses PATH", markup=False)
-        console.print(
-            f"each view alone: polarguide priors {done.folder} --out {done.folder.name}-priors", markup=False
+        say("it has no poses: repeat the command with --poses sfm or --poses PATH")
+        say(
+            f"each view alone: polarguide priors {done.folder} --out {done.folder.name}-priors",
         )

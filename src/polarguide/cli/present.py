@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.options import ComputeOptions
 
@@ -68,4 +68,4 @@ def present(
         reporter=ConsoleReporter(),
     )
     for line in presenting.described(shown):
-        console.print(line, markup=False)
+        say(line)

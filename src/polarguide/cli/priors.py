@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions, ThreadOptions
@@ -76,18 +76,18 @@ def priors(
         reporter=reporter,
     )
     if isinstance(found, Path):
-        console.print(f"pictures: {out}   contact sheet: {found}", markup=False)
+        say(f"pictures: {out}   contact sheet: {found}")
         return
     for name, folder in list(found.folders.items())[:4]:
         page = folder / "shot.html"
-        console.print(f"{name}: {page if page.exists() else folder}", markup=False)
+        say(f"{name}: {page if page.exists() else folder}")
     if len(found.folders) > 4:
-        console.print(f"... and {len(found.folders) - 4} more in {out}", markup=False)
+        say(f"... and {len(found.folders) - 4} more in {out}")
     if found.faults:
         total = len(found.faults) + len(found.folders)
         raise PolarguideError(
             out,
             expected=f"{total} shots",
-            found=f"{len(found.faults)} that cannot be read ({', '.join(list(found.faults)[:4])})",
+            found=f"{len(found.faults)} that failed ({', '.join(list(found.faults)[:4])})",
             remedy="The warnings above say why; the others are written.",
         )

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
-from polarguide.cli.console import console, printable, warn
+from polarguide.cli.console import console, printable, say, warn
 from polarguide.progress import Advance, Reporter
 
 LINE_SECONDS = 15.0
@@ -70,7 +70,7 @@ class Lines:
 
     def _print(self) -> None:
         if self._line:
-            console.print(self._line, markup=False)
+            say(self._line)
             self._line = ""
 
 
@@ -79,7 +79,7 @@ class ConsoleReporter(Reporter):
 
     def say(self, text: str) -> None:
         """Print a finding; brackets in it are shown as they are."""
-        console.print(printable(text, lines=True), markup=False)
+        say(text, lines=True)
 
     def warn(self, text: str) -> None:
         """Print a warning."""

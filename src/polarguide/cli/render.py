@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from polarguide.cli.console import console
+from polarguide.cli.console import say
 from polarguide.cli.runs import RunFolder, opened
 from polarguide.errors import PolarguideError, require_package
-from polarguide.options import ComputeOptions, PictureFormat, check_range
+from polarguide.options import ComputeOptions, PictureFormat, check_finite, check_range
+
+FRAMES = 120
 
 
 def render(
@@ -17,7 +19,7 @@ def render(
     views: str = "test",
     layers: str = "final,base,reflection,specular,diffuse,strength,normal,depth",
     path: str = "",
-    frames: int = 120,
+    frames: int = FRAMES,
     video: Path | None = None,
     format: PictureFormat = "png",
     transparent: bool = False,
@@ -53,6 +55,14 @@ def render(
             remedy="Write for example --path orbit --video film.mp4.",
         )
     check_range("frames", frames, 1, 100_000)
+    if not path and frames != FRAMES:
+        raise PolarguideError(
+            "frames",
+            expected="a --path",
+            found="none",
+            remedy="Give for example --path orbit, or leave it out.",
+        )
+    check_finite("rotate_environment", rotate_environment, -3600.0, 3600.0)
     if video is not None:
         require_package("imageio_ffmpeg", "--video")
     if environment is not None and environment.suffix.lower() == ".exr":
@@ -81,4 +91,4 @@ def render(
     sheet = trained.write_pictures(
         out, views=views, layers=names, format=format, transparent=transparent, reporter=reporter
     )
-    console.print(f"pictures: {sheet.parent}   contact sheet: {sheet}")
+    say(f"pictures: {sheet.parent}   contact sheet: {sheet}")

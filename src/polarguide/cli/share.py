@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from polarguide.cli.console import console, size_text
+from polarguide.cli.console import say, size_text
 from polarguide.cli.runs import RunFolder, opened
 from polarguide.options import ThreadOptions
 
@@ -28,4 +28,4 @@ def share(
     """
     trained, _ = opened(run, machine)
     path = trained.share(out, title=title, caption=caption)
-    console.print(f"page: {path} ({size_text(path.stat().st_size)})", markup=False)
+    say(f"page: {path} ({size_text(path.stat().st_size)})")

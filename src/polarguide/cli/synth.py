@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import console, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.options import ThreadOptions
 from polarguide.synth.settings import Overrides, SynthSettings, find_scene
@@ -41,23 +41,20 @@ def synth(
         folders = sweeps.sweep_scenes(
             spec, out, settings, overrides, sweeps.parse_sweep(sweep), reporter, threads=compute.threads
         )
-        console.print(f"scenes: {' '.join(str(folder) for folder in folders)}", markup=False)
+        say(f"scenes: {' '.join(str(folder) for folder in folders)}")
         return
     render = importlib.import_module("polarguide.synth.render")
     manifest = importlib.import_module("polarguide.synth.manifest")
     done = render.synthesize(overrides.apply(spec), out, settings, reporter, threads=compute.threads)
-    console.print(
-        f"scene: {done}   SHA-256 of its {manifest.MANIFEST}: {manifest.scene_digest(done)}", markup=False
+    say(
+        f"scene: {done}   SHA-256 of its {manifest.MANIFEST}: {manifest.scene_digest(done)}",
     )
     if settings.sensor == "ideal":
-        console.print(f"next: polarguide train {done} --out runs/{done.name}", markup=False)
+        say(f"next: polarguide train {done} --out runs/{done.name}")
     elif settings.sensor == "filter":
-        console.print(
-            f"next: polarguide prepare {done / 'raw'} --out {done}-prepared --poses {done}", markup=False
-        )
+        say(f"next: polarguide prepare {done / 'raw'} --out {done}-prepared --poses {done}")
     else:
-        console.print(
+        say(
             f"next: polarguide prepare {done / 'raw'} --out {done}-prepared --sensor {settings.sensor.upper()} "
             f"--bits 12 --black-level 64 --calibration {done / 'calibration.json'} --poses {done}",
-            markup=False,
         )

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import console
+from polarguide.cli.console import say
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.options import SceneOptions, SessionOptions
 from polarguide.system import StopSignals
@@ -55,6 +55,6 @@ def train(
             )
         except KeyboardInterrupt as stopped:
             if str(stopped):  # it was asked to stop, and says after which step it did
-                console.print(f"{stopped}; go on with the same command and --resume")
+                say(f"{stopped}; go on with the same command and --resume")
             raise
-    console.print(f"trained: {out}   next: polarguide eval {out}   polarguide view {out}")
+    say(f"trained: {out}   next: polarguide eval {out}   polarguide view {out}")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from typing import TypedDict
+from typing import Annotated, TypedDict
+
+import msgspec
 
 from polarguide.evaluation.table import COLUMNS
 
@@ -33,7 +35,7 @@ class RunRecord(TypedDict):
 
     scene: str
     recipe: str
-    seed: int
+    seed: Annotated[int, msgspec.Meta(ge=0)]
     folder: str
     state: str
     error: str | None

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.experiments.bench_options import BENCH, Bench, BenchOptions
 from polarguide.experiments.compare import compare, locked
@@ -52,6 +53,7 @@ def run_bench(
             have been looked at.
     """
     specs = {name: Overrides(views=bench.views).apply(find_scene(name)) for name in options.chosen(bench)}
+    refuse_scene(Path(out))
     rows = {} if options.render_only else dict(bench.rows)
     for name in rows:  # hours of rendering should not end in a wrong name
         recipe_named(name)

@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
 from polarguide.experiments.exposure_figure import write_exposure_figure
 from polarguide.experiments.jobs import STDERR, Job, run_jobs
-from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.options import MOST_SEEDS, CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
 from polarguide.experiments.report import write_report
 from polarguide.experiments.results import Results
@@ -76,9 +77,10 @@ def compare(
     )
     for name, count in seeds_of.items():
         check_choice("seeds_of", name, [recipe.name for recipe in comparison.recipes])
-        check_count("seeds_of", count)
+        check_count("seeds_of", count, 1, MOST_SEEDS)
     if not scenes:
         raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
+    refuse_scene(comparison.out)
     if options.against is not None:
         check_choice("against", options.against, [row.name for row in comparison.rows])
     choose_backend(options.device)

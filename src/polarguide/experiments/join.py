@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.experiments.aggregate import RunRecord, aggregate
 from polarguide.experiments.collect import write_tables
@@ -65,6 +66,7 @@ def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None
     joined = join_results(
         [read_results(path) for path in paths], [str(path) for path in paths], against=against
     )
+    refuse_scene(Path(out))
     make_folder(Path(out))
     write_tables(Path(out), joined)
     remark = "Pictures are in the reports of the parts."

@@ -16,6 +16,9 @@ from polarguide.options import (
     check_count,
 )
 
+MOST_SEEDS = 1000
+"""Each is a run of its own for every recipe and scene."""
+
 
 @dataclass(frozen=True)
 class CompareOptions(SceneOptions):
@@ -46,7 +49,7 @@ class CompareOptions(SceneOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_count("seeds", self.seeds)
+        check_count("seeds", self.seeds, 1, MOST_SEEDS)
         check_count("jobs", self.jobs, 0, MOST_THREADS)
         check_count("threads", self.threads, 1, MOST_THREADS)
         check_count("report_views", self.report_views, 0)

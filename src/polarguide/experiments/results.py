@@ -56,7 +56,7 @@ class SceneRecord(TypedDict):
 
     name: str
     digest: str
-    views: int
+    views: Annotated[int, msgspec.Meta(ge=0)]
     test_views: list[str]
     black_share: float | None
 

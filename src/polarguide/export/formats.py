@@ -12,6 +12,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import read_model
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.evaluation.table import shown_metrics
@@ -22,7 +23,7 @@ from polarguide.export.points import surface_points, write_points
 from polarguide.export.share import share_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
-from polarguide.files import make_folder, require_inside, temporary_folder, write_text
+from polarguide.files import holds_files, make_folder, require_inside, temporary_folder, write_text
 from polarguide.options import ExportFormat, PathLike, check_choice, check_range
 from polarguide.presentation import balanced
 from polarguide.progress import SILENT, Reporter
@@ -34,6 +35,8 @@ from polarguide.shading.gbuffer import render
 from polarguide.shading.model import Parameters
 from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
+
+TRANSFORMS = "transforms.json"
 
 PANORAMA_HEIGHT = 512
 
@@ -69,6 +72,7 @@ def export(
     folder = run.folder / "export" if out is None else Path(out)
     if out is None:
         require_inside(run.folder, folder)
+    refuse_scene(folder)
     writers: dict[str, Callable[[], list[Path]]] = {
         "ply": lambda: [_ply(run, shown, folder / "splats.ply")],
         "spz": lambda: [_spz(run, shown, folder / "splats.spz", spz_version)],
@@ -253,10 +257,18 @@ def _environment(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
 
 def _cameras(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
     scene, placement = run.scene, shown.placement
-    require_inside(folder, folder / "sparse" / "0")
+    model = folder / "sparse" / "0"
+    require_inside(folder, model)
+    if model.is_dir() and holds_files(model) and not (folder / TRANSFORMS).exists():
+        raise PolarguideError(
+            model,
+            expected="no model, or one of an earlier export",
+            found="another",
+            remedy="Give another --out.",
+        )
     cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     points = placement.points(scene.points)
-    write_colmap(folder / "sparse" / "0", cameras, points, scene.point_colors, comments=shown.comments)
+    write_colmap(model, cameras, points, scene.point_colors, comments=shown.comments)
     about = {**shown.origin.record(), **placement.record()}
-    write_transforms(folder / "transforms.json", cameras, about)
-    return [folder / "sparse" / "0", folder / "transforms.json"]
+    write_transforms(folder / TRANSFORMS, cameras, about)
+    return [model, folder / TRANSFORMS]

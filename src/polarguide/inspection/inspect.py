@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polarguide.capture import load_scene
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, require_inside
 from polarguide.inspection.analyzers import analyzer_check, corrected
@@ -69,11 +70,12 @@ def inspection_folder(scene: Path, out: Path | None = None) -> Path:
     """The folder that an inspection writes: ``out``, or SCENE-inspection beside the scene.
 
     Raises:
-        PolarguideError: there is a file of this name.
+        PolarguideError: there is a file of this name, or it would be written into a scene.
     """
     beside = scene.resolve().with_name(scene.resolve().name + "-inspection")
     folder = beside if out is None else out
     check_out(folder)
+    refuse_scene(folder)
     require_inside(beside.parent if out is None else folder, folder, folder / RUN_FOLDER)
     return folder
 

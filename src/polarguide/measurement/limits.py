@@ -81,6 +81,9 @@ def _check(path: Path, place: str, field: str, bound: Bound, reference: bool) ->
         )
     if bound.min is None and bound.max is None:
         raise _wrong(path, place, "min, max or both", "neither")
+    for value in (bound.min, bound.max):
+        if field in AXIAL and value is not None and not 0 <= value <= 180:
+            raise _wrong(path, place, "angles from 0 to 180", f"{value:g}")
     if bound.min is not None and bound.max is not None and bound.min > bound.max and field not in AXIAL:
         raise _wrong(path, place, "a min up to the max", f"{bound.min:g} and {bound.max:g}")
 

@@ -24,7 +24,7 @@ from polarguide.measurement.table import Entry, FileStamp, Status, Table, stamps
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.shots.develop import check_files
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.exposures import ExposureSet, find_shots, require_elsewhere
 from polarguide.shots.maps import ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import UNREADABLE, fault_of, read_shot
@@ -224,6 +224,7 @@ def measure_shots(
         PolarguideError: there is no shot, an option is wrong, or the table cannot be written. A shot that cannot be
             read raises nothing: its line says why.
     """
+    require_elsewhere(paths, Path(out))
     shots = find_shots(paths, reading)
     counts: Counter[str] = Counter()
     earlier = 0
@@ -244,4 +245,5 @@ def measure_shots(
                 heard(entry)
             counts[status] += 1
             advance(number)
+        line.table.require_there()
     return Outcome(Path(out), counts, earlier)

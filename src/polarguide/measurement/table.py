@@ -166,13 +166,34 @@ class Table:
         """Write the lines of a shot; when this returns, they are on disk.
 
         Raises:
-            PolarguideError: they cannot be written, for example because the disk is full.
+            PolarguideError: they cannot be written, for example because the disk is full, or the table was removed.
         """
+        self.require_there()
         lines, rows = self._files
         # JSON's escapes keep names that are no Unicode.
         _append(self.folder / LINES, lines, json.dumps(msgspec.to_builtins(entry)).encode() + b"\n")
         self._note(entry)
         _append(self.folder / CSV, rows, _csv(entry.rows()))
+
+    def require_there(self) -> None:
+        """Check that the files are still those that are written to: what is removed meanwhile takes lines silently.
+
+        Raises:
+            PolarguideError: one was removed, renamed or replaced.
+        """
+        for name, file in zip((LINES, CSV), self._files, strict=True):
+            path = self.folder / name
+            try:
+                there = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+            except OSError:
+                there = False
+            if not there:
+                raise PolarguideError(
+                    path,
+                    expected="the table that was opened",
+                    found="that it was removed, renamed or replaced meanwhile",
+                    remedy="Put it back if you can; the same command measures what is not in it.",
+                )
 
     def _note(self, entry: Entry) -> None:
         self._done[_key(entry.files)] = entry.status

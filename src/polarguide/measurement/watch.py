@@ -20,7 +20,7 @@ from polarguide.measurement.options import MeasureOptions, WatchOptions
 from polarguide.measurement.table import Entry, FileStamp, stamps
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
-from polarguide.shots.exposures import ExposureSet, list_shots, mosaics
+from polarguide.shots.exposures import ExposureSet, list_shots, mosaics, require_elsewhere
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import UNREADABLE
 
@@ -136,6 +136,7 @@ def watch_folder(
     """
     root = Path(folder)
     require_folder(root, expected="a folder to watch", remedy="Check --watch.")
+    require_elsewhere([root], Path(out))
     reading.require_kind("filter" if reading.sensor is None else "mosaic", root.name)
     counts: Counter[str] = Counter()
     with Line(Path(out), options, reading) as line:
@@ -147,12 +148,14 @@ def watch_folder(
             begin = time.monotonic()
             shots = there.shots()
             took = time.monotonic() - begin
+            line.table.require_there()
             for entry in watch.look(shots):
                 heard(entry)
                 counts[entry.status] += 1
                 if should_stop():
                     break
             time.sleep(max(step, 4 * took))
+        line.table.require_there()
         return Outcome(Path(out), counts, 0, watch.waiting(), there.trouble())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,12 @@ from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.filter.align import Shift, align_shots, estimate_shifts
 from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
-from polarguide.capture.filter.shots import find_shots, read_shots, require_four_shots
+from polarguide.capture.filter.shots import find_shots, list_shots, read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities, rounding_of_bytes
 from polarguide.capture.memory import require_memory_of_each
-from polarguide.capture.view import ANGLES
+from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import EXACT, Rounding
-from polarguide.errors import PolarguideError
+from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
@@ -40,12 +41,18 @@ class FilterSource(Source):
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
+    needs = ("transfer", "scale")
     cameras = None
 
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
         self._settings = settings
         shots = find_shots(root, nested=True)
         require_four_shots(root, shots)
+        unused = [path.name for path in list_shots(root, nested=True)[1]]
+        unused += [path.name for files in shots.values() for a, path in files.items() if a not in ANGLES]
+        if unused:
+            found = f"{root} has pictures without an angle in their names, or at other angles than 0, 45, 90 and 135"
+            warnings.warn(f"{found}, which are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
         self._files = dict(sorted(shots.items()))
         self.views = list(self._files)
         self.paths = [files[angle] for files in self._files.values() for angle in ANGLES]

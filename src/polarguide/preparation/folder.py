@@ -10,7 +10,7 @@ import contextlib
 import json
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.polarizer_angles import Angle
-from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.sensor.radiometry import Levels
+from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.capture.write import EXACT, intensity_codes, picture_name, picture_names, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, holds_files, make_folder, read_file, require_inside, write_whole
@@ -40,6 +41,7 @@ _OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsi
 
 
 _Code = Annotated[int, msgspec.Meta(ge=0, le=FULL_CODE)]
+_Factor = Annotated[float, msgspec.Meta(gt=0, le=1e12)]
 _Multiple = tuple[_Code, Annotated[int, msgspec.Meta(ge=1, le=FULL_CODE)]]
 
 
@@ -52,9 +54,6 @@ class _Request(msgspec.Struct):
     source: str
     format: str
     file: dict[str, tuple[int, int]]
-
-
-_Factor = Annotated[float, msgspec.Meta(gt=0, lt=1e12)]
 
 
 class _Exposure(msgspec.Struct):
@@ -76,6 +75,12 @@ class _View(msgspec.Struct):
 
 class _Measured(msgspec.Struct):
     rounding: Annotated[tuple[_Multiple, ...], msgspec.Meta(min_length=1)] = ((0, 1),)
+    levels: Levels | None = None
+    gains: tuple[_Factor, _Factor, _Factor, _Factor] | None = None
+    white_balance: tuple[_Factor, _Factor, _Factor] | None = None
+    scale: _Factor | None = None
+    transfer: Literal["linear", "srgb"] | None = None
+    light: dict[str, _Factor] | None = None
 
 
 class _State(msgspec.Struct):
@@ -161,6 +166,21 @@ class SceneFolder:
                 remedy="Repeat the command as it was, or give another --out; nothing was written.",
             )
         self.measured, self.views = state.get("measured"), state.get("views", {})
+
+    def require_measured(self, needs: Collection[str]) -> None:
+        """Check that what an earlier call has measured, if there was one, has all that is read of it.
+
+        Raises:
+            PolarguideError: something is missing.
+        """
+        missing = [key for key in needs if self.measured is not None and self.measured.get(key) is None]
+        if missing:
+            raise PolarguideError(
+                self.root / (JOURNAL if (self.root / JOURNAL).exists() else SCENE),
+                expected="what an earlier call has measured",
+                found=f"no {listed(missing)}",
+                remedy="Remove the folder, and begin anew.",
+            )
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:

@@ -37,6 +37,8 @@ CALIBRATED_IMBALANCE = 0.01
 class MosaicSource(Source):
     """Raw mosaics of a division-of-focal-plane sensor."""
 
+    needs = ("levels", "gains", "white_balance", "scale")
+
     def __init__(self, root: Path, settings: PrepareSettings, dataset: Dataset | None = None) -> None:
         """Find the files.
 

@@ -48,6 +48,7 @@ class MaskedSource(Source):
                 remedy="Rename them; views without a mask are used whole.",
             )
         self._pictures = pictures
+        self.needs = pictures.needs
         self.kind, self.cameras, self.views = pictures.kind, pictures.cameras, pictures.views
         self.paths = [*pictures.paths, *self._masks.values()]
 

@@ -21,7 +21,7 @@ from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
 from polarguide.preparation.exposure_table import write_exposure_table
-from polarguide.preparation.folder import JOURNAL, PARTIAL, SCENE, SFM, SceneFolder
+from polarguide.preparation.folder import PARTIAL, SCENE, SFM, SceneFolder
 from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
@@ -96,6 +96,7 @@ def prepare_scene(
         )
     poses = known_poses(root, pictures, settings.poses)
     folder = SceneFolder(target, _request(root, pictures, settings, poses))
+    folder.require_measured(pictures.needs)
     if folder.finished:
         reporter.say(f"{target} is complete already; nothing to do.")
         return _outcome(folder, pictures, settings, new=False)
@@ -243,17 +244,7 @@ def _write_view(
 ) -> tuple[list[str], tuple[str, ...]]:
     """Write the pictures of a view; returns what makes it useless, and the notes about it."""
     assert folder.measured is not None
-    try:
-        done = pictures.develop(view, folder.measured)
-    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
-        if not folder.begun:
-            raise
-        raise PolarguideError(
-            folder.root / JOURNAL,
-            expected="what an earlier call has measured",
-            found=f"something else ({type(error).__name__}: {error})",
-            remedy="Remove the folder, and begin anew.",
-        ) from None
+    done = pictures.develop(view, folder.measured)
     intensities, invalid, mask, warped = done.intensities, done.invalid, done.mask, None
     if poses is not None:
         warp = poses.warp(view, done.geometry)

@@ -35,6 +35,7 @@ _JPEG = (".jpg", ".jpeg")
 class SinglesSource(Source):
     """Photographs of one camera through a linear polarizer that was turned between them, or without one."""
 
+    needs = ("transfer", "scale", "light")
     kind = "singles"
     cameras = None
 

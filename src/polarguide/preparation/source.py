@@ -48,8 +48,10 @@ class Source(Protocol):
         cameras: by view name, if the source has poses, else None.
         views: view names, sorted.
         paths: all files that are read.
+        needs: keys of what ``measure`` returns that ``develop`` reads.
     """
 
+    needs: tuple[str, ...]
     kind: str
     cameras: Mapping[str, PosedCamera] | None
     views: list[str]

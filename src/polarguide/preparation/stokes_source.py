@@ -30,6 +30,8 @@ _WORKED = 4 * 3 * (3 + 3 + 4 + 4)
 class StokesSource(Source):
     """Stokes vectors in any unit, without a full scale."""
 
+    needs = ("scale",)
+
     def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
         """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
         self.kind, self.cameras = dataset.name, dataset.cameras

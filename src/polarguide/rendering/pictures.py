@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.files import atomic, make_folder, require_inside, write_whole
 from polarguide.options import PathLike, PictureFormat, check_choice
@@ -89,6 +90,7 @@ def write_pictures(
             "transparent", expected="format png", found=format, remedy="Leave one of the two out."
         )
     folder = run.folder / "render" if out is None else Path(out)
+    refuse_scene(folder)
     if out is None:
         require_inside(run.folder, folder)
     names = checked_layers(list(run.layers if layers is None else layers))

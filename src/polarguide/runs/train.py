@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
@@ -16,7 +17,7 @@ from polarguide.capture import Scene
 from polarguide.capture.background import without_surroundings
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.variants import captured_as
-from polarguide.errors import PolarguideError
+from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.files import make_folder
 from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
@@ -350,6 +351,11 @@ def _check_scene(scene: Scene) -> None:
             found=f"{len(centers)} from one",
             remedy="Add views, or correct the poses.",
         )
+    cameras = [view.camera for view in scene.train_views]
+    ahead = (scene.points.double() @ c.rotation[2] + c.translation[2] > 0 for c in cameras)
+    if len(scene.points) and not any(bool(each.any()) for each in ahead):
+        said = f"{scene.root}: all points lie behind all cameras: poses and points do not belong together."
+        warnings.warn(said, PolarguideWarning, stacklevel=2)
 
 
 def _check_slots(state: TrainingState, settings: TrainSettings, out: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -65,6 +66,7 @@ def calibrate_sensor(
     """
     settings = settings.checked()
     _require_new(out)
+    _require_apart(out, Path(source), settings)
     files = Shots(Path(source), settings)
     known = settings.known_angles(files.files)
     measured = files.measure(reporter)
@@ -96,6 +98,22 @@ def calibrate_sensor(
     for line in lines(found, said):
         reporter.say(line)
     return Calibrated(out, picture, found, said, fit, choice, defects)
+
+
+def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
+    """Refuse to write the picture among those that are read: the next call would take it for a shot."""
+    for folder in (shots, settings.flat, settings.dark_frame):
+        if (
+            folder is not None
+            and folder.is_dir()
+            and os.path.realpath(folder) == os.path.realpath(out.parent)
+        ):
+            raise PolarguideError(
+                out,
+                expected=f"a place outside of {folder}",
+                found="one among the shots, which would hold the picture, too",
+                remedy="Give another --out; nothing was written.",
+            )
 
 
 def _require_new(out: Path) -> None:

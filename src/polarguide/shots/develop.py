@@ -16,6 +16,7 @@ from polarguide.capture.filter.exif import apply_orientation, orientation_calibr
 from polarguide.capture.filter.shots import read_shots, require_four_shots
 from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
 from polarguide.capture.layout import find_layout, select_views
+from polarguide.capture.memory import KEPT, READ, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
 from polarguide.capture.sensor.color_filters import SIDE
@@ -35,6 +36,8 @@ from polarguide.shots.options import ShotOptions
 
 Mask = NDArray[np.bool_]
 _LARGE_IMBALANCE = 0.01
+_MAPS = 4 * (4 * 3 + 3 + 5)
+"""Bytes for each pixel of the intensities and of what is derived from them first, all at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +281,14 @@ def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
     assert shot.root is not None
     layout = find_layout(shot.root)
     select_views(layout, [shot.view])
+    require_memory_of_each(
+        shot.paths,
+        KEPT + READ + _MAPS,
+        "a view",
+        remedy="Free memory, or prepare the scene in a smaller size.",
+    )
     transfer = "srgb" if options.transfer == "srgb" else "linear"
-    data = read_view(layout, shot.view, factor=1, transfer=transfer)
+    data = read_view(layout, shot.view, factor=shot.downscale, transfer=transfer)
     largest = int(np.iinfo(data.peak.dtype).max)
     scale = checks.full_scale(data.histogram, largest)
     intensities = oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration)

@@ -38,7 +38,7 @@ class ExposureSet:
         kind: mosaic (one file), filter (one file an angle) or scene (a view of a scene folder).
         files: by angle; a mosaic's under 0. Angles may be missing: ``read_shot`` says so.
         root: folder of the scene; else None.
-        view: its name in the scene.
+        view: its name in the scene. downscale: side of the boxes over which its pictures are averaged.
         fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
         others: where there is a fault, files that ``files`` has no place for; or the folder that it is in.
     """
@@ -48,6 +48,7 @@ class ExposureSet:
     files: dict[int, Path]
     root: Path | None = None
     view: str = ""
+    downscale: int = 1
     fault: PolarguideError | None = None
     others: tuple[Path, ...] = ()
 
@@ -244,6 +245,39 @@ def require_name(shot: ExposureSet) -> None:
             found=repr(shot.name),
             remedy="Rename the file.",
         )
+
+
+def require_own_folder(shot: ExposureSet, folder: Path) -> None:
+    """Refuse to write the maps of a shot beside its files: one of them may have the name of a map.
+
+    Raises:
+        PolarguideError: a file of the shot lies in ``folder``.
+    """
+    written = os.path.realpath(folder)
+    for path in shot.paths:
+        if os.path.dirname(os.path.realpath(path)) == written:
+            raise PolarguideError(
+                path,
+                expected=f"a shot outside of {folder}, where its maps go",
+                found="that it lies there",
+                remedy="Give another --out.",
+            )
+
+
+def require_elsewhere(paths: Sequence[str | os.PathLike[str]], out: Path) -> None:
+    """Refuse to write among shots: the next call would take what was written for shots.
+
+    Raises:
+        PolarguideError: ``out`` is one of the folders that are looked through.
+    """
+    for path in paths:
+        if os.path.isdir(path) and os.path.realpath(path) == os.path.realpath(out):
+            raise PolarguideError(
+                out,
+                expected="a folder that is not searched for shots",
+                found="that of the shots",
+                remedy="Give another --out.",
+            )
 
 
 def _unusable(shot: ExposureSet) -> ExposureSet:

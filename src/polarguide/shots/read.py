@@ -61,7 +61,8 @@ def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
         found, remedy = error.strerror or str(error), "Check the files and their disk."
     else:
         found, remedy = "it needs more memory than there is", "Free memory, or take a smaller region."
-    return PolarguideError(shot.paths[0], expected="a shot that can be read", found=found, remedy=remedy)
+    expected = "a shot that can be read, and room for its maps"
+    return PolarguideError(shot.paths[0], expected=expected, found=found, remedy=remedy)
 
 
 def tiles(height: int, width: int) -> Iterator[slice]:

@@ -62,7 +62,9 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
     """
     try:
         fx, fy, cx, cy = (float(part) for part in text.split(","))
-        known = all(map(math.isfinite, (fx, fy, cx, cy))) and fx > 0 and fy > 0
+        # A center may lie outside of a cut picture; beyond these bounds it is a slip.
+        centered = all(abs(c - n / 2) <= 10 * n for c, n in zip((cx, cy), size, strict=True))
+        known = centered and all(0 < f <= 1e6 for f in (fx, fy))
     except ValueError:
         known = False
     if not known:

@@ -17,7 +17,13 @@ from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
 from polarguide.shots.catalog import KINDS
 from polarguide.shots.develop import check_files
-from polarguide.shots.exposures import ExposureSet, find_shots, require_name
+from polarguide.shots.exposures import (
+    ExposureSet,
+    find_shots,
+    require_elsewhere,
+    require_name,
+    require_own_folder,
+)
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.page_html import PAGE, shot_page
@@ -55,8 +61,8 @@ def write_shots(
 ) -> WrittenShots:
     """Write all maps of one or many shots, a folder for each.
 
-    A shot that cannot be read does not stop the others. Files of an earlier call in other formats are
-    removed.
+    A shot that cannot be read, or whose maps cannot be written, does not stop the others. Files of an earlier call in
+    other formats are removed.
 
     Args:
         paths: files and folders as ``find_shots`` takes them, or what it has found.
@@ -85,6 +91,7 @@ def write_shots(
     found = [s for s in paths if isinstance(s, ExposureSet)]
     if len(found) < len(paths) or not paths:
         found += find_shots([p for p in paths if not isinstance(p, ExposureSet)], options)
+    require_elsewhere([path for path in paths if not isinstance(path, ExposureSet)], Path(out))
     check_files(options)
     folders: dict[str, Path] = {}
     faults: dict[str, PolarguideError] = {}
@@ -92,8 +99,11 @@ def write_shots(
         for number, shot in enumerate(found, 1):
             try:
                 require_name(shot)
+                folder = Path(out) / shot.name
+                require_own_folder(shot, folder)
                 maps = read_shot(shot, options)
                 surface = surface_maps(maps, camera_of(shot, maps.size, intrinsics), refractive_index)
+                write_maps(maps, surface, folder, formats)
             except UNREADABLE as error:
                 fault = fault_of(shot, error)
                 if len(found) == 1:
@@ -103,7 +113,7 @@ def write_shots(
             else:
                 for note in maps.notes:
                     reporter.say(f"{shot.name}: {note}")
-                folders[shot.name] = write_maps(maps, surface, Path(out) / shot.name, formats)
+                folders[shot.name] = folder
             advance(number)
     if not folders:
         raise next(iter(faults.values()))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,6 +53,46 @@ def check_file_name(name: str, where: str) -> None:
     if not (plain and 0 < len(name) <= LONGEST_NAME):
         expected = f"a name of 1 to {LONGEST_NAME} characters that a file can have"
         raise _fault(where, expected, repr(name)[:LONGEST_NAME])
+
+
+def require_unicode(path: Path) -> None:
+    """Refuse a name of a file whose bytes are no UTF-8: the renderer ends the process over one.
+
+    Raises:
+        PolarguideError: it is one.
+    """
+    try:
+        os.fspath(path).encode("utf-8")
+    except UnicodeEncodeError:
+        raise PolarguideError(
+            path, expected="a name in UTF-8", found="other bytes", remedy="Rename the file or its folder."
+        ) from None
+
+
+def only_fields(data: Mapping[str, Any], known: Sequence[str], where: str) -> None:
+    """Refuse fields that nothing reads.
+
+    Raises:
+        PolarguideError: there are some.
+    """
+    unknown = sorted(data.keys() - set(known))
+    if unknown:
+        raise _fault(where, f"only {', '.join(known)}", ", ".join(unknown)[:LONGEST_NAME])
+
+
+def check_color(color: Any, where: str) -> None:
+    """Refuse what is no color: three numbers from 0 to 1, "own", or a texture, which is checked where it is made.
+
+    Raises:
+        PolarguideError: it is something else.
+    """
+    if color == "own" or isinstance(color, dict):
+        return
+    numbers = color if isinstance(color, list | tuple) else ()
+    plain = all(isinstance(c, int | float) and not isinstance(c, bool) and 0 <= c <= 1 for c in numbers)
+    if len(numbers) != 3 or not plain:
+        expected = 'three numbers from 0 to 1, "own", or a texture {"type": ...}'
+        raise _fault(where, expected, repr(color)[:LONGEST_NAME])
 
 
 def require_light(panorama: NDArray[Any], where: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, write_whole
-from polarguide.synth.bounds import REMEDY, require_light, require_solid
+from polarguide.synth.bounds import REMEDY, only_fields, require_light, require_solid, require_unicode
 from polarguide.synth.environment import make_environment
 from polarguide.synth.mesh import Array, Mesh, rotation, write_ply
 from polarguide.synth.mitsuba_dicts import area_light_dict, bsdf_dict, environment_dict, shown_dict
@@ -77,6 +77,7 @@ def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
     if thing.shape.get("type") == "ball":
         mesh = sphere(_radius(thing))
     elif thing.shape.get("type") == "mesh":
+        only_fields(thing.shape, ("type", "file"), f"{thing.name} shape")
         mesh = _user_mesh(spec.folder / str(thing.shape.get("file")))
     else:
         mesh = make_mesh(thing.shape, thing.name)
@@ -89,8 +90,9 @@ def _radius(thing: Thing) -> float:
     """Of a ball.
 
     Raises:
-        PolarguideError: it is none.
+        PolarguideError: it is none, or the ball has other fields.
     """
+    only_fields(thing.shape, ("type", "radius"), f"{thing.name} shape")
     radius = thing.shape.get("radius", 1.0)
     if isinstance(radius, bool) or not isinstance(radius, int | float) or not radius > 0:
         raise PolarguideError(
@@ -104,6 +106,7 @@ def _user_mesh(path: Path) -> Mesh:
     import mitsuba as mi
 
     kind = path.suffix.lower().lstrip(".")
+    require_unicode(path)
     if kind not in ("ply", "obj") or not path.is_file():
         raise PolarguideError(
             path,
@@ -111,9 +114,24 @@ def _user_mesh(path: Path) -> Mesh:
             found="nothing" if not path.is_file() else f"a {path.suffix} file",
             remedy="File names of meshes are relative to the folder of the scene file.",
         )
-    params = mi.traverse(mi.load_dict({"type": kind, "filename": str(path)}))
+    try:
+        params = mi.traverse(mi.load_dict({"type": kind, "filename": str(path)}))
+    except RuntimeError as error:  # what Mitsuba says ends in the reason
+        reason = str(error).rpartition("shape plugin of type")[2].partition(": ")[2] or str(error)
+        raise PolarguideError(
+            path,
+            expected="a complete mesh of triangles",
+            found=" ".join(reason.split())[:200],
+            remedy="Export it again.",
+        ) from None
     points = np.array(params["vertex_positions"], float).reshape(-1, 3)
     faces = np.array(params["faces"], np.int64).reshape(-1, 3)
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # Mitsuba takes a negative corner for the first
+    if not whole.any() or faces.min() < 0 or faces.max() >= len(points):
+        found = f"corners {faces.min()} to {faces.max()} of {len(points)}" if whole.any() else "no triangle"
+        raise PolarguideError(
+            path, expected="triangles between its points", found=found, remedy="Export it again."
+        )
     normals = np.array(params["vertex_normals"], float).reshape(-1, 3)
     uv = np.array(params["vertex_texcoords"], float).reshape(-1, 2)
     return Mesh(

@@ -89,6 +89,14 @@ def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> d
             found=repr(error),
             remedy="docs/reference/scene-files.md describes them.",
         ) from error
+    plain = len(position) == len(toward) == len(radiance) == 3 and len(half) == 2
+    if not plain or position == toward or min(half) <= 0 or min(radiance) < 0:
+        raise PolarguideError(
+            f"{where} (lights)",
+            expected="two different places, a size above 0, and radiance of 0 or more, of each light",
+            found=str(light)[:200],
+            remedy="docs/reference/scene-files.md describes them.",
+        )
     up = (
         [0, 0, 1]
         if abs(toward[2] - position[2]) < 0.99 * np.linalg.norm(np.subtract(toward, position))

@@ -15,6 +15,7 @@ from polarguide.camera import Camera
 from polarguide.capture.write import write_png, write_view
 from polarguide.progress import Reporter
 from polarguide.synth import folder
+from polarguide.synth.bounds import require_unicode
 from polarguide.synth.build import BuiltScene, build_scene
 from polarguide.synth.cameras import held_out_names, place_cameras, view_names
 from polarguide.synth.film import LobeRadiance, render_lobes
@@ -88,6 +89,7 @@ def synthesize(
         PolarguideError: Mitsuba is missing, the folder holds something else, or the scene has a mistake.
     """
     settings.check()
+    require_unicode(out)
     if folder.open_folder(out, folder.scene_request(spec, settings)):
         verify_scene(out)
         reporter.say(f"{out} is finished already; all its files have their checksums.")

@@ -14,10 +14,12 @@ from msgspec import Meta, Struct
 
 from polarguide.errors import PolarguideError
 from polarguide.records import decode, read_record
-from polarguide.synth.bounds import LARGEST, REMEDY, check_file_name, check_numbers
+from polarguide.synth.bounds import LARGEST, REMEDY, check_color, check_file_name, check_numbers
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Vector = tuple[Number, Number, Number]
+Refraction = Annotated[float, Meta(gt=0, le=100)]
+Extinction = Annotated[float, Meta(ge=0, le=100)]
 Data = dict[str, Any]
 MOST_VIEWS, MOST_SURFACES = 10_000, 1000
 OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
@@ -40,8 +42,8 @@ class Material(Struct, frozen=True, forbid_unknown_fields=True):
     color: Any = (0.5, 0.5, 0.5)
     roughness: Annotated[float, Meta(ge=0.001, le=1)] = 0.05
     index: Annotated[float, Meta(gt=1, lt=4)] = 1.5
-    eta: Vector = (1.35, 0.97, 0.62)
-    k: Vector = (7.5, 6.4, 5.3)
+    eta: tuple[Refraction, Refraction, Refraction] = (1.35, 0.97, 0.62)
+    k: tuple[Extinction, Extinction, Extinction] = (7.5, 6.4, 5.3)
 
 
 class Thing(Struct, frozen=True, forbid_unknown_fields=True):
@@ -90,7 +92,7 @@ class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
     wander: Number = 0.0
     fov: Annotated[float, Meta(gt=1, lt=150)] = 40.0
     views: Annotated[int, Meta(ge=1, le=MOST_VIEWS)] = 72
-    spacing: Number | None = None
+    spacing: Annotated[float, Meta(gt=0, le=360)] | None = None
 
 
 class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
@@ -117,8 +119,8 @@ class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
     about: str = ""
     lights: tuple[Data, ...] = ()
     depth: Annotated[int, Meta(ge=1, le=MOST_SURFACES)] = 6
-    clamp: Annotated[float, Meta(ge=0)] = 0.0
-    exposure: Annotated[float, Meta(gt=0)] | None = None
+    clamp: Annotated[float, Meta(ge=0, le=LARGEST)] = 0.0
+    exposure: Annotated[float, Meta(ge=1 / LARGEST, le=LARGEST)] | None = None
     object_only: bool = False
     folder: Path = Path(".")
 
@@ -163,6 +165,7 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
         check_file_name(thing.name, f"{where} (things[{number}].name)")
         check_numbers(thing.shape, where, f"things[{number}].shape")
         check_numbers(thing.material.color, where, f"things[{number}].material.color")
+        check_color(thing.material.color, f"{where} (things[{number}].material.color)")
     for key in ("environment", "lights"):
         check_numbers(getattr(spec, key), where, key)
     if not sum(ring.get("share", 1.0) for ring in spec.camera.rings) > 0:

@@ -35,6 +35,8 @@ def plane(size: tuple[float, float] = (1.0, 1.0), tile: float = 0.0) -> Mesh:
 def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0), bevel: float = 0.0, detail: int = 4) -> Mesh:
     """A box with rounded edges; each side shows the whole texture."""
     half = np.array(size, float) / 2
+    if not 0 <= bevel <= half.min():
+        raise ValueError(f"a bevel of {bevel:g}, where half of the shortest side is {half.min():g}")
     round_ = min(bevel, float(half.min()) * 0.999) or 1e-5
     corner = np.tan(np.linspace(-np.pi / 4, np.pi / 4, detail + 1))
     sides = []
@@ -63,7 +65,10 @@ def lathe(profile: list[list[float]], segments: int = 96, smooth: int = 8) -> Me
 
     ``smooth`` points are put between two points of the profile, on a Catmull-Rom curve; 0 keeps them as they are.
     """
-    line = _curve(np.array(profile, float), smooth)
+    corners = np.array(profile, float)
+    if (corners[:, 0] < 0).any():
+        raise ValueError(f"a radius of {corners[:, 0].min():g} in the profile")
+    line = _curve(corners, smooth)
     line[:, 0] = np.maximum(line[:, 0], 0)
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     direction = np.stack((np.cos(angle), np.sin(angle)), -1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,6 +43,8 @@ def parse_sweep(text: str) -> Sweep:
     try:
         values = tuple(sorted({float(value) for value in listed.split(",")}))
     except ValueError:
+        values = ()
+    if not all(math.isfinite(value) for value in values):
         values = ()
     whole = parameter != "views" or all(value == int(value) and value >= 2 for value in values)
     if parameter not in PARAMETERS or not values or not whole:

@@ -70,6 +70,8 @@ def _count(tensors: Mapping[str, Tensor], name: str) -> int:
     means = _given(tensors, name)
     if means.ndim != 2:
         raise ValueError(f"{name} of shape {list(means.shape)}, not [N, 3]")
+    if not len(means):  # densification always leaves one
+        raise ValueError(f"{name} of no Gaussian")
     return int(means.shape[0])
 
 
@@ -92,8 +94,6 @@ def _shaped(tensors: Mapping[str, Tensor], name: str, shape: tuple[int, ...]) ->
 
 def _check_values(tensors: Mapping[str, Tensor], full: str, shape: tuple[int, ...], name: str) -> None:
     values = _shaped(tensors, full, shape)
-    if not values.numel():
-        return
     most = LARGEST.get(name, LARGEST_VALUE)
     if float(values.abs().max()) > most or (name == "log_scales" and float(values.max()) > LARGEST_LOG_SCALE):
         raise ValueError(f"{full} with values as large as {float(values.abs().max()):g}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from collections.abc import Iterable
 from typing import Any
 from urllib.parse import urlsplit
@@ -10,6 +11,8 @@ from urllib.parse import urlsplit
 from polarguide.errors import PolarguideError
 
 WEB = ("http", "https")
+_PLACE = re.compile(r"(\[[^\[\]]*\]|[^\[\]:@]*)(:[0-9]*)?")
+"""NAME or [ADDRESS], and :PORT."""
 
 
 class Gate:
@@ -56,6 +59,8 @@ def host_of(url: str, schemes: tuple[str, ...] = ("",)) -> str | None:
         parts = urlsplit(url)
         host, _ = parts.hostname, parts.port
     except ValueError:
+        return None
+    if _PLACE.fullmatch(parts.netloc) is None:  # urlsplit passes over what follows the bracket of an address
         return None
     more = parts.path.strip("/") or parts.query or parts.fragment or "@" in parts.netloc
     return host.rstrip(".") if host and parts.scheme in schemes and not more else None

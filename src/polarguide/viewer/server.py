@@ -243,11 +243,11 @@ def _listening(viser: Any, host: str, port: int, title: str) -> Any:
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as listener:
             listener.bind(address)
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # the latter of a name that no network can have
         raise PolarguideError(
             host,
             expected="an address of this machine",
-            found=error.strerror or str(error),
+            found=getattr(error, "strerror", None) or str(error),
             remedy="Choose 127.0.0.1, or another address of this machine.",
         ) from None
     with contextlib.redirect_stdout(io.StringIO()):

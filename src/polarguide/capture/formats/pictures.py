@@ -21,6 +21,8 @@ SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 TRANSFERS = ("linear", "srgb")
 LARGEST_PIXELS = 150_000_000
 """More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
+_DECODED = 16
+"""Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on."""
 
 
 def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
@@ -120,7 +122,26 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
         with contextlib.suppress(cv2.error):
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None:
+            _require_room(path, size)
             damage = "one that cannot be decoded"
     if damage is not None:
         raise damaged(path, "a complete PNG, JPEG or TIFF file", damage)
     return np.asarray(pixels)
+
+
+def _require_room(path: Path, size: tuple[int, int] | None) -> None:
+    """Tell a lack of memory from damage, which the decoder does not.
+
+    Raises:
+        PolarguideError: a picture of this size, and what its decoder has beside it, cannot be allocated.
+    """
+    width, height = size or (0, 0)
+    try:
+        np.empty(_DECODED * width * height, np.uint8)
+    except MemoryError:
+        raise PolarguideError(
+            path,
+            expected=f"memory for a picture of {width}x{height} pixels",
+            found="less",
+            remedy="Free memory, or check this shell's limits (ulimit -a).",
+        ) from None
