@@ -11,6 +11,7 @@ import pytest
 import torch
 from known_scene import HEIGHT, WIDTH, known_scene, rendered
 
+from polarguide.capture.exposures import Exposure
 from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.scores import score_view, summarize
 from polarguide.evaluation.target import ViewTarget, without_jumps
@@ -118,6 +119,12 @@ def test_stokes_error_without_layers_or_polarization():
     assert (got["stokes_error"], got["stokes_error_reason"]) == (
         None,
         "hardly any polarization was measured where it counts",
+    )
+    pair = dataclasses.replace(view, codes=view.codes[[0, 2]], exposures=(Exposure(0.0), Exposure(90.0)))
+    got = score(pair, facts)
+    assert (got["stokes_error"], got["stokes_error_reason"]) == (
+        None,
+        "the pictures of the view do not determine a Stokes vector",
     )
     # S1 of a thousandth of S0 is just enough to be compared with.
     for share, known in ((0.9e-3, False), (1.1e-3, True)):

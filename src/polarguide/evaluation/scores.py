@@ -17,6 +17,7 @@ from polarguide.evaluation.table import HIGHEST_PSNR, VIEW_METRICS
 from polarguide.evaluation.target import ViewTarget
 
 _NO_LAYERS = "the recipe has no specular and diffuse layers to predict it from"
+_UNDETERMINED = "the pictures of the view do not determine a Stokes vector"
 _NO_POLARIZATION = "hardly any polarization was measured where it counts"
 
 ViewScores = dict[str, float | str | None]
@@ -86,7 +87,8 @@ def score_view(
     if flip_reason is not None:
         scores["flip_reason"] = flip_reason
     if scores["stokes_error"] is None:
-        scores["stokes_error_reason"] = _NO_LAYERS if stokes is None else _NO_POLARIZATION
+        measured = _NO_POLARIZATION if target.polarization is not None else _UNDETERMINED
+        scores["stokes_error_reason"] = _NO_LAYERS if stokes is None else measured
     if lost_pixels:
         scores["nonfinite_pixels"] = lost_pixels
     return scores

@@ -50,10 +50,9 @@ class Forecast:
         """What it took, beside what was expected."""
         peak = peak_memory_mib()
         memory = "" if peak is None else f" and {in_gigabytes(int(peak * MEBIBYTE))} of memory"
-        return (
-            f"took {in_words(seconds)}{memory} (estimate: {in_words(self.seconds)} to "
-            f"{in_words(self.most_seconds)}, up to {in_gigabytes(self.peak)})"
-        )
+        least, most = in_words(self.seconds), in_words(self.most_seconds)
+        estimate = least if least == most else f"{least} to {most}"
+        return f"took {in_words(seconds)}{memory} (estimate: {estimate}, up to {in_gigabytes(self.peak)})"
 
 
 def forecast(

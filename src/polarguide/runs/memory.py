@@ -14,7 +14,7 @@ from polarguide.system import free_memory, resident_memory
 from polarguide.training.recipe import Recipe
 
 GIGABYTE = 10**9
-# Estimates by the tensors that there are; one training of 24 steps at 1224 x 1024 x 60 with 4 GB stayed 12 % below them.
+# Estimates by the tensors that there are: one training (24 steps, 1224 x 1024 x 60, 4 GB) took 12 % less than they say.
 # benchmarks/speed/memory.py measures.
 PROCESS = 250_000_000
 """Bytes that a process takes beside what it holds before training: of libraries, and what the allocator splits."""
