@@ -107,6 +107,26 @@ def test_variables_of_torchrun_that_are_none_are_named(
     assert process_rank() in (0, 2)
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("MASTER_ADDR", ""), ("MASTER_PORT", ""), ("MASTER_PORT", "99999999"), ("MASTER_PORT", "x"), ("LOCAL_RANK", "x")],
+)  # fmt: skip
+def test_processes_need_a_place_to_meet(name: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    two = {
+        "WORLD_SIZE": "2",
+        "RANK": "1",
+        "LOCAL_RANK": "1",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": "29500",
+    }
+    for key, value in two.items():
+        monkeypatch.setenv(key, value)
+    assert process_count() == 2
+    monkeypatch.setenv(name, text)
+    with pytest.raises(PolarguideError, match=f"{name}: .*torchrun"):
+        process_count()
+
+
 def test_a_library_that_takes_sigterm_does_not_keep_it() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with sigterm_kept():

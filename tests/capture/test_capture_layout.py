@@ -10,6 +10,7 @@ import torch
 from tiny_capture import TinyCapture, write_picture
 
 from polarguide.capture import load_scene
+from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
 
@@ -109,3 +110,24 @@ def test_view_names_may_contain_underscores_and_digits(capture: TinyCapture) -> 
     images = capture.root / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text().replace("v000.png", "cam/left_090.jpeg"))
     assert load_scene(capture.root).views[0].name == "left_090"
+
+
+@pytest.mark.parametrize("place", ["", "polar", "polar/new/x", "masks", "gt", "sparse/0", "invalid/new"])
+def test_nothing_is_written_into_a_scene(tmp_path: Path, place: str) -> None:
+    scene = tmp_path / "scene"
+    (scene / "polar").mkdir(parents=True)
+    with pytest.raises(PolarguideError, match=r"expected a folder for what is written, found .*scene"):
+        refuse_scene(scene / place)
+    (tmp_path / "link").symlink_to(scene / place)
+    with pytest.raises(PolarguideError, match=r"found (polar|masks|gt|sparse|invalid)/ of a scene|found a scene"):
+        refuse_scene(tmp_path / "link")
+    refuse_scene(tmp_path / "polar" / "new")
+    refuse_scene(scene / "runs" / "mine")  # nothing is read from there
+
+
+def test_four_folders_of_angles_are_a_scene_too(tmp_path: Path) -> None:
+    for angle in ("I-00", "I-45", "I-90", "I-135"):
+        (tmp_path / angle).mkdir()
+    for place in (tmp_path, tmp_path / "I-45", tmp_path / "I-45" / "new"):
+        with pytest.raises(PolarguideError, match="expected a folder for what is written"):
+            refuse_scene(place)

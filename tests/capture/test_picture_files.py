@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_picture
 
 from polarguide.capture import load_scene
+from polarguide.capture.formats import pictures
 from polarguide.capture.formats.integrity import find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
 from polarguide.capture.view import FULL_CODE
@@ -289,3 +290,17 @@ def test_mask_of_another_size_or_damaged(capture: TinyCapture, folder: str) -> N
     write_picture(path, np.ones((10, 12)), bits=8)
     path.write_bytes(path.read_bytes()[:-1])
     fails(capture.root, f"{folder}/v002.png", "a PNG file cut short")
+
+
+def test_a_lack_of_memory_is_told_from_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = cv2.imencode(".png", np.zeros((40, 50), np.uint16))[1].tobytes()
+    monkeypatch.setattr(pictures.cv2, "imdecode", lambda *_: None)
+    with pytest.raises(PolarguideError, match="one that cannot be decoded"):
+        pictures.decode_stored(tmp_path / "a.png", data)
+
+    def none_left(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(pictures.np, "empty", none_left)
+    with pytest.raises(PolarguideError, match="expected memory for a picture of 50x40 pixels, found less"):
+        pictures.decode_stored(tmp_path / "a.png", data)

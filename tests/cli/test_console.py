@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
+import io
+import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from polarguide.cli.app import run
-from polarguide.cli.console import printable, size_text
-from polarguide.cli.evaluate import _without_value
-from polarguide.evaluation.table import METRICS
+from polarguide.cli.console import printable, say, size_text
+from polarguide.cli.evaluate import _errors, _without_value
+from polarguide.evaluation.table import METRICS, OBJECT_METRICS
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
 
@@ -53,3 +56,27 @@ def test_a_mesh_without_its_libraries_is_no_want_of_ground_truth(monkeypatch) ->
     assert lines[1:] == ["no ground truth, or no such layer, for: normal error"]
     assert "mesh F-score 1 %" in lines[0]
     assert "skimage" in lines[0]
+
+
+def test_lines_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    say(f"trained: o[/red]{HOSTILE}")
+    said = capsys.readouterr().out
+    assert r"o[/red]\x1b[2J" in said
+    assert "\x1b" not in said
+
+
+def test_objects_of_any_name_are_rows_of_the_table() -> None:
+    values = {key: 0.5 for key in OBJECT_METRICS}
+    named = {f"[/red]{HOSTILE}": {"pixels": 3, **values}}
+    shown = Console(file=io.StringIO(), width=400)
+    shown.print(_errors({"objects": named, "materials": {}}))
+    assert r"[/red]\x1b[2J" in shown.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_console_that_cannot_say_a_letter_gets_its_escape(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.TextIOWrapper(io.BytesIO(), "ascii", "strict")
+    monkeypatch.setattr(sys, "stdout", stream)
+    assert run(["--version"]) == 0
+    say("\u2603\udcff")
+    stream.flush()
+    assert b"\\u2603\\udcff" in stream.buffer.getvalue()  # type: ignore[attr-defined]

@@ -241,3 +241,22 @@ def test_damaged_checkpoints_are_refused(damage: str, refused, copy: Path, tmp_p
 def test_damaged_scores_are_refused(text: str, refused, copy: Path) -> None:
     (copy / "metrics.json").write_text(text, encoding="latin-1")
     assert "metrics.json" in refused("share", copy)
+
+
+def test_another_model_is_not_written_over(trained: Path, refused, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    flags = ["export", trained, "--format", "cameras", "--out", tmp_path, *ONE]
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text("mine")
+    assert "expected no model, or one of an earlier export" in refused(*flags)
+    assert (model / "cameras.txt").read_text() == "mine"
+    (model / "cameras.txt").unlink()
+    for _ in range(2):  # its own is written anew
+        assert run([str(flag) for flag in flags]) == 0
+
+
+def test_options_without_what_they_belong_to(trained: Path, refused, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    render = ["render", trained, "--out", tmp_path / "new", *ONE]
+    assert "--frames: expected a --path" in refused(*render, "--frames", "5")
+    assert "--rotate-environment" in refused(*render, "--rotate-environment", "1e308")
+    assert not (tmp_path / "new").exists()

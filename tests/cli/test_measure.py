@@ -194,3 +194,11 @@ def test_a_watch_says_at_its_end_what_never_came(tmp_path: Path, capsys: pytest.
     (tmp_path / "90").rename(parts / "90")
     assert run(command) == 0
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("option", ["--settle", "--patience", "--idle"])
+def test_options_of_a_watch_need_one(
+    shots: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["measure", str(shots), "--out", str(tmp_path / "out"), *SENSOR, option, "7"]) == 2
+    assert f"{option}: expected --watch" in capsys.readouterr().err

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -78,3 +80,36 @@ def test_faults_of_ours_are_not_hidden(error: Exception, monkeypatch: pytest.Mon
     monkeypatch.setattr(app, "_call", fail)
     with pytest.raises(type(error)):
         run(["eval", "run"])
+
+
+def test_a_package_that_fails_while_it_is_imported_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "failing_package.py").write_text("raise ValueError('Unknown setting of ITS_VARIABLE')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(app, "_call", lambda *_: importlib.import_module("failing_package"))
+    assert run(["eval", "run"]) == 2
+    assert "Unknown setting of ITS_VARIABLE. Check the environment's variables" in capsys.readouterr().err
+
+
+def test_a_signal_that_comes_while_a_package_is_imported_ends_the_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object) -> int:
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr(app, "_call", stopped)
+    assert run(["eval", "run"]) == 130
+    assert "stopped." in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device -> a system with /dev/full")
+def test_a_version_that_cannot_be_written_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert run(["--version"]) == 2
+        monkeypatch.undo()
+        with contextlib.suppress(OSError):
+            full.close()

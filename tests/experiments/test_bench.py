@@ -11,11 +11,14 @@ from typing import Any
 
 import pytest
 
+import polarguide
 from polarguide.errors import PolarguideError
 from polarguide.experiments import bench as benches
 from polarguide.experiments.bench import run_bench
 from polarguide.experiments.bench_options import BENCH, Bench, BenchOptions
 from polarguide.experiments.compare import locked
+from polarguide.experiments.join import join_tables
+from polarguide.experiments.options import CompareOptions
 from polarguide.recipes import recipe_named
 from polarguide.synth import render as renderer
 from polarguide.synth.manifest import scene_digest
@@ -217,6 +220,23 @@ def test_a_folder_of_something_else_is_refused(bench: Bench, tmp_path: Path) -> 
     with pytest.raises(PolarguideError, match="two: expected a new or an empty folder"):
         run_bench(tmp_path, RENDER, bench=bench)
     assert not (tmp_path / "scenes" / "one").exists()
+
+
+def test_a_scene_is_no_place_for_the_bench_or_a_comparison(bench: Bench, tmp_path: Path) -> None:
+    (tmp_path / "polar").mkdir()
+    for place in (tmp_path, tmp_path / "polar" / "new"):
+        with pytest.raises(PolarguideError, match="expected a folder for what is written"):
+            run_bench(place, RENDER, bench=bench)
+        with pytest.raises(PolarguideError, match="expected a folder for what is written"):
+            polarguide.compare([tmp_path], ["3dgs"], place)
+        with pytest.raises(PolarguideError, match=r"folder for what is written|results\.json"):
+            join_tables([tmp_path], place)
+    assert [path.name for path in tmp_path.rglob("*")] == ["polar"]
+
+
+def test_there_are_not_a_billion_seeds() -> None:
+    with pytest.raises(PolarguideError, match="seeds: expected up to 1000"):
+        CompareOptions(seeds=10**9)
 
 
 def test_without_mitsuba_nothing_is_begun(

@@ -40,6 +40,8 @@ def test_what_is_written_passes(record: dict[str, Any], tmp_path: Path) -> None:
         (("scenes",), [], "(scenes): expected a list"),
         (("scenes", 1, "name"), "x", "(scenes): expected every name once, found ["),
         (("recipes", 0, "data"), [], "(recipes[0].data): expected a JSON object {...}, found []"),
+        (("runs", 0, "seed"), -1, "(runs[0].seed): expected 0 or more, found -1"),
+        (("scenes", 0, "views"), -6, "(scenes[0].views): expected 0 or more, found -6"),
         (("runs", 0, "scene"), "z", "(runs[0].scene): expected one of the scenes x, y, found "),
         (("runs", 1, "state"), "lost", "(runs[1].state): expected one of done, failed, missing, found "),
         (("runs", 1, "state"), "failed", "(runs[1].metrics): expected values for a run that is done"),

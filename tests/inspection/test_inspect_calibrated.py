@@ -140,3 +140,14 @@ def test_gains_that_are_none_are_refused(tmp_path: Path) -> None:
     (root / "scene.json").write_text(json.dumps({**record, "gains": [0, 1, 1, 1]}))
     with pytest.raises(PolarguideError, match=r"scene\.json.*gains"):
         corrected(read_capture(root), tmp_path / "camera.safetensors")
+
+
+def test_a_rendered_scene_says_its_sensor_in_other_words(tmp_path: Path) -> None:
+    """As ``synth --sensor`` does, whose pictures are not those of the mosaics beside them."""
+    root = scene(tmp_path, PLAIN)
+    about = {"sensor": {"name": "IMX250MZR", "gains": [1.0, 1.0, 1.0, 1.0]}}
+    (root / "scene.json").write_text(json.dumps(about))
+    capture = read_capture(root)
+    assert analyzer_check(capture, None) is None
+    with pytest.raises(PolarguideError, match="or rendered"):
+        corrected(capture, tmp_path / "camera.safetensors")

@@ -66,6 +66,7 @@ def test_a_regions_limits_take_the_place_of_those_for_all(tmp_path: Path) -> Non
         ({"limits": {"dolp_mean": {"max": "1"}}}, "number"),
         ({"limits": {"dolp_mean": {}}}, "min, max or both"),
         ({"limits": {"dolp_mean": {"min": 2, "max": 1}}}, "a min up to the max"),
+        ({"limits": {"aolp_mean": {"min": -400, "max": 900}}}, "angles from 0 to 180"),
         ({"limits": {"s0_difference": {"max": 1}}}, "--reference"),
         ({"regions": {"nose": {"dolp_mean": {"max": 1}}}}, "found nose"),
         ({"bounds": {}}, "found bounds"),

@@ -221,3 +221,21 @@ def test_pictures_of_shots_of_one_name_do_not_replace_each_other(
     assert measured("tuesday", "PART1")["picture"] == "PART1-4"
     assert {path: path.read_bytes() for path in before} == before
     assert len(list((out / "beyond").iterdir())) == len(list((out / "differences").iterdir())) == 5
+
+
+@pytest.mark.parametrize("how", ["removed", "replaced"])
+def test_a_table_that_goes_away_takes_no_more_lines(tmp_path: Path, how: str) -> None:
+    with Table(tmp_path / "table", SETTINGS) as table:
+        table.add(entry(0))
+        (tmp_path / "table" / LINES).unlink()
+        if how == "replaced":
+            (tmp_path / "table" / LINES).write_text("")
+        for act in (table.require_there, lambda: table.add(entry(1))):
+            with pytest.raises(PolarguideError, match=r"table\.jsonl: .*removed, renamed or replaced"):
+                act()
+
+
+def test_no_table_among_the_shots(folder: Path, reading: ShotOptions) -> None:
+    with pytest.raises(PolarguideError, match="found that of the shots"):
+        measure_shots([folder], folder, MeasureOptions(), reading)
+    assert not (folder / LINES).exists()

@@ -19,7 +19,7 @@ from camera_files import ANGLES, behind, smooth_light, write_model, write_mosaic
 from polarguide import files
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration, read_calibration
-from polarguide.errors import PolarguideError
+from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.preparation import folder as folder_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -434,3 +434,53 @@ def test_four_copies_of_one_shot_are_warned_of(tmp_path: Path) -> None:
     settings = PrepareSettings(poses="none", align=False, transfer="linear")
     prepare_scene(tmp_path / "raw", tmp_path / "out", settings, Heard())
     assert said == ["v001: its four pictures are the same, as copies of one are."]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("scale", None), ("gains", None), ("levels", None), ("scale", "x"), ("gains", [1, 1]), ("gains", [0, 1, 1, 1]),
+     ("levels", {"bits": "x"}), ("levels", {"bits": 12})],
+)  # fmt: skip
+def test_what_was_measured_is_checked_before_it_is_gone_on_with(
+    tmp_path: Path, key: str, value: object
+) -> None:
+    write_mosaics(tmp_path / "source")
+    prepare_scene(tmp_path / "source", tmp_path / "out", MOSAIC)
+    (tmp_path / "out" / "scene.json").rename(tmp_path / "out" / "prepare.json")
+    path = tmp_path / "out" / "prepare.json"
+    journal = json.loads(path.read_text())
+    journal["prepare"]["measured"][key] = value
+    if value is None:
+        del journal["prepare"]["measured"][key]
+    path.write_text(json.dumps(journal))
+    with pytest.raises(PolarguideError, match=rf"prepare\.json.*{key}"):
+        prepare_scene(tmp_path / "source", tmp_path / "out", MOSAIC)
+
+
+def test_a_fault_of_ours_is_not_said_to_be_one_of_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_mosaics(tmp_path / "source")
+    prepare_scene(tmp_path / "source", tmp_path / "out", MOSAIC)
+    (tmp_path / "out" / "scene.json").rename(tmp_path / "out" / "prepare.json")
+    for picture in (tmp_path / "out" / "polar").glob("v000_*"):
+        picture.unlink()
+
+    def fails(*_: object, **__: object) -> None:
+        raise ValueError("of ours")
+
+    monkeypatch.setattr("polarguide.preparation.mosaic_source.demosaic", fails)
+    with pytest.raises(ValueError, match="of ours"):
+        prepare_scene(tmp_path / "source", tmp_path / "out", MOSAIC)
+
+
+def test_pictures_at_other_angles_are_warned_of(tmp_path: Path) -> None:
+    write_shots(tmp_path / "raw", "v000", behind(smooth_light()))
+    files = sorted(path for path in (tmp_path / "raw").rglob("*") if path.is_file())
+    (tmp_path / "one").mkdir()
+    for angle, path in zip((0, 135, 45, 90), files, strict=True):
+        shutil.copyfile(path, tmp_path / "one" / f"v_{angle}{path.suffix}")
+    shutil.copyfile(files[0], tmp_path / "one" / f"v_60{files[0].suffix}")
+    settings = PrepareSettings(poses="none", align=False, transfer="linear")
+    with pytest.warns(PolarguideWarning, match=r"not used \(v_60"):
+        prepare_scene(tmp_path / "one", tmp_path / "out", settings, Reporter())

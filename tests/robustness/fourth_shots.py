@@ -71,13 +71,15 @@ def shot_cases() -> Iterator[MadeCase]:
         import numpy as np
         from PIL import Image
 
-        Image.fromarray(np.zeros((6000, 6000), np.uint16)).save(folder / MOSAIC)
+        for path in (folder / "mosaics").iterdir():
+            path.unlink()
+        Image.fromarray(np.full((6000, 6000), 900, np.uint16)).save(folder / MOSAIC)
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-        limit = pages * resource.getpagesize() + (100 << 20)
+        limit = pages * resource.getpagesize() + (50 << 20)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
     yield made_case(
-        "fourth mosaic of 6000 pixels a side and 100 MiB",
+        "fourth mosaic of 6000 pixels a side and 50 MiB",
         large,
         MOSAICS,
         says="memory",

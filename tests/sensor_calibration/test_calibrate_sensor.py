@@ -384,6 +384,10 @@ def test_what_exists_is_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(PolarguideError, match=r"ends in \.safetensors"):
         calibrate_sensor(tmp_path / "shots", tmp_path / "mine.json", CalibrateSettings("IMX250MZR"))
     assert (tmp_path / "mine.png").read_bytes() == b"a photograph"
+    with pytest.raises(PolarguideError, match="one among the shots"):
+        calibrate_sensor(
+            tmp_path / "shots", tmp_path / "shots" / "new.safetensors", CalibrateSettings("IMX250MZR")
+        )
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,10 +14,20 @@ import pytest
 
 import polarguide
 from polarguide.errors import PolarguideError
-from polarguide.shots import ShotMaps, ShotOptions, SurfaceMaps, read_shot, surface_maps, write_shots
+from polarguide.options import SceneOptions
+from polarguide.shots import (
+    ShotMaps,
+    ShotOptions,
+    SurfaceMaps,
+    find_shots,
+    read_shot,
+    surface_maps,
+    write_shots,
+)
 from polarguide.shots.catalog import KINDS
 from polarguide.shots.page_html import PAGE
 from polarguide.shots.pictures import drawn, stretch_of, with_legend
+from polarguide.shots.surface import parse_intrinsics
 from tests.helpers.browsers import chromium
 from tests.helpers.heard import Heard
 from tests.shots.test_read import CUP, MONO, PLAIN, light, write_four, write_mosaic
@@ -148,3 +160,65 @@ def test_a_color_shot_is_drawn_in_color(tmp_path: Path) -> None:
     folder = write_shots([tmp_path / "part.png"], tmp_path / "out", options, formats=("png",)).folders["part"]
     picture = cv2.imread(str(folder / "S0.png"))[:64, :96].astype(int)
     assert (picture[..., 1] - picture[..., 2]).mean() > 10  # green filters pass more than red ones
+
+
+def test_maps_that_cannot_be_written_do_not_stop_the_other_shots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name in "abc":
+        write_mosaic(folder / f"{name}.png", "IMX250MZR")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a").write_text("a file where a folder should be")
+    write = np.save
+
+    def full(file: Any, values: Any) -> None:
+        if f"{os.sep}b{os.sep}" in file.name:
+            raise MemoryError
+        write(file, values)
+
+    monkeypatch.setattr(np, "save", full)
+    heard = Heard()
+    done = write_shots([folder], tmp_path / "out", MONO, formats=("npy",), reporter=heard)
+    assert set(done.folders) == {"c"}
+    assert set(done.faults) == {"a", "b"}
+    assert "room for its maps, found it needs more memory" in str(done.faults["b"])
+    assert (tmp_path / "out" / "c" / "maps.json").exists()
+
+
+def test_maps_are_not_written_beside_their_mosaic_or_among_shots(tmp_path: Path) -> None:
+    (tmp_path / "S0").mkdir()
+    mosaic = tmp_path / "S0" / "S0.png"
+    write_mosaic(mosaic, "IMX250MZR")
+    before = mosaic.read_bytes()
+    with pytest.raises(PolarguideError, match="that it lies there"):
+        write_shots([mosaic], tmp_path, MONO, formats=("png",))
+    with pytest.raises(PolarguideError, match="found that of the shots"):
+        write_shots([tmp_path / "S0"], tmp_path / "S0" / ".." / "S0", MONO, formats=("png",))
+    assert mosaic.read_bytes() == before
+    assert [path.name for path in (tmp_path / "S0").iterdir()] == ["S0.png"]
+
+
+def test_maps_of_a_scene_have_the_size_that_is_asked_for(tmp_path: Path, demo_scene: Path) -> None:
+    reading = SceneOptions(downscale=4)
+    polarguide.priors(demo_scene, tmp_path, views="v000", reading=reading, formats=["npy"])
+    assert np.load(tmp_path / "v000" / "DoLP.npy").shape == (24, 32)
+    assert np.load(tmp_path / "v000" / "normal.npy").shape == (24, 32, 3)
+
+
+def test_a_view_that_does_not_fit_into_memory_is_refused_by_its_header(
+    tmp_path: Path, demo_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (found, *_) = find_shots([demo_scene])
+    monkeypatch.setattr("polarguide.capture.memory.free_memory", lambda: 1 << 20)
+    monkeypatch.setattr("polarguide.shots.develop.read_view", lambda *_, **__: pytest.fail("it was decoded"))
+    with pytest.raises(PolarguideError, match="a view of 128x96 that take"):
+        read_shot(found, ShotOptions())
+
+
+def test_intrinsics_are_those_of_the_picture(tmp_path: Path) -> None:
+    assert parse_intrinsics("50,50,32,24", (64, 48)).fx == 50
+    for text in ("1e308,1e308,0,0", "50,50,1e9,0", "50,50,32,-481", "0,50,32,24"):
+        with pytest.raises(PolarguideError, match="--intrinsics"):
+            parse_intrinsics(text, (64, 48))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from importlib import resources
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import numpy as np
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.synth.bounds import require_light, require_solid
+from polarguide.synth.bounds import only_fields, require_light, require_solid, require_unicode
 from polarguide.synth.cameras import place_cameras
 from polarguide.synth.environment import ENVIRONMENTS, directions, make_environment
 from polarguide.synth.mesh import Mesh, write_ply
+from polarguide.synth.mitsuba_dicts import area_light_dict
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file, with_current_keys
 from polarguide.synth.settings import PRESETS, Overrides, find_scene
 from polarguide.synth.shapes import make_mesh
@@ -145,6 +147,8 @@ def test_a_painted_solid_keeps_its_colors() -> None:
         {"type": "cat"},
         {},
         {"type": "box", "wings": 1},
+        {"type": "box", "size": [1, 1, 1], "bevel": 5},
+        {"type": "lathe", "profile": [[-1, 0], [1, 1]]},
         {"type": "solid", "parts": [{"kind": "x", "at": [0, 0, 0], "size": [1, 1, 1]}]},
     ],
 )
@@ -213,7 +217,7 @@ def test_overrides_reach_foreground_plastic_only() -> None:
 
 def test_sweeps() -> None:
     assert parse_sweep("noise=2,0,1").values == (0.0, 1.0, 2.0)
-    for text in ("noise", "noise=", "size=1,2", "views=1.5", "noise=a"):
+    for text in ("noise", "noise=", "size=1,2", "views=1.5", "noise=a", "noise=nan", "views=inf"):
         with pytest.raises(PolarguideError, match="--sweep"):
             parse_sweep(text)
 
@@ -247,7 +251,13 @@ def test_a_thing_is_called_as_a_file_can_be(name: str) -> None:
      ({"things": [{"name": "a", "shape": {"type": "sphere", "radius": 1e300}}]}, "shape.radius"),
      ({"things": [{"name": "a", "shape": {"type": "sphere", "detail": 10**6}}]}, "shape.detail"),
      ({"things": [{"name": "a", "shape": {"type": "tube", "path": [[0, 0, 0]] * 2000}}]}, "shape.path"),
-     ({"environment": {"type": "uniform", "radiance": [1e30, 1, 1]}}, "environment")],
+     ({"environment": {"type": "uniform", "radiance": [1e30, 1, 1]}}, "environment"),
+     ({"exposure": 1e-30}, "exposure"), ({"clamp": 1e30}, "clamp"),
+     ({"camera": {"rings": [{"radius": 3, "height": 1}], "spacing": 0}}, "spacing"),
+     *(({"things": [{"name": "a", "shape": {"type": "sphere"}, "material": {"color": color}}]}, "material.color")
+       for color in ("red", [1, 1], [1, 1, 1, 1], [2, 0, 0], [-1, 0, 0], [True, 0, 0], None)),
+     *(({"things": [{"name": "a", "shape": {"type": "sphere"}, "material": {"type": "metal", **index}}]}, "material")
+       for index in ({"eta": [0, 1, 1]}, {"k": [-1, 1, 1]}))],
 )  # fmt: skip
 def test_numbers_out_of_all_bounds_are_named(changes: dict[str, object], where: str) -> None:
     with pytest.raises(PolarguideError) as refused:
@@ -262,3 +272,26 @@ def test_light_that_is_none_and_objects_without_an_extent_are_named() -> None:
     for points in (np.zeros((0, 3)), np.ones((5, 3)), np.full((5, 3), np.inf)):
         with pytest.raises(PolarguideError, match="with an extent"):
             require_solid(points, "test")
+
+
+def test_a_name_that_is_no_text_is_refused_before_the_renderer_sees_it(tmp_path: Path) -> None:
+    require_unicode(tmp_path / "r\u00e4ume")
+    with pytest.raises(PolarguideError, match="expected a name in UTF-8"):
+        require_unicode(tmp_path / os.fsdecode(b"\xff"))
+
+
+def test_fields_that_nothing_reads_are_named() -> None:
+    only_fields({"type": "ball"}, ("type", "radius"), "ball shape")
+    with pytest.raises(PolarguideError, match="expected only type, radius, found foo"):
+        only_fields({"type": "ball", "foo": 1}, ("type", "radius"), "ball shape")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"toward": [0, 0, 5]}, {"size": [0, 1]}, {"position": [0, 0]}, {"radiance": [-1, 0, 0]}, {"radiance": [1]}],
+)  # fmt: skip
+def test_lamps_that_are_none_are_named(change: dict[str, object]) -> None:
+    pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
+    light = {"position": [0, 0, 5], "toward": [0, 0, 0], "size": [1, 1], "radiance": [1, 1, 1]}
+    with pytest.raises(PolarguideError, match=r"small \(lights\)"):
+        area_light_dict({**light, **change}, 0, "small")

@@ -126,6 +126,9 @@ def test_signs_and_lengths(tiny_scene: Scene, busy_recipe: Recipe) -> None:
     for name in ("statistics.seen", "adam.means.exp_avg_sq", "adam.means.step"):
         with pytest.raises(ValueError, match="negative"):
             refuse_foreign({**tensors, name: tensors[name] - 1e6}, busy_recipe)
+    none = {name: values[:0] if name.startswith("gaussians.") else values for name, values in tensors.items()}
+    with pytest.raises(ValueError, match="of no Gaussian"):
+        refuse_foreign(none, busy_recipe)
     still = {**tensors, "gaussians.quaternions": torch.zeros_like(tensors["gaussians.quaternions"])}
     with pytest.raises(ValueError, match="length zero"):
         refuse_foreign(still, busy_recipe)

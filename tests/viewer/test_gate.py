@@ -25,7 +25,7 @@ def test_names_of_this_machine_pass_with_pages_of_their_own_or_none(host: str) -
 @pytest.mark.parametrize(
     "host",
     ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8080", "", "a b", "[::1", "me@127.0.0.1",
-     "127.0.0.1/x", "127.0.0.1:port", "0x7f.1"],
+     "127.0.0.1/x", "127.0.0.1:port", "0x7f.1", "[::1].evil.example", "[::1]evil.example:80"],
 )  # fmt: skip
 def test_other_names_are_refused_with_the_remedy(host: str) -> None:
     assert "--allow-host" in (OWN.refusal(Headers(Host=host)) or "")

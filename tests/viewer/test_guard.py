@@ -22,6 +22,7 @@ from polarguide.errors import PolarguideError
 from polarguide.viewer import Viewer, guard
 from polarguide.viewer.gate import Gate
 from polarguide.viewer.messages import LARGEST, Refused, checked, choice, flag, number, pair
+from polarguide.viewer.server import _listening
 
 NUMBERS = [
     math.nan,
@@ -260,3 +261,9 @@ def test_a_camera_is_clamped() -> None:
     assert (found["fov"], found["image_width"], found["position"]) == (0.01, 8192, [50.0, 0.0, 0.0])
     assert found["wxyz"] == [1.0, 0.0, 0.0, 0.0]
     assert "more" not in found
+
+
+@pytest.mark.parametrize("host", ["a" * 70_000, "\udcff", "xn--\u2603.."])
+def test_names_that_no_network_can_have_are_one_line(host: str) -> None:
+    with pytest.raises(PolarguideError, match="expected an address of this machine"):
+        _listening(None, host, 8080, "a title")

@@ -136,11 +136,12 @@ def _of_the_machine(error: Exception) -> str:
 def _while_loading(error: Exception) -> bool:
     """Whether an installed package failed while it was imported, as PyTorch does with variables that it cannot read."""
     frames = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
-    ours = [number for number, name in enumerate(frames) if f"{os.sep}polarguide{os.sep}" in name]
+    ours = [number for number, name in enumerate(frames) if name.startswith(_HOME)]
     return any(name.startswith("<frozen importlib") for name in frames[ours[-1] + 1 :]) if ours else False
 
 
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
+_HOME = str(Path(__file__).parents[1]) + os.sep
 _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
 _MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --threads 1 takes less."
 

@@ -63,10 +63,16 @@ class _Prepared(msgspec.Struct):
     views: dict[str, _View] = {}
 
 
+class _Simulated(msgspec.Struct):
+    """The sensor of ``synth``, whose mosaics lie beside pictures that it did not take."""
+
+    name: str
+
+
 class _Scene(msgspec.Struct):
     """What is read of ``scene.json``."""
 
-    sensor: str | None = None
+    sensor: str | _Simulated | None = None
     gains: tuple[_Gain, _Gain, _Gain, _Gain] | None = None
     analyzers: _Analyzers | None = None
     prepare: _Prepared | None = None
@@ -94,11 +100,11 @@ def corrected(capture: Capture, path: Path) -> Capture:
             found=f"one with that of {about.analyzers.sensor} (checksum {about.analyzers.sha256[:16]}...)",
             remedy="Leave --calibration out.",
         )
-    if about.prepare is not None and about.sensor is None:
+    if isinstance(about.sensor, _Simulated) or (about.prepare is not None and about.sensor is None):
         raise PolarguideError(
             capture.root,
             expected="a scene of the mosaics of a sensor",
-            found="one of shots through a filter, or of a dataset",
+            found="one of shots through a filter, of a dataset, or rendered",
             remedy="Leave --calibration out.",
         )
     calibration.require_sensor(about.sensor, path)

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -145,7 +146,7 @@ class MosaicSource(Source):
         stored = self._mosaics.read(path)
         dark = self._mosaics.dark(stored.shape)
         values = self._mosaics.cut(stored)
-        levels = Levels(**measured["levels"])
+        levels = msgspec.convert(measured["levels"], Levels)
         saturated, black = unusable_samples(values, levels, dark)
         bad, linear = saturated | black, levels.linear(values, dark)
         if self._analyzers is not None:

@@ -1,0 +1,58 @@
+"""Meshes of users: what is damaged is named, and does not end the process."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from polarguide.errors import PolarguideError
+from polarguide.synth.build import _user_mesh
+
+HEAD = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(
+    f"property float {axis}\n" for axis in "xyz"
+)
+FACES = "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+PLACES = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
+
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def ply(vertices: object, faces: object, body: bytes) -> bytes:
+    return (HEAD.format(vertices) + FACES.format(faces)).encode() + body
+
+
+def corners(*numbers: int) -> bytes:
+    return bytes([len(numbers)]) + struct.pack(f"<{len(numbers)}i", *numbers)
+
+
+def test_a_triangle(tmp_path: Path) -> None:
+    (tmp_path / "m.ply").write_bytes(ply(3, 1, PLACES + corners(0, 1, 2)))
+    mesh = _user_mesh(tmp_path / "m.ply")
+    assert mesh.points.shape == (3, 3)
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("m.ply", ply(-5, 1, b"")),
+        ("m.ply", ply("9" * 5000, 1, b"")),
+        ("m.ply", ply(3, 1, PLACES + corners(0, 1, 99))),
+        ("m.ply", ply(3, 1, PLACES + corners(0, 1, -1))),
+        ("m.ply", ply(3, 1, PLACES + b"\xff")),
+        ("m.ply", ply(3, 0, PLACES)),
+        ("m.ply", b"ply\nformat"),
+        ("m.obj", b""),
+        ("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
+        ("m.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    ],
+)
+def test_damaged_ones_are_named(tmp_path: Path, name: str, data: bytes) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(PolarguideError) as refused:
+        _user_mesh(tmp_path / name)
+    assert refused.value.where.endswith(name)
+    assert "\n" not in str(refused.value)
