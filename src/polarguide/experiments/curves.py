@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -112,3 +112,22 @@ def ticks(low: float, high: float, about: int = 6) -> list[float]:
     step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * 0.999)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     return [round(index * step, 10) for index in range(first, max(last, first + 1) + 1)]
+
+
+def grid(
+    place: Callable[[float, float], tuple[float, float]], x_ticks: Sequence[float], y_ticks: Sequence[float]
+) -> list[str]:
+    """SVG elements of horizontal lines at ``y_ticks``, and the numbers at both axes.
+
+    Args:
+        place: where a point lies in the picture.
+    """
+    parts = []
+    for tick in y_ticks:
+        (x1, y), (x2, _) = place(x_ticks[0], tick), place(x_ticks[-1], tick)
+        parts.append(f'<line class="grid" x1="{x1:.1f}" x2="{x2:.1f}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text text-anchor="end" x="{x1 - 6:.1f}" y="{y + 4:.1f}">{tick:g}</text>')
+    for tick in x_ticks:
+        x, y = place(tick, y_ticks[0])
+        parts.append(f'<text text-anchor="middle" x="{x:.1f}" y="{y + 16:.1f}">{tick:g}</text>')
+    return parts

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from polarguide.capture.variants import count_of
 from polarguide.evaluation.table import COLUMNS
-from polarguide.experiments.curves import ticks
+from polarguide.experiments.curves import grid, ticks
 from polarguide.experiments.plan import Comparison
 from polarguide.experiments.results import Results
 from polarguide.experiments.study import PALETTE
@@ -89,13 +89,7 @@ def _panel(points: dict[str, list[Point]], title: str, left: int, top: int) -> s
         )
 
     parts = [f'<text x="{left + LEFT}" y="{top + 16}">{html.escape(title)}</text>']
-    for tick in y_ticks:
-        (x1, y), (x2, _) = place(x_ticks[0], tick), place(x_ticks[-1], tick)
-        parts.append(f'<line class="grid" x1="{x1:.1f}" x2="{x2:.1f}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text text-anchor="end" x="{x1 - 6:.1f}" y="{y + 4:.1f}">{tick:g}</text>')
-    for tick in x_ticks:
-        x, y = place(tick, y_ticks[0])
-        parts.append(f'<text text-anchor="middle" x="{x:.1f}" y="{y + 16:.1f}">{tick:g}</text>')
+    parts += grid(place, x_ticks, y_ticks)
     middle = left + (LEFT + WIDTH - RIGHT) / 2
     parts.append(f'<text text-anchor="middle" x="{middle:.1f}" y="{top + HEIGHT - 8}">pictures taken</text>')
     for number, (scene, of_scene) in enumerate(points.items()):
