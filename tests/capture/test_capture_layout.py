@@ -119,7 +119,9 @@ def test_nothing_is_written_into_a_scene(tmp_path: Path, place: str) -> None:
     with pytest.raises(PolarguideError, match=r"expected a folder for what is written, found .*scene"):
         refuse_scene(scene / place)
     (tmp_path / "link").symlink_to(scene / place)
-    with pytest.raises(PolarguideError, match=r"found (polar|masks|gt|sparse|invalid)/ of a scene|found a scene"):
+    with pytest.raises(
+        PolarguideError, match=r"found (polar|masks|gt|sparse|invalid)/ of a scene|found a scene"
+    ):
         refuse_scene(tmp_path / "link")
     refuse_scene(tmp_path / "polar" / "new")
     refuse_scene(scene / "runs" / "mine")  # nothing is read from there
