@@ -52,7 +52,7 @@ def test_from_shots_to_a_corrected_scene(
     ("arguments", "expected"),
     [
         (["calibrate", "nowhere", "--out", "c.safetensors", "--sensor", "IMX250MZR"], "nowhere"),
-        (["calibrate", ".", "--out", "c.safetensors", "--sensor", "IMX250MZR"], "at least 5 shots"),
+        (["calibrate", ".", "--out", "../c.safetensors", "--sensor", "IMX250MZR"], "at least 5 shots"),
         (
             ["calibrate", ".", "--out", "c.png", "--sensor", "IMX250MZR"],
             "--out: expected a file name that ends in",

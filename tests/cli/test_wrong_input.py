@@ -190,7 +190,7 @@ def test_a_verb_that_is_nearly_one(refused, word: str, meant: str) -> None:
 
 
 def test_a_word_that_is_no_verb(refused) -> None:
-    assert "fly: expected a verb: demo, calibrate, prepare" in refused("fly")
+    assert "fly: expected a verb: demo, calibrate, scale, prepare" in refused("fly")
 
 
 def test_viewing_a_file_says_what_is_wanted(refused, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def shot_cases() -> Iterator[MadeCase]:
         "fourth shot at 60 degrees beside four",
         at_another_angle,
         ["prepare", "alone", *SHOTS[2:]],
-        says="warning: .*other angles",
+        says="warning: .*its pictures are the same",
     )
 
     def small(path: Path) -> None:
