@@ -10,8 +10,11 @@ import sys
 # OpenMP reads this when it is loaded, so it has to be said before torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from polarguide.cli.app import run
-from polarguide.system import keep_freed_memory, stop_signals
+try:
+    from polarguide.cli.app import run
+    from polarguide.system import interrupt, keep_freed_memory, stop_signals
+except KeyboardInterrupt:  # before there is anything to stop
+    sys.exit(130)
 
 
 def main() -> None:
@@ -21,9 +24,18 @@ def main() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, to the end of the process
     # As Ctrl-C does, so that whatever is open is closed.
     for number in stop_signals():
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, interrupt)
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:  # a shell may let it be ignored
+        signal.signal(signal.SIGINT, interrupt)
     keep_freed_memory()
-    sys.exit(run(sys.argv[1:]))
+    try:
+        status = run(sys.argv[1:])
+    except KeyboardInterrupt:  # one more, while it was said that the first had stopped the command
+        status = 130
+    if status == 130:
+        for number in (signal.SIGINT, *stop_signals()):  # nothing is left to stop
+            signal.signal(number, signal.SIG_IGN)
+    sys.exit(status)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,23 @@ def stop_signals() -> list[int]:
     ]
 
 
+_interrupts: list[int] = []
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """A handler of signals that raises KeyboardInterrupt, as Python's own does, and takes note of it.
+
+    Packages lose it: what they import while it comes looks broken, and says nothing of the reason.
+    """
+    _interrupts.append(number)
+    signal.default_int_handler(number, frame)
+
+
+def interrupts() -> int:
+    """How many signals ``interrupt`` has taken in this process."""
+    return len(_interrupts)
+
+
 class StopSignals:
     """A context in which Ctrl-C, SIGTERM and SIGHUP ask work to stop; the object is a training's ``should_stop``.
 
@@ -58,10 +75,10 @@ class StopSignals:
         self._works = True
         return self._asked
 
-    def _stop(self, number: int, _: FrameType | None) -> None:
+    def _stop(self, number: int, frame: FrameType | None) -> None:
         if self._works:
             if self._asked and number == signal.SIGINT:
-                raise KeyboardInterrupt
+                interrupt(number, frame)
             self._asked = True
         elif number == signal.SIGTERM and process_count() > 1:
             # torchrun ends the others when one process is lost: first one of them has to say what happened.
@@ -69,15 +86,12 @@ class StopSignals:
             timer.daemon = True
             timer.start()
         else:
-            raise KeyboardInterrupt
+            interrupt(number, frame)
 
 
 @contextlib.contextmanager
 def signals_as_interrupts() -> Iterator[None]:
     """SIGTERM and SIGHUP act like Ctrl-C."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
 
     old = {number: signal.signal(number, interrupt) for number in stop_signals()}
     try:

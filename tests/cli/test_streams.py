@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 from polarguide.cli import app
 from polarguide.cli.app import run
+from polarguide.system import interrupt
 
 PROGRAM = f"{sys.executable} -m polarguide"
 
@@ -27,6 +29,22 @@ def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def test_help_into_nothing(closed: str, tmp_path: Path) -> None:
     done = shell(f"{PROGRAM} --help {closed}", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_signal_that_a_package_makes_another_error_of_ends_the_command(
+    lost: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object) -> int:
+        try:
+            interrupt(signal.SIGINT, None)
+        except KeyboardInterrupt as first:
+            raise RuntimeError("error encountered (see above)") from (None if lost else first)
+        return 0
+
+    monkeypatch.setattr(app, "_call", stopped)
+    assert run(["eval", "run"]) == 130
+    assert "stopped." in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full, which takes nothing")

@@ -429,11 +429,14 @@ def test_four_copies_of_one_shot_are_warned_of(tmp_path: Path) -> None:
             said.append(text)
 
     light = behind(smooth_light())
-    for view, values in (("v000", light), ("v001", light[[0, 0, 0, 0]])):
+    for view, values in (("v000", light), ("v001", light[[0, 0, 0, 0]]), ("v002", light[[0, 1, 0, 3]])):
         write_shots(tmp_path / "raw", view, values)
     settings = PrepareSettings(poses="none", align=False, transfer="linear")
     prepare_scene(tmp_path / "raw", tmp_path / "out", settings, Heard())
-    assert said == ["v001: its four pictures are the same, as copies of one are."]
+    assert said == [
+        "v001: its four pictures are the same, as copies of one are.",
+        "v002: its pictures at 0 and 90 degrees are the same, as copies of one are.",
+    ]
 
 
 @pytest.mark.parametrize(

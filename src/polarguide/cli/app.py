@@ -21,6 +21,7 @@ from polarguide import __version__
 from polarguide.cli.console import say, warnings_printed
 from polarguide.errors import PolarguideError
 from polarguide.options import gibibytes
+from polarguide.system import interrupts
 
 VERBS = {
     "demo": "demo",
@@ -69,6 +70,7 @@ def options_of(function: Callable[..., Any]) -> dict[str, Any]:
 def run(arguments: Sequence[str]) -> int:
     """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input, or what the verb says)."""
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
+    before = interrupts()
     for stream in (
         sys.stdout,
         sys.stderr,
@@ -91,8 +93,8 @@ def run(arguments: Sequence[str]) -> int:
         )
         return _failed(f"{said} Check the name, the rights, and the room on the disk.")
     except Exception as error:
-        if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
-            return _stopped()  # what C code makes of one that comes while it imports
+        if _from_a_signal(error) or interrupts() > before:
+            return _stopped()
         said = _of_the_machine(error)
         if not said:
             raise
@@ -109,6 +111,15 @@ def _stopped() -> int:
     with contextlib.suppress(OSError):
         _errors().print("stopped.")
     return 130
+
+
+def _from_a_signal(error: BaseException | None) -> bool:
+    """Whether an error is what a package has made of a KeyboardInterrupt, such as C code that imports another."""
+    for _ in range(20):
+        if error is None or isinstance(error, KeyboardInterrupt):
+            break
+        error = error.__cause__ or error.__context__
+    return isinstance(error, KeyboardInterrupt)
 
 
 def _failed(text: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shlex
 import shutil
@@ -17,7 +18,7 @@ from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError
 from polarguide.capture.colmap.undistort import Geometry
-from polarguide.capture.view import listed
+from polarguide.capture.view import ANGLES, listed
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
 from polarguide.preparation.exposure_table import write_exposure_table
@@ -262,6 +263,12 @@ def _write_view(
         faults.append(
             f"{view}: its {'four ' * (len(intensities) == 4)}pictures are the same, as copies of one are."
         )
+    elif list(done.angles or ANGLES) == list(ANGLES):
+        faults += [
+            f"{view}: its pictures at {ANGLES[a]} and {ANGLES[b]} degrees are the same, as copies of one are."
+            for a, b in itertools.combinations(range(len(ANGLES)), 2)
+            if np.array_equal(intensities[a], intensities[b])
+        ]
     return faults, done.notes
 
 
