@@ -484,6 +484,6 @@ def test_pictures_at_other_angles_are_warned_of(tmp_path: Path) -> None:
     for angle, path in zip((0, 135, 45, 90), files, strict=True):
         shutil.copyfile(path, tmp_path / "one" / f"v_{angle}{path.suffix}")
     shutil.copyfile(files[0], tmp_path / "one" / f"v_60{files[0].suffix}")
-    settings = PrepareSettings(poses="none", align=False, transfer="linear")
+    settings = PrepareSettings(format="filter", poses="none", align=False, transfer="linear")
     with pytest.warns(PolarguideWarning, match=r"not used \(v_60"):
         prepare_scene(tmp_path / "one", tmp_path / "out", settings, Reporter())
