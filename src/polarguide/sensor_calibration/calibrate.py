@@ -66,8 +66,8 @@ def calibrate_sensor(
     """
     settings = settings.checked()
     _require_new(out)
-    _require_apart(out, Path(source), settings)
     files = Shots(Path(source), settings)
+    _require_apart(out, Path(source), settings)
     known = settings.known_angles(files.files)
     measured = files.measure(reporter)
     fit = _solved(files, measured, settings, known)
