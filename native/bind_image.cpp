@@ -170,18 +170,19 @@ void bind_image(nb::module_ &module) {
     module.def(
         "harmonics_backward",
         [](int degree, const Array &means, const Array &center, const Array &dc, const Array &rest,
-           const Array &grad_out, std::optional<Array> grad_means, Array grad_dc, Array grad_rest) {
+           const Array &grad_out, std::optional<Array> grad_means, Array grad_dc, std::optional<Array> grad_rest) {
             HarmonicsArgs a = harmonics_args(degree, means, center, dc, rest);
             const int64_t n = rows(means);
             expect_shape(grad_out, "grad_out", {n, 3});
             if (grad_means) expect_shape(*grad_means, "grad_means", {n, 3});
-            expect_shape(grad_dc, "grad_dc", {n, 3}), expect_shape(grad_rest, "grad_rest", {n, 15, 3});
+            expect_shape(grad_dc, "grad_dc", {n, 3});
+            if (grad_rest) expect_shape(*grad_rest, "grad_rest", {n, 15, 3});
             a.grad_out = grad_out.data(), a.grad_means = grad_means ? grad_means->data() : nullptr, a.grad_dc = grad_dc.data();
-            a.grad_rest = grad_rest.data();
+            a.grad_rest = grad_rest ? grad_rest->data() : nullptr;
             nb::gil_scoped_release release;
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_backward)(a, b, e); };
             parallel_chunks(n, item_chunk, body);
         },
         nb::arg("degree"), nb::arg("means"), nb::arg("center"), nb::arg("dc"), nb::arg("rest"), nb::arg("grad_out"),
-        nb::arg("grad_means").none(), nb::arg("grad_dc"), nb::arg("grad_rest"), "Fills the gradients that are not None.");
+        nb::arg("grad_means").none(), nb::arg("grad_dc"), nb::arg("grad_rest").none(), "Fills the gradients that are not None.");
 }

@@ -33,6 +33,12 @@ void run(void (*kernel)(const ReflectArgs &, int64_t, int64_t), const ReflectArg
     parallel_chunks(count, item_chunk, body);
 }
 
+void run(void (*kernel)(const ConductorArgs &, int64_t, int64_t), const ConductorArgs &a, int64_t count) {
+    nb::gil_scoped_release release;
+    auto body = [&](int64_t b, int64_t e, int) { kernel(a, b, e); };
+    parallel_chunks(count, item_chunk, body);
+}
+
 void run(void (*kernel)(const GBufferArgs &, int64_t, int64_t), const GBufferArgs &a, int64_t count) {
     nb::gil_scoped_release release;
     auto body = [&](int64_t b, int64_t e, int) { kernel(a, b, e); };
@@ -57,6 +63,35 @@ const float *optional_rows(const MaybeArray &array, const char *name, int64_t n)
 } // namespace
 
 void bind_reflect(nb::module_ &module) {
+    module.def(
+        "conductor_values",
+        [](const Array &cosine, const Array &reflectance, Array mean, Array slope, std::optional<Array> derivatives) {
+            const int64_t n = cosine.ndim() == 1 ? int64_t(cosine.shape(0)) : 0;
+            expect_shape(cosine, "cosine", {n}), expect_shape(reflectance, "reflectance", {n, 3});
+            expect_shape(mean, "mean", {n, 3}), expect_shape(slope, "slope", {n, 3});
+            if (derivatives) expect_shape(*derivatives, "derivatives", {n, 3, 4});
+            ConductorArgs a{};
+            a.cosine = cosine.data(), a.reflectance = reflectance.data(), a.mean = mean.data(), a.slope = slope.data();
+            a.derivatives = derivatives ? derivatives->data() : nullptr;
+            run(POLARGUIDE_DISPATCH(conductor_values), a, n);
+        },
+        nb::arg("cosine"), nb::arg("reflectance"), nb::arg("mean"), nb::arg("slope"), nb::arg("derivatives").none(),
+        "Reflectance and polarization of metals.");
+    module.def(
+        "conductor_backward",
+        [](Array derivatives, const MaybeArray &grad_mean, const MaybeArray &grad_slope, Array grad_cosine,
+           Array grad_reflectance) {
+            const int64_t n = grad_cosine.ndim() == 1 ? int64_t(grad_cosine.shape(0)) : 0;
+            expect_shape(derivatives, "derivatives", {n, 3, 4}), expect_shape(grad_cosine, "grad_cosine", {n});
+            expect_shape(grad_reflectance, "grad_reflectance", {n, 3});
+            ConductorArgs a{};
+            a.derivatives = derivatives.data(), a.grad_mean = optional_rows(grad_mean, "grad_mean", n);
+            a.grad_slope = optional_rows(grad_slope, "grad_slope", n);
+            a.grad_cosine = grad_cosine.data(), a.grad_reflectance = grad_reflectance.data();
+            run(POLARGUIDE_DISPATCH(conductor_backward), a, n);
+        },
+        nb::arg("derivatives"), nb::arg("grad_mean").none(), nb::arg("grad_slope").none(), nb::arg("grad_cosine"),
+        nb::arg("grad_reflectance"), "Gradients by the cosine and the reflectance of metals.");
     module.def(
         "reflect_directions",
         [](const Array &features, const Array &rays, Array directions) {
@@ -86,7 +121,8 @@ void bind_reflect(nb::module_ &module) {
         "reflect_backward_layers",
         [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,
            MaybeArray grad_final, MaybeArray grad_specular, MaybeArray grad_diffuse, MaybeArray grad_reflection,
-           Array grad_seen, Array grad_features) {
+           MaybeArray grad_held_specular, MaybeArray grad_held_diffuse, Array grad_seen, MaybeArray grad_texels,
+           Array grad_features) {
             ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index);
             const int64_t n = int64_t(rays.shape(0));
             expect_shape(seen, "seen", {n, 3}), expect_shape(grad_seen, "grad_seen", {n, 3});
@@ -95,13 +131,20 @@ void bind_reflect(nb::module_ &module) {
             a.grad_specular = optional_rows(grad_specular, "grad_specular", n);
             a.grad_diffuse = optional_rows(grad_diffuse, "grad_diffuse", n);
             a.grad_reflection = optional_rows(grad_reflection, "grad_reflection", n);
+            a.grad_held_specular = optional_rows(grad_held_specular, "grad_held_specular", n);
+            a.grad_held_diffuse = optional_rows(grad_held_diffuse, "grad_held_diffuse", n);
+            if ((a.grad_held_specular || a.grad_held_diffuse) && !grad_texels)
+                throw std::invalid_argument("grad_texels: needed where a gradient by held layers is given");
+            if (grad_texels) expect_shape(*grad_texels, "grad_texels", {n, 3}), a.grad_texels = grad_texels->data();
             a.seen = seen.data(), a.grad_seen = grad_seen.data(), a.grad_features = grad_features.data();
             run(POLARGUIDE_DISPATCH(reflect_backward_layers), a, n);
         },
         nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
         nb::arg("grad_final").none(), nb::arg("grad_specular").none(), nb::arg("grad_diffuse").none(),
-        nb::arg("grad_reflection").none(), nb::arg("grad_seen"), nb::arg("grad_features"),
-        "Fills the gradients by the look-up and, but for what comes through the look-up, by the features.");
+        nb::arg("grad_reflection").none(), nb::arg("grad_held_specular").none(), nb::arg("grad_held_diffuse").none(),
+        nb::arg("grad_seen"), nb::arg("grad_texels").none(), nb::arg("grad_features"),
+        "Fills the gradients by the look-up and, but for what comes through the look-up, by the features. What comes by "
+        "the held layers leaves the normals alone: of the two by the look-up it is in grad_texels.");
     module.def(
         "reflect_backward_directions",
         [](const Array &features, const Array &rays, const Array &grad_directions, Array grad_features) {

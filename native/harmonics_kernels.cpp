@@ -144,13 +144,15 @@ template <int D> void backward(const HarmonicsArgs &a, int64_t begin, int64_t en
                 const vf along = by_direction[0] * d[0] + by_direction[1] * d[1] + by_direction[2] * d[2];
                 for (int i = 0; i < 3; ++i) to_means[i] = (by_direction[i] - along * d[i]) * inverse;
             }
-            basis<D>(d[0], d[1], d[2], b);
-            for (int k = 0; k < Columns<D>::used; ++k)
-                for (int c = 0; c < 3; ++c) store(columns + (3 * k + c) * lanes, b[k] * g[c]);
+            if (a.grad_rest) {
+                basis<D>(d[0], d[1], d[2], b);
+                for (int k = 0; k < Columns<D>::used; ++k)
+                    for (int c = 0; c < 3; ++c) store(columns + (3 * k + c) * lanes, b[k] * g[c]);
+            }
         }
         store_columns<3>(a.grad_dc + 3 * first, n, to_dc);
         if (a.grad_means) store_columns<3>(a.grad_means + 3 * first, n, to_means);
-        store_rest<D>(a.grad_rest + rest_values * first, n, spare, columns);
+        if (a.grad_rest) store_rest<D>(a.grad_rest + rest_values * first, n, spare, columns);
     }
 }
 

@@ -45,7 +45,7 @@ struct HarmonicsArgs {
     const float *means, *center, *dc, *rest; // [N,3] [3] [N,3] [N,15,3]
     float *out;                              // [N,3]
     const float *grad_out;
-    float *grad_means, *grad_dc, *grad_rest; // grad_means may be null: not wanted
+    float *grad_means, *grad_dc, *grad_rest; // of means and rest each may be null: not wanted
 };
 POLARGUIDE_DECLARE(void harmonics_forward(const HarmonicsArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void harmonics_backward(const HarmonicsArgs &a, int64_t begin, int64_t end))
@@ -75,14 +75,27 @@ struct ReflectArgs {
     const float *seen;     // [P,3]
     float *directions;     // [P,3]
     float *final_picture, *specular, *diffuse, *reflection;
-    const float *grad_final, *grad_specular, *grad_diffuse, *grad_reflection; // each may be null
+    // Each may be null. The held ones are by the same layers, and have no part in the normal's gradient.
+    const float *grad_final, *grad_specular, *grad_diffuse, *grad_reflection, *grad_held_specular, *grad_held_diffuse;
     const float *grad_directions;
-    float *grad_seen, *grad_features;
+    float *grad_seen, *grad_texels, *grad_features; // by the look-up without and with the held ones
 };
 POLARGUIDE_DECLARE(void reflect_directions(const ReflectArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void reflect_layers(const ReflectArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t end))
+
+// Reflectance of metals for unpolarized light, and its degree of polarization over sin^2 of the zenith. `derivatives` are
+// of both by the cosine and by the reflectance, in turn.
+struct ConductorArgs {
+    const float *cosine, *reflectance;        // [K] [K,3]
+    float *mean, *slope;                      // [K,3]
+    float *derivatives;                       // [K,3,4]; null: not wanted
+    const float *grad_mean, *grad_slope;      // [K,3], each may be null
+    float *grad_cosine, *grad_reflectance;    // [K] [K,3]
+};
+POLARGUIDE_DECLARE(void conductor_values(const ConductorArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void conductor_backward(const ConductorArgs &a, int64_t begin, int64_t end))
 
 // What a picture reads of its G-buffer beside the layers: the blended normal, channels 3 to 5, and the depth, the last
 // channel over alpha.

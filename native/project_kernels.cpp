@@ -8,7 +8,7 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-constexpr float blur = 0.3f; // px^2, added to the projected covariance
+constexpr float blur = 0.1f; // px^2, added to the projected covariance
 constexpr float natural = 0.693147181f;
 constexpr float minimum_opacity = 1.0f / 255.0f;
 

@@ -1,6 +1,6 @@
 // Splatting of 3D Gaussians with D feature channels: the data that passes between the stages.
 //
-// Definition (as of the reference implementation, src/polarguide/raster/reference.py): EWA projection with a 0.3 px^2
+// Definition (as of the reference implementation, src/polarguide/raster/reference.py): EWA projection with a 0.1 px^2
 // blur, alpha = min(0.99, opacity * exp(-quadratic / 2)), contributions below 1/255 are dropped, a pixel ends before
 // the Gaussian that would bring its transmittance under 1e-4, Gaussians in order of camera depth (ties: by index).
 #pragma once

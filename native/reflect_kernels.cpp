@@ -1,139 +1,189 @@
 // Deferred reflection per pixel, around the look-up in the cubemap: rays mirrored at blended normals before it, the
 // layers of the picture after it, and both gradients.
 #include "image.h"
-
-#include <math.h>
+#include "simd.h"
 
 namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
 constexpr float shortest_normal = 1e-3f, brightest = 5.0f; // log of light
-constexpr float least_alpha = 1e-6f;
+constexpr float least_alpha = 1e-6f, log2_e = 1.44269504f;
 
+// Columns `first` to `first` + W of as many rows as a register has lanes; rows from n on are zero.
+template <int W> POLARGUIDE_INLINE void columns_of(const float *rows, int stride, int first, int n, reg *columns) {
+    alignas(64) float t[W][reg_lanes] = {};
+    for (int l = 0; l < n; ++l)
+        for (int k = 0; k < W; ++k) t[k][l] = rows[int64_t(stride) * l + first + k];
+    __builtin_memcpy(columns, t, sizeof t);
+}
+
+// The blended normals of pixels i to i + n, and the rays there.
 struct Mirror {
-    float normal[3], inverse; // unit, and 1 / length
-    bool short_;              // length below the floor: divided by the floor
-    float along;              // ray . normal
+    reg ray[3], normal[3], inverse; // unit, and 1 / length
+    ireg short_;                    // length below the floor: divided by the floor
+    reg along;                      // ray . normal
 };
 
-inline Mirror mirror_at(const ReflectArgs &a, int64_t i) {
-    const float *n = a.features + a.channels * i + 3, *ray = a.rays + 3 * i;
+POLARGUIDE_INLINE Mirror mirror_at(const ReflectArgs &a, int64_t i, int n) {
+    reg blended[3];
     Mirror m;
-    const float squared = n[0] * n[0] + n[1] * n[1] + n[2] * n[2];
+    columns_of<3>(a.features + a.channels * i, a.channels, 3, n, blended);
+    load_columns<3>(a.rays + 3 * i, n, m.ray);
+    const reg squared = blended[0] * blended[0] + blended[1] * blended[1] + blended[2] * blended[2];
     m.short_ = squared < shortest_normal * shortest_normal;
-    m.inverse = 1.0f / (m.short_ ? shortest_normal : sqrtf(squared));
-    m.along = 0.0f;
-    for (int k = 0; k < 3; ++k) m.normal[k] = n[k] * m.inverse, m.along += ray[k] * m.normal[k];
+    m.inverse = 1.0f / (m.short_ ? reg_splat(shortest_normal) : square_root(squared));
+    m.along = reg{};
+    for (int k = 0; k < 3; ++k) m.normal[k] = blended[k] * m.inverse, m.along += m.ray[k] * m.normal[k];
     return m;
 }
 
-// Unpolarized power reflectance at cos i = c in [0, 1], and its derivative.
-inline float reflectance(float c, float refractive_index, float *slope) {
-    const float n2 = refractive_index * refractive_index, t = sqrtf(n2 - 1.0f + c * c), p = n2 * c, dt = c / t;
-    const float s_sum = 1.0f / (c + t), p_sum = 1.0f / (p + t), rs = (c - t) * s_sum, rp = (p - t) * p_sum;
+// Unpolarized power reflectance where the ray meets the normal, and its derivative by their product.
+POLARGUIDE_INLINE reg reflectance(reg along, float refractive_index, reg *by_along) {
+    const reg c = clamp(-along, reg{}, reg_splat(1.0f)); // the cosine
+    const float n2 = refractive_index * refractive_index;
+    const reg t = square_root(c * c + (n2 - 1.0f)), p = n2 * c, dt = c / t;
+    const reg s_sum = 1.0f / (c + t), p_sum = 1.0f / (p + t), rs = (c - t) * s_sum, rp = (p - t) * p_sum;
     // ((a - t) / (a + t))' = 2 (a' t - a t') / (a + t)^2
-    *slope = rs * 2.0f * (t - c * dt) * s_sum * s_sum + rp * 2.0f * (n2 * t - p * dt) * p_sum * p_sum;
+    const reg slope = rs * 2.0f * (t - c * dt) * s_sum * s_sum + rp * 2.0f * (n2 * t - p * dt) * p_sum * p_sum;
+    *by_along = (along >= -1.0f) & (along <= 0.0f) ? -slope : reg{};
     return 0.5f * (rs * rs + rp * rp);
 }
 
 struct Light {
-    float value[3], slope[3]; // and derivative by the raw texel value
-    bool lit[3];              // not cut at 0
+    reg value[3], slope[3]; // and derivative by the raw texel value
+    ireg lit[3];            // not cut at 0
 };
 
-inline Light light_at(const ReflectArgs &a, int64_t i) {
-    const float *raw = a.seen + 3 * i, *local = a.local ? a.features + a.channels * i + 7 : nullptr;
+POLARGUIDE_INLINE Light light_at(const ReflectArgs &a, int64_t i, int n) {
+    reg raw[3], local[3] = {};
+    load_columns<3>(a.seen + 3 * i, n, raw);
+    if (a.local) columns_of<3>(a.features + a.channels * i, a.channels, 7, n, local);
     Light l;
     for (int k = 0; k < 3; ++k) {
+        // Beyond 80 neither has anything left that a float could tell; NaN stays.
+        const float most = a.fresnel ? brightest : 80.0f;
+        const reg bounded = raw[k] < -80.0f ? reg_splat(-80.0f) : raw[k] > most ? reg_splat(most) : raw[k];
         if (a.fresnel) {
-            l.value[k] = expf(raw[k] < brightest ? raw[k] : brightest);
-            l.slope[k] = raw[k] <= brightest ? l.value[k] : 0.0f;
+            l.value[k] = exp2(bounded * log2_e);
+            l.slope[k] = raw[k] <= brightest ? l.value[k] : reg{};
         } else {
-            l.value[k] = 1.0f / (1.0f + expf(-raw[k]));
+            l.value[k] = 1.0f / (1.0f + exp2(-log2_e * bounded));
             l.slope[k] = l.value[k] * (1.0f - l.value[k]);
         }
-        l.lit[k] = true;
-        if (local) {
-            l.value[k] += local[k];
-            l.lit[k] = l.value[k] >= 0.0f;
-            if (!l.lit[k]) l.value[k] = 0.0f;
-        }
+        const reg sum = l.value[k] + local[k];
+        l.lit[k] = sum >= 0.0f;
+        l.value[k] = l.lit[k] ? sum : reg{};
     }
     return l;
 }
 
-inline float facing(float along) { return along < -1.0f ? 1.0f : along > 0.0f ? 0.0f : -along; }
+// A gradient [P,3] that may be missing.
+POLARGUIDE_INLINE void gradient_at(const float *gradient, int64_t i, int n, reg *columns) {
+    if (gradient) return load_columns<3>(gradient + 3 * i, n, columns);
+    for (int k = 0; k < 3; ++k) columns[k] = reg{};
+}
+
+// How much of the light shows, and of the base color: strength times Fresnel's reflectance, and all, or the lerp.
+struct Blend {
+    reg share, kept; // specular = strength share light, diffuse = kept base
+    reg by_along;    // derivative of the share by ray . normal
+};
+
+POLARGUIDE_INLINE Blend blend_of(const ReflectArgs &a, reg strength, reg along) {
+    Blend b = {reg_splat(1.0f), 1.0f - strength, reg{}};
+    if (a.fresnel) b.share = reflectance(along, a.refractive_index, &b.by_along), b.kept = reg_splat(1.0f);
+    return b;
+}
+
+POLARGUIDE_INLINE int count_at(int64_t i, int64_t end) { return end - i < reg_lanes ? int(end - i) : reg_lanes; }
 
 } // namespace
 
 void reflect_directions(const ReflectArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-        const Mirror m = mirror_at(a, i);
-        const float *ray = a.rays + 3 * i;
-        for (int k = 0; k < 3; ++k) a.directions[3 * i + k] = ray[k] - 2.0f * m.along * m.normal[k];
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        const Mirror m = mirror_at(a, i, n);
+        reg out[3];
+        for (int k = 0; k < 3; ++k) out[k] = m.ray[k] - 2.0f * m.along * m.normal[k];
+        store_columns<3>(a.directions + 3 * i, n, out);
     }
 }
 
 void reflect_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-        const float *base = a.features + a.channels * i, strength = base[6];
-        const Light l = light_at(a, i);
-        float slope, weight = strength, kept = 1.0f - strength;
-        if (a.fresnel) weight = strength * reflectance(facing(mirror_at(a, i).along), a.refractive_index, &slope), kept = 1.0f;
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        reg base[3], strength, specular[3], diffuse[3], final_picture[3];
+        columns_of<3>(a.features + a.channels * i, a.channels, 0, n, base);
+        columns_of<1>(a.features + a.channels * i, a.channels, 6, n, &strength);
+        const Light light = light_at(a, i, n);
+        const Blend blend = blend_of(a, strength, a.fresnel ? mirror_at(a, i, n).along : reg{});
         for (int k = 0; k < 3; ++k) {
-            const float specular = weight * l.value[k], diffuse = kept * base[k];
-            a.specular[3 * i + k] = specular, a.diffuse[3 * i + k] = diffuse;
-            a.final_picture[3 * i + k] = specular + diffuse, a.reflection[3 * i + k] = l.value[k];
+            specular[k] = strength * blend.share * light.value[k], diffuse[k] = blend.kept * base[k];
+            final_picture[k] = specular[k] + diffuse[k];
         }
+        store_columns<3>(a.specular + 3 * i, n, specular), store_columns<3>(a.diffuse + 3 * i, n, diffuse);
+        store_columns<3>(a.final_picture + 3 * i, n, final_picture), store_columns<3>(a.reflection + 3 * i, n, light.value);
     }
 }
 
 // Gradients by the look-up, and by the features except the part of the normal that comes through the look-up, which
-// reflect_backward_directions adds. Channels beyond those that are read get zero.
+// reflect_backward_directions adds. Channels beyond those that are read get zero. What comes by the held layers reaches
+// everything but the normal: it is in `grad_texels` alone of the two gradients by the look-up.
 void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-        const float *base = a.features + a.channels * i, strength = base[6], *ray = a.rays + 3 * i;
-        float *to = a.grad_features + a.channels * i;
-        for (int c = 0; c < a.channels; ++c) to[c] = 0.0f;
-        const Light l = light_at(a, i);
-        float slope = 0.0f, share = 1.0f, kept = 1.0f - strength;
+    const bool held = a.grad_held_specular || a.grad_held_diffuse;
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        reg base[3], strength, to[10], seen[3], texels[3], picture[3], by[5][3];
+        columns_of<3>(a.features + a.channels * i, a.channels, 0, n, base);
+        columns_of<1>(a.features + a.channels * i, a.channels, 6, n, &strength);
+        const Light light = light_at(a, i, n);
         Mirror m;
-        if (a.fresnel) m = mirror_at(a, i), share = reflectance(facing(m.along), a.refractive_index, &slope), kept = 1.0f;
-        float by_weight = 0.0f, by_kept = 0.0f;
+        m.along = reg{};
+        if (a.fresnel) m = mirror_at(a, i, n);
+        const Blend blend = blend_of(a, strength, m.along);
+        gradient_at(a.grad_final, i, n, picture), gradient_at(a.grad_specular, i, n, by[0]);
+        gradient_at(a.grad_diffuse, i, n, by[1]), gradient_at(a.grad_reflection, i, n, by[2]);
+        gradient_at(a.grad_held_specular, i, n, by[3]), gradient_at(a.grad_held_diffuse, i, n, by[4]);
+        reg by_share = {}, by_held = {}, by_kept = {};
         for (int k = 0; k < 3; ++k) {
-            const float final_picture = a.grad_final ? a.grad_final[3 * i + k] : 0.0f;
-            const float specular = final_picture + (a.grad_specular ? a.grad_specular[3 * i + k] : 0.0f);
-            const float diffuse = final_picture + (a.grad_diffuse ? a.grad_diffuse[3 * i + k] : 0.0f);
-            float light = strength * share * specular + (a.grad_reflection ? a.grad_reflection[3 * i + k] : 0.0f);
-            if (!l.lit[k]) light = 0.0f;
-            by_weight += l.value[k] * specular, by_kept += base[k] * diffuse;
-            to[k] = kept * diffuse;
-            if (a.local) to[7 + k] = light;
-            a.grad_seen[3 * i + k] = light * l.slope[k];
+            const reg specular = picture[k] + by[0][k], diffuse = picture[k] + by[1][k] + by[4][k];
+            const reg live = light.lit[k] ? strength * blend.share * specular + by[2][k] : reg{};
+            const reg both = live + (light.lit[k] ? strength * blend.share * by[3][k] : reg{});
+            by_share += light.value[k] * specular, by_held += light.value[k] * by[3][k], by_kept += base[k] * diffuse;
+            to[k] = blend.kept * diffuse, to[7 + k] = both;
+            seen[k] = live * light.slope[k], texels[k] = both * light.slope[k];
         }
-        to[6] = a.fresnel ? share * by_weight : by_weight - by_kept;
-        if (a.fresnel && m.along >= -1.0f && m.along <= 0.0f) {
-            // along = ray . n / |n|; the cosine is its negative.
-            const float by_along = -slope * strength * by_weight;
-            for (int k = 0; k < 3; ++k)
-                to[3 + k] = by_along * m.inverse * (ray[k] - (m.short_ ? 0.0f : m.along * m.normal[k]));
+        to[6] = a.fresnel ? blend.share * (by_share + by_held) : by_share + by_held - by_kept;
+        const reg turn = blend.by_along * strength * by_share * (a.fresnel ? m.inverse : reg{});
+        for (int k = 0; k < 3; ++k)
+            to[3 + k] = a.fresnel ? turn * (m.ray[k] - (m.short_ ? reg{} : m.along * m.normal[k])) : reg{};
+        store_columns<3>(a.grad_seen + 3 * i, n, seen);
+        if (held) store_columns<3>(a.grad_texels + 3 * i, n, texels);
+        const int used = a.local ? 10 : 7;
+        for (int l = 0; l < n; ++l) {
+            float *row = a.grad_features + a.channels * (i + l);
+            for (int c = 0; c < used; ++c) row[c] = to[c][l];
+            for (int c = used; c < a.channels; ++c) row[c] = 0.0f;
         }
     }
 }
 
 void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-        const Mirror m = mirror_at(a, i);
-        const float *ray = a.rays + 3 * i, *g = a.grad_directions + 3 * i;
-        float *to = a.grad_features + a.channels * i + 3;
-        const float across = g[0] * m.normal[0] + g[1] * m.normal[1] + g[2] * m.normal[2];
-        float by_unit[3], radial = 0.0f;
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        const Mirror m = mirror_at(a, i, n);
+        reg g[3], by_unit[3], radial = {};
+        load_columns<3>(a.grad_directions + 3 * i, n, g);
+        const reg across = g[0] * m.normal[0] + g[1] * m.normal[1] + g[2] * m.normal[2];
         for (int k = 0; k < 3; ++k) {
-            by_unit[k] = -2.0f * (m.along * g[k] + across * ray[k]);
+            by_unit[k] = -2.0f * (m.along * g[k] + across * m.ray[k]);
             radial += by_unit[k] * m.normal[k];
         }
-        for (int k = 0; k < 3; ++k) to[k] += m.inverse * (by_unit[k] - (m.short_ ? 0.0f : radial * m.normal[k]));
+        for (int k = 0; k < 3; ++k) {
+            const reg to = m.inverse * (by_unit[k] - (m.short_ ? reg{} : radial * m.normal[k]));
+            for (int l = 0; l < n; ++l) a.grad_features[a.channels * (i + l) + 3 + k] += to[l];
+        }
     }
 }
 

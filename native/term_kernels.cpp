@@ -120,12 +120,23 @@ inline void compare(const PolarizationArgs &a, int k, int64_t i, int n, const La
 
 } // namespace
 
-void polarization_term(const PolarizationArgs &a, int64_t begin, int64_t end) {
+// What metals add, in two blocks of colors; zero without metal, for which all that follows is as if there were none.
+namespace {
+inline void read_metal(const PolarizationArgs &a, int64_t i, int n, Vec &metal, Vec &field) {
+    metal = Vec{}, field = Vec{};
+    for (int l = 0; l < n; ++l)
+        for (int c = 0; c < 3; ++c)
+            metal.k[c][l] = 2.0f * a.metal[6 * (i + l) + c], field.k[c][l] = 2.0f * a.metal[6 * (i + l) + 3 + c];
+}
+} // namespace
+
+template <bool with_metal> void polarization_term_of(const PolarizationArgs &a, int64_t begin, int64_t end) {
     alignas(64) double sums[block] = {};
     for (int64_t i = begin; i < end; i += block) {
         const int n = block_of(i, end);
         Surface s;
-        Vec normal, turned, specular, diffuse, stokes[3];
+        Vec normal, turned, specular, diffuse, stokes[3], metal, field;
+        if (with_metal) read_metal(a, i, n, metal, field);
         alignas(64) Lane weight, pull;
         read(a.term.normal + 3 * i, n, normal), read(a.rays + 3 * i, n, s.ray);
         read(a.specular + 3 * i, n, specular), read(a.diffuse + 3 * i, n, diffuse);
@@ -136,7 +147,8 @@ void polarization_term(const PolarizationArgs &a, int64_t begin, int64_t end) {
         for (int c = 0; c < 3; ++c)
             for (int l = 0; l < block; ++l) {
                 const float over = 2.0f * specular.k[c][l], under = 2.0f * diffuse.k[c][l];
-                const float polarized = s.diffuse[l] * under - s.specular[l] * over;
+                float polarized = s.diffuse[l] * under - s.specular[l] * over;
+                if (with_metal) polarized += s.specular[l] * metal.k[c][l] - field.k[c][l];
                 stokes[0].k[c][l] = over + under;
                 stokes[1].k[c][l] = polarized * s.double_cos[l], stokes[2].k[c][l] = polarized * s.double_sin[l];
             }
@@ -146,13 +158,17 @@ void polarization_term(const PolarizationArgs &a, int64_t begin, int64_t end) {
         for (int l = 0; l < block; ++l) {
             float by_specular = 0.0f, by_diffuse = 0.0f, by_cos = 0.0f, by_sin = 0.0f;
             for (int c = 0; c < 3; ++c) {
-                const float over = 2.0f * specular.k[c][l], under = 2.0f * diffuse.k[c][l];
-                const float polarized = s.diffuse[l] * under - s.specular[l] * over;
+                float over = 2.0f * specular.k[c][l];
+                const float under = 2.0f * diffuse.k[c][l];
+                if (with_metal) over -= metal.k[c][l];
+                float polarized = s.diffuse[l] * under - s.specular[l] * over;
+                if (with_metal) polarized -= field.k[c][l];
                 const float g = by.s[1].k[c][l] * s.double_cos[l] + by.s[2].k[c][l] * s.double_sin[l];
                 by_cos += polarized * by.s[1].k[c][l], by_sin += polarized * by.s[2].k[c][l];
                 by_specular -= over * g, by_diffuse += under * g;
                 to_specular.k[c][l] = 2.0f * (by.s[0].k[c][l] - s.specular[l] * g);
                 to_diffuse.k[c][l] = 2.0f * (by.s[0].k[c][l] + s.diffuse[l] * g);
+                if (with_metal) metal.k[c][l] = 2.0f * s.specular[l] * g, field.k[c][l] = -2.0f * g;
             }
             const float by_cosine = s.facing[l] * (by_specular * s.by_cosine[0][l] + by_diffuse * s.by_cosine[1][l]);
             const float by_x = 2.0f * (s.x[l] * by_cos + s.y[l] * by_sin), by_y = 2.0f * (s.x[l] * by_sin - s.y[l] * by_cos);
@@ -167,8 +183,15 @@ void polarization_term(const PolarizationArgs &a, int64_t begin, int64_t end) {
         turn_back(a.rotation, to_unit, to_normal);
         add(to_normal, n, a.term.grad_normal + 3 * i);
         write(to_specular, n, a.grad_specular + 3 * i), write(to_diffuse, n, a.grad_diffuse + 3 * i);
+        for (int l = 0; with_metal && l < n; ++l)
+            for (int c = 0; c < 3; ++c)
+                a.grad_metal[6 * (i + l) + c] = metal.k[c][l], a.grad_metal[6 * (i + l) + 3 + c] = field.k[c][l];
     }
     a.term.parts[begin / pixels_per_part] = sum_of(sums);
+}
+
+void polarization_term(const PolarizationArgs &a, int64_t begin, int64_t end) {
+    a.metal ? polarization_term_of<true>(a, begin, end) : polarization_term_of<false>(a, begin, end);
 }
 
 void direction_term(const DirectionArgs &a, int64_t begin, int64_t end) {

@@ -23,12 +23,15 @@ struct PolarizationArgs {
     TermArgs term;
     const float *rays, *rotation;     // [P,3] unit, camera axes; [3,3] world to camera
     const float *specular, *diffuse;  // [P,3] half of their share in S0
+    const float *metal;               // [P,6] the part of specular that metals add, and it times its degree of
+                                      // polarization over sin^2; null: none
     const float *measured;            // [K,P,3]
     const float *analyzers;           // [K,3]
     int64_t count;                    // P
     int measurements;                 // K
     float refractive_index;
     float *grad_specular, *grad_diffuse; // [P,3], written
+    float *grad_metal;                   // [P,6], written; null without metal
 };
 POLARGUIDE_DECLARE(void polarization_term(const PolarizationArgs &a, int64_t begin, int64_t end))
 

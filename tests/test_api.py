@@ -180,7 +180,7 @@ def test_a_run_renders_by_name_and_by_camera(trained: Path) -> None:
     assert set(layers) == {"final", "normal", "alpha"}
     assert layers["final"].shape == (*layers["alpha"].shape, 3)
     torch.testing.assert_close(layers["final"], run.render(run.cameras["v000"])["final"])
-    assert len(run.gaussians["means"]) == len(run.gaussians["opacity_logits"]) == len(run.model)
+    assert len(run.gaussians["means"]) == len(run.gaussians["opacity_logits"]) == run.model.gaussians
     assert run.light is not None
     assert "Gaussians" in repr(run)
     for wrong in (

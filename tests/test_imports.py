@@ -39,6 +39,7 @@ ROOMS = (
     "shots",
     "measurement",
     "training",
+    "neural",
     "recipes",
     "runs",
     "rendering",

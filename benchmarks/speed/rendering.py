@@ -2,7 +2,7 @@
 
 Every test view is drawn in turn as color alone and as all layers, with and without depth; the ratio is taken within
 each turn, so that a slow moment of the machine meets both. Run it alone:
-``python benchmarks/speed/rendering.py RUN...``.
+``python benchmarks/speed/rendering.py RUN... [--size 1920x1080] [--threads 1 2]``.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch is imported
@@ -20,7 +21,8 @@ import torch
 
 from polarguide import _native
 from polarguide.api import Run, open_run
-from polarguide.capture import View
+from polarguide.camera import Camera
+from polarguide.raster import use_threads
 from polarguide.shading.gbuffer import render
 
 ROUNDS = 7
@@ -32,25 +34,36 @@ def milliseconds(draw: Callable[[], object]) -> float:
     return 1e3 * (time.perf_counter() - begin)
 
 
-def measure(opened: Run, rounds: int) -> None:
+def shown_at(camera: Camera, size: tuple[int, int] | None) -> Camera:
+    """The camera with a picture of this size, which it fills."""
+    if size is None:
+        return camera
+    factor = max(size[0] / camera.width, size[1] / camera.height)
+    larger = camera.scaled(factor, *size)
+    middle = (size[0] - factor * camera.width) / 2, (size[1] - factor * camera.height) / 2
+    return replace(larger, cx=larger.cx + middle[0], cy=larger.cy + middle[1])
+
+
+def measure(opened: Run, rounds: int, size: tuple[int, int] | None, threads: int) -> None:
+    use_threads(threads)
     rows, rasterize = opened.model.state.gaussians, opened.model.backend.rasterize
 
-    def plain(view: View) -> object:
-        return render(rows, view.camera, rasterize, normals=False)
+    def plain(camera: Camera) -> object:
+        return render(rows, camera, rasterize, normals=False)
 
-    def layers(view: View) -> object:
-        return opened.result(view.camera, depth=False).to("cpu")
+    def layers(camera: Camera) -> object:
+        return opened.result(camera, depth=False).to("cpu")
 
-    def layers_and_depth(view: View) -> object:
-        return opened.result(view.camera).to("cpu")
+    def layers_and_depth(camera: Camera) -> object:
+        return opened.result(camera).to("cpu")
 
     ways = (plain, layers, layers_and_depth)
-    views = opened.scene.test_views
+    cameras = [shown_at(view.camera, size) for view in opened.scene.test_views]
     times: dict[str, list[float]] = {way.__name__: [] for way in ways}
     for turn in range(rounds + 1):
-        for view in views:
+        for camera in cameras:
             for way in ways:
-                taken = milliseconds(lambda way=way, view=view: way(view))  # type: ignore[misc]
+                taken = milliseconds(lambda way=way, camera=camera: way(camera))  # type: ignore[misc]
                 if turn:  # the first warms up
                     times[way.__name__].append(taken)
     median = {name: statistics.median(taken) for name, taken in times.items()}
@@ -58,9 +71,10 @@ def measure(opened: Run, rounds: int) -> None:
         statistics.median(a / b for a, b in zip(times[way.__name__], times["plain"], strict=True))
         for way in ways[1:]
     ]
-    camera = views[0].camera
+    camera = cameras[0]
     print(
-        f"| {opened.folder.name} | {opened.recipe.name} | {camera.width} x {camera.height} | {len(rows):,} | "
+        f"| {opened.folder.name} | {opened.recipe.name} | {threads} | {camera.width} x {camera.height} "
+        f"| {len(rows):,} | "
         f"{median['plain']:.1f} | {median['layers']:.1f} | {median['layers_and_depth']:.1f} | "
         + " | ".join(f"{ratio:.2f}" for ratio in ratios)
         + " |"
@@ -71,15 +85,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--size", help="as 1920x1080; that of the views where not given")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1])
     arguments = parser.parse_args()
+    size = tuple(int(side) for side in arguments.size.split("x")) if arguments.size else None
+    assert size is None or len(size) == 2
+    print(f"{_native.simd()}\n")
     print(
-        f"{_native.simd()}, {_native.thread_count()} kernel threads, {torch.get_num_threads()} torch threads\n"
+        "| run | recipe | threads | size | Gaussians | color ms | layers ms | with depth ms | ratio | with depth |"
     )
-    print("| run | recipe | size | Gaussians | color ms | layers ms | with depth ms | ratio | with depth |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     with torch.no_grad():
         for run in arguments.runs:
-            measure(open_run(run), arguments.rounds)
+            for threads in arguments.threads:
+                measure(open_run(run), arguments.rounds, size, threads)
 
 
 if __name__ == "__main__":

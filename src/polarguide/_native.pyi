@@ -88,7 +88,7 @@ def harmonics_backward(
     grad_out: Tensor,
     grad_means: Tensor | None,
     grad_dc: Tensor,
-    grad_rest: Tensor,
+    grad_rest: Tensor | None,
 ) -> None: ...
 def axes_forward(
     means: Tensor,
@@ -110,6 +110,16 @@ def axes_backward(
     grad_quaternions: Tensor,
 ) -> None: ...
 def mirrored_forward(means: Tensor, center: Tensor, normals: Tensor, out: Tensor) -> None: ...
+def conductor_values(
+    cosine: Tensor, reflectance: Tensor, mean: Tensor, slope: Tensor, derivatives: Tensor | None
+) -> None: ...
+def conductor_backward(
+    derivatives: Tensor,
+    grad_mean: Tensor | None,
+    grad_slope: Tensor | None,
+    grad_cosine: Tensor,
+    grad_reflectance: Tensor,
+) -> None: ...
 def reflect_directions(features: Tensor, rays: Tensor, directions: Tensor) -> None: ...
 def reflect_layers(
     features: Tensor,
@@ -134,7 +144,10 @@ def reflect_backward_layers(
     grad_specular: Tensor | None,
     grad_diffuse: Tensor | None,
     grad_reflection: Tensor | None,
+    grad_held_specular: Tensor | None,
+    grad_held_diffuse: Tensor | None,
     grad_seen: Tensor,
+    grad_texels: Tensor | None,
     grad_features: Tensor,
 ) -> None: ...
 def reflect_backward_directions(
@@ -156,6 +169,7 @@ def polarization(
     rotation: Tensor,
     specular: Tensor,
     diffuse: Tensor,
+    metal: Tensor | None,
     measured: Tensor,
     analyzers: Tensor,
     weight: Tensor | None,
@@ -164,6 +178,7 @@ def polarization(
     grad_normal: Tensor,
     grad_specular: Tensor,
     grad_diffuse: Tensor,
+    grad_metal: Tensor | None,
 ) -> float: ...
 def direction(
     normal: Tensor,

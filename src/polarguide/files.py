@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -93,6 +94,20 @@ def _temporary(path: Path) -> Path:
                 with contextlib.suppress(OSError):
                     shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+@contextlib.contextmanager
+def in_utf8(path: Path) -> Iterator[Path]:
+    """A name in UTF-8 by which to read or write a file whose own is other bytes: some libraries take no others."""
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory() as folder:
+            link = Path(folder) / "file"
+            link.symlink_to(path.absolute())
+            yield link
+    else:
+        yield path
 
 
 def holds_files(folder: Path) -> bool:

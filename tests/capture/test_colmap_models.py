@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -171,6 +172,25 @@ def test_broken_numbers(capture: TinyCapture, old: str, new: str) -> None:
         if old in path.read_text():
             edit(path, old, new)
     fails(capture.root, "image v000.png", "a unit quaternion", "positive focal lengths", "found quaternion")
+
+
+@pytest.mark.parametrize(("old", "new"), [(" 6.5 ", " 1e9 "), ("15.5 ", "1e-4 ")])
+def test_a_lens_that_no_camera_has(capture: TinyCapture, old: str, new: str) -> None:
+    edit(model_folder(capture) / "cameras.txt", old, new)
+    fails(capture.root, "image v000.png", "a principal point, at most 10000 sides of the picture away")
+
+
+def test_a_camera_without_pixels(capture: TinyCapture) -> None:
+    edit(model_folder(capture) / "cameras.txt", "PINHOLE 12 10", "PINHOLE 0 0")
+    fails(capture.root, "camera of view v000", "12x10", "found 0x0")
+
+
+def test_a_pose_that_is_no_number_in_images_bin(capture: TinyCapture) -> None:
+    to_binary(capture)  # with frames.bin, from which the poses are taken
+    path = model_folder(capture) / "images.bin"
+    data = path.read_bytes()
+    path.write_bytes(data[:12] + struct.pack("<d", float("nan")) + data[20:])
+    fails(capture.root, "images.bin", "an image whose pose is not finite")
 
 
 def test_no_points(capture: TinyCapture) -> None:

@@ -145,6 +145,43 @@ def test_masks_of_any_convention(capture: TinyCapture) -> None:
     assert scene.warnings == ("masks/ has no file for 3 of 9 views (v006, v007, v008).",)
 
 
+def test_materials_of_any_number_of_views(capture: TinyCapture) -> None:
+    numbers = np.zeros((10, 12), np.uint8)
+    numbers[:, 4:8], numbers[:, 8:] = 1, 2
+    (capture.root / "materials").mkdir()
+    cv2.imwrite(str(capture.root / "materials" / "v003.png"), numbers)
+    scene = load_scene(capture.root)
+    found = scene.view("v003").materials
+    assert found is not None
+    assert torch.equal(found, torch.from_numpy(numbers))
+    assert scene.view("v002").materials is None
+    assert not scene.warnings
+    numbers[:, 7] = 2  # half of a box
+    cv2.imwrite(str(capture.root / "materials" / "v003.png"), numbers)
+    halved = load_scene(capture.root, downscale=2).view("v003").materials
+    assert halved is not None
+    assert halved[0].tolist() == [0, 0, 1, 0, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("picture", "words"),
+    [
+        (np.full((10, 12), 255, np.uint8), "255"),
+        (np.full((10, 12), 3, np.uint8), "0 (unknown), 1 (dielectric) and 2 (metal)"),
+        (np.zeros((10, 11), np.uint8), "11x10"),
+    ],
+)
+def test_materials_of_another_size_or_number_are_refused(
+    capture: TinyCapture, picture: np.ndarray, words: str
+) -> None:
+    (capture.root / "materials").mkdir()
+    cv2.imwrite(str(capture.root / "materials" / "v001.png"), picture)
+    with pytest.raises(PolarguideError, match=re.escape(words)) as refused:
+        load_scene(capture.root)
+    assert "v001.png" in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
 def test_invalid_pixels_come_from_the_file_alone(capture: TinyCapture) -> None:
     marked = np.zeros((10, 12), np.uint8)
     marked[2, 3] = 1
@@ -154,6 +191,39 @@ def test_invalid_pixels_come_from_the_file_alone(capture: TinyCapture) -> None:
     assert scene.view("v001").invalid.nonzero().tolist() == [[2, 3]]
     assert not scene.view("v001").saturated.any()
     assert not scene.view("v002").invalid.any()
+
+
+def _invalid(capture: TinyCapture, names: list[str]) -> None:
+    (capture.root / "invalid").mkdir()
+    for name in names:
+        cv2.imwrite(str(capture.root / "invalid" / f"{name}.png"), np.full((10, 12), 255, np.uint8))
+
+
+def test_training_views_that_are_all_invalid_are_refused(capture: TinyCapture) -> None:
+    capture.write_json("split.json", {"test": ["v000"]})
+    _invalid(capture, [name for name in NAMES if name != "v000"])
+    with pytest.raises(
+        PolarguideError, match="one pixel to train on that is not invalid, found none in 8 views"
+    ):
+        load_scene(capture.root)
+    assert (
+        load_scene(capture.root, views=["v000", "v001"]).view("v001").invalid.all()
+    )  # somebody looks at them
+
+
+def test_views_that_are_all_invalid_are_a_warning(capture: TinyCapture) -> None:
+    _invalid(capture, ["v001", "v003"])
+    (warning,) = load_scene(capture.root).warnings
+    assert warning.startswith("2 of 9 views are invalid at every pixel (v001, v003): they tell nothing.")
+
+
+def test_angles_that_are_one_file_are_a_warning(capture: TinyCapture) -> None:
+    for angle in ("045", "090", "135"):
+        shutil.copyfile(capture.root / "polar/v002_000.png", capture.root / f"polar/v002_{angle}.png")
+    (warning,) = load_scene(capture.root).warnings
+    assert warning.startswith(
+        "The pictures at all angles are the same file in 1 of 9 views (v002): they look"
+    )
 
 
 def test_progress_counts_the_views(capture: TinyCapture) -> None:

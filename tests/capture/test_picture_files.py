@@ -149,12 +149,22 @@ def test_srgb_curve_meets_its_known_points() -> None:
     assert (np.diff(codes.astype(int)) > 0).all()
 
 
-def test_alpha_is_dropped_and_channels_are_in_rgb_order(tmp_path: Path) -> None:
+def test_full_alpha_is_dropped_and_channels_are_in_rgb_order(tmp_path: Path) -> None:
     bgra = np.zeros((4, 5, 4), np.uint8)
-    bgra[..., 0], bgra[..., 2], bgra[..., 3] = 10, 30, 7
+    bgra[..., 0], bgra[..., 2], bgra[..., 3] = 10, 30, 255
     picture = decode_picture(tmp_path, encoded(".png", bgra))
     assert picture.shape == (4, 5, 3)
     assert picture[0, 0].tolist() == [30, 0, 10]
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_transparent_pixel_is_refused(tmp_path: Path, kind: type) -> None:
+    bgra = np.full((4, 5, 4), np.iinfo(kind).max, kind)
+    bgra[2, 3, 3] = 7
+    with pytest.raises(
+        PolarguideError, match=r"expected an opaque picture, found 5\.0% of it transparent\. Save"
+    ):
+        decode_picture(tmp_path, encoded(".png", bgra))
 
 
 @pytest.mark.parametrize("data", JPEGS.values(), ids=JPEGS.keys())

@@ -15,7 +15,11 @@ from polarguide.cli.app import VERBS, function_of, options_of, run
 
 # Fields that a verb sets by other options of its own.
 ELSEWHERE = {
-    *((verb, name) for verb in ("compare", "ablate") for name in ("seed", "views_per_step", "gaussians")),
+    *(
+        (verb, name)
+        for verb in ("compare", "ablate")
+        for name in ("seed", "views_per_step", "gaussians", "begin_again", "materials")
+    ),
     ("prepare", "calibration"),
     ("prepare", "analyzers"),
     ("measure", "calibration"),

@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from single_shots import single_shots
 
 from polarguide.cli.app import run
 from polarguide.inspection.layers import LAYERS
@@ -147,3 +148,15 @@ def test_wrong_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert run(["inspect", str(tmp_path / "scene"), "--out", str(tmp_path / "file")]) == 2
     assert "expected a folder to write" in capsys.readouterr().err
     assert list((tmp_path / "scene").iterdir()) == []
+
+
+def test_fixing_needs_four_pictures(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = single_shots(demo_scene, tmp_path / "shots")
+    asked = ["inspect", str(scene), "--normals", "points", "--fix", str(tmp_path / "fixed")]
+    assert run([*asked, "--out", str(tmp_path / "out")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--fix" in said
+    assert "angles.csv" in said
+    assert not (tmp_path / "fixed").exists()

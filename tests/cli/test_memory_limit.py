@@ -10,8 +10,8 @@ import pytest
 from safetensors.torch import load_file
 
 from polarguide.cli.app import run
+from polarguide.runs import families
 from polarguide.runs import forecast as forecasts
-from polarguide.runs import train as training
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 from polarguide.runs.memory import MemoryPlan
 
@@ -45,7 +45,7 @@ def test_a_training_in_little_memory_gives_the_same_bits_and_says_what_it_takes(
         r"took \d+ s and [\d.]+ GB of memory \(estimate: \d+ s( to \d+ s)?, up to [\d.]+ GB\)", said
     )
     # Nothing is kept in memory.
-    monkeypatch.setattr(training, "plan_memory", lambda *_, **__: MemoryPlan(False, 0, 10**9))
+    monkeypatch.setattr(families, "plan_memory", lambda *_, **__: MemoryPlan(False, 0, 10**9))
     assert run(["train", str(demo_scene), "--out", str(tmp_path / "b"), *SHORT, "--memory", "3GB"]) == 0
     first, second = (load_file(tmp_path / name / CHECKPOINT) for name in "ab")
     assert first.keys() == second.keys()

@@ -107,7 +107,17 @@ def test_eval_writes_a_valid_record(
 def test_render_writes_every_layer_of_every_test_view(trained: Path, tmp_path: Path) -> None:
     out = tmp_path / "pictures"
     assert run(["render", str(trained), "--out", str(out), "--threads", "1"]) == 0
-    layers = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth")
+    layers = (
+        "final",
+        "base",
+        "reflection",
+        "specular",
+        "diffuse",
+        "strength",
+        "metalness",
+        "normal",
+        "depth",
+    )
     wanted = {f"{view}_{layer}.png" for view in TEST_VIEWS for layer in layers} | {"contact_sheet.png"}
     assert {path.name for path in out.iterdir()} == wanted
     assert all(picture(out / name).shape[:2] == SIZE for name in wanted if name != "contact_sheet.png")
@@ -194,7 +204,10 @@ def test_a_recipe_without_reflection_goes_through_all_verbs(
     assert run(["eval", str(out)]) == 0
     assert json.loads((out / "metrics.json").read_text())["specular_psnr"] is None
     assert run(["render", str(out), "--views", "v000"]) == 0
-    assert "this recipe has no layer diffuse, reflection, specular, strength" in capsys.readouterr().out
+    assert (
+        "this recipe has no layer diffuse, metalness, reflection, specular, strength"
+        in capsys.readouterr().out
+    )
     assert not (out / "render" / "v000_specular.png").exists()
     assert (out / "render" / "v000_final.png").exists()
 

@@ -21,3 +21,9 @@ def test_the_command_writes_it_once(tmp_path: Path, capsys: pytest.CaptureFixtur
     for wrong in ("nan", "3", "1000"):
         assert run(["scale", "--diameter", wrong, "--out", str(tmp_path / "b.svg")]) == 2
     assert "--diameter: expected 20 to 160" in capsys.readouterr().err
+
+
+def test_the_folder_is_made(tmp_path: Path) -> None:
+    out = tmp_path / "some" / "folder" / "a.svg"
+    assert run(["scale", "--diameter", "70", "--out", str(out)]) == 0
+    assert out.read_text() == ring_scale(70.0)

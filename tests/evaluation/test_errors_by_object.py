@@ -19,13 +19,15 @@ CPU = torch.device("cpu")
 SEEDS = (5, 6)
 
 
-def errors(scene, *, layers=True):
+def errors(scene, *, layers=True, metal=None):
     facts = SceneFacts.of(scene)
     pool = ErrorsByObject(facts.objects)
     for view, seed in zip(scene.views, SEEDS, strict=True):
         result, stokes, _ = rendered(view, seed)
         if not layers:
             result.specular = result.diffuse = stokes = None
+        if metal is not None:
+            result.metalness = metal(view)
         score_view(ViewTarget.of_view(view, facts, CPU), result, stokes=stokes, by_object=pool)
     return pool.records()
 
@@ -133,3 +135,15 @@ def test_views_without_numbers_add_nothing():
         for v in views
     )
     assert errors(dataclasses.replace(scene, views=bare)) == ({}, {})
+
+
+def test_shares_of_what_is_shown_as_metal() -> None:
+    scene = known_scene()
+    spoon = next(item.id for item in scene.objects if item.name == "spoon")
+    by_object, materials = errors(
+        scene, metal=lambda view: 0.4 + 0.2 * (view.ground_truth.object_ids == spoon)
+    )
+    shares = {name: found["metal_share"] for name, found in by_object.items()}
+    assert shares == {"cup": 0, "spoon": 1, "cloth": 0, "clay": 0}
+    assert materials["metal"]["metal_share"] == 1
+    assert "metal_share" not in errors(scene)[0]["cup"]

@@ -78,3 +78,16 @@ def test_a_table_of_objects_that_is_wrong(changed: tuple[Path, Path]) -> None:
     (scene / "scene.json").write_text(json.dumps({"objects": [{"id": 1}]}))
     with pytest.raises(PolarguideError, match=r"scene\.json \(objects\[0\]\): expected the field name"):
         opened(folder, scene, Heard())
+
+
+def test_a_run_without_test_views_is_not_scored(changed: tuple[Path, Path]) -> None:
+    folder, scene = changed
+    about = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps({**about, "test_views": []}))
+    (folder / "metrics.json").unlink(missing_ok=True)
+    run = opened(folder, scene, Heard())
+    with pytest.raises(
+        PolarguideError, match=r"expected test views to score the run on, found none: .* split\.json"
+    ):
+        run.evaluate()
+    assert not (folder / "metrics.json").exists()

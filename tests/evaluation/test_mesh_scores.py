@@ -14,6 +14,7 @@ from polarguide.camera import Camera
 from polarguide.capture import GroundTruth, View
 from polarguide.evaluation import mesh as measured
 from polarguide.rendering.fusion import Surface
+from polarguide.rendering.mesh import fused_surface
 from polarguide.shading.result import RenderResult
 
 trimesh = pytest.importorskip("trimesh")
@@ -54,6 +55,10 @@ def views(mask: bool = True) -> list[View]:
 def ball(radius: float = 1.0, subdivisions: int = 4) -> Surface:
     made = trimesh.creation.icosphere(subdivisions, radius)
     return Surface(np.asarray(made.vertices), np.asarray(made.faces), np.asarray(made.vertices) / radius)
+
+
+def fused(render):
+    return lambda: fused_surface(CAMERAS, render, resolution=64)[0]
 
 
 def scores(surface: Surface, known: list[View]) -> dict[str, float]:
@@ -168,31 +173,25 @@ def sphere_result(camera: Camera, radius: float = 1.0) -> RenderResult:
     return RenderResult(zero, zero, zero, zero, None, None, normal, depth.float(), alpha)
 
 
-@pytest.fixture(autouse=True)
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fewer voxels, so that tests are quick."""
-    monkeypatch.setattr(measured, "RESOLUTION", 64)
-
-
 def test_the_mesh_of_a_run_is_scored() -> None:
-    got = measured.mesh_scores(CAMERAS, sphere_result, views())
+    got = measured.mesh_scores(fused(sphere_result), views())
     assert set(got) == KEYS
     assert got["mesh_fscore_1"] > 0.8
-    wrong = measured.mesh_scores(CAMERAS, lambda camera: sphere_result(camera, 1.1), views())
+    wrong = measured.mesh_scores(fused(lambda camera: sphere_result(camera, 1.1)), views())
     assert wrong["mesh_fscore_1"] < 0.1
 
 
 def test_nothing_to_compare_or_to_fuse(monkeypatch: pytest.MonkeyPatch) -> None:
     unknown = [dataclasses.replace(view, ground_truth=None) for view in views()]
-    assert measured.mesh_scores(CAMERAS, sphere_result, unknown) == {}
+    assert measured.mesh_scores(fused(sphere_result), unknown) == {}
 
     def nothing(camera: Camera) -> RenderResult:
         seen = sphere_result(camera)
         return dataclasses.replace(seen, alpha=0 * seen.alpha)
 
-    assert measured.mesh_scores(CAMERAS, nothing, views()) == dict.fromkeys(KEYS, 0.0)
+    assert measured.mesh_scores(fused(nothing), views()) == dict.fromkeys(KEYS, 0.0)
     monkeypatch.setattr(measured, "_libraries", lambda: False)
-    assert measured.mesh_scores(CAMERAS, sphere_result, views()) == {}
+    assert measured.mesh_scores(fused(sphere_result), views()) == {}
 
 
 def test_without_masks_everything_is_judged() -> None:

@@ -87,8 +87,8 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-9)))
 
 
-def written(recipe: str, folder: Path) -> Path:
-    state, shading = random_state(recipe)
+def written(recipe: str, folder: Path, *, metal: bool = False) -> Path:
+    state, shading = random_state(recipe, metal=metal)
     path = folder / f"{recipe}.html"
     write_text(
         path,
@@ -100,22 +100,25 @@ def written(recipe: str, folder: Path) -> Path:
 
 
 @torch.no_grad()
-def ours(recipe: str, layer: str, camera: Camera) -> np.ndarray:
-    state, shading = random_state(recipe)
+def ours(recipe: str, layer: str, camera: Camera, *, metal: bool = False) -> np.ndarray:
+    state, shading = random_state(recipe, metal=metal)
     result = render(state.gaussians, camera, rasterize_cpu, shading=shading, light=state.light)
     picture = layer_picture(result, layer, camera)
     assert picture is not None
     return picture
 
 
-@pytest.mark.parametrize("recipe", KINDS)
-def test_layers_agree_with_the_rasterizer(recipe: str, browser: Any, tmp_path: Path) -> None:
-    opened = Opened(browser, written(recipe, tmp_path), 200, 300)
+@pytest.mark.parametrize(
+    ("recipe", "metal"), [*((recipe, False) for recipe in KINDS), ("polarguide-stokes", True)]
+)
+def test_layers_agree_with_the_rasterizer(recipe: str, metal: bool, browser: Any, tmp_path: Path) -> None:
+    opened = Opened(browser, written(recipe, tmp_path, metal=metal), 200, 300)
     cameras = ring()
     layers = opened.page.evaluate("polarguide.scene.layers")
+    assert ("metalness" in layers) == metal
     for view in ("v0", "v2"):
         for layer, picture in zip(layers, opened.pictures(view, layers), strict=True):
-            found = psnr(picture, ours(recipe, layer, cameras[view]))
+            found = psnr(picture, ours(recipe, layer, cameras[view], metal=metal))
             assert found > LEAST, f"{view} {layer}: {found:.1f} dB"
     own = [url for url in opened.requests if not url.startswith(("file:", "blob:null/"))]
     assert not own

@@ -66,6 +66,7 @@ def results(
             "jobs": 1,
             "against": against,
             "background": "auto",
+            "materials": "auto",
         },
         scenes=[
             {

@@ -19,8 +19,8 @@ KINDS = {"3dgs": "plain", "3dgs-dr": "reflection", "polarguide-stokes": "local",
 """A recipe for each kind of shading."""
 
 
-def random_state(name: str, count: int = 300) -> tuple[TrainingState, ShadingModel]:
-    """A state as the recipe's training would leave, and its shading."""
+def random_state(name: str, count: int = 300, *, metal: bool = False) -> tuple[TrainingState, ShadingModel]:
+    """A state as the recipe's training would leave, and its shading; with ``metal``, of which a third are metals."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
@@ -43,6 +43,9 @@ def random_state(name: str, count: int = 300) -> tuple[TrainingState, ShadingMod
     for key, spread in {"strength_logits": 1.0, "local_dc": 0.3, "local_rest": 0.1}.items():
         if key in gaussians:
             gaussians[key] = spread * normal(*gaussians[key].shape)
+    if metal:
+        gaussians["metalness"][::3] = 1
+        gaussians["reflectance_logits"], gaussians["roughness_logits"] = normal(count, 3), normal(count)
     if "surface" in gaussians:
         gaussians["surface"][::5] = 0
         gaussians["sh_rest"][::5] = 0  # for which a page has no room

@@ -8,6 +8,7 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.shading.deferred import DeferredShading, reflect_reference
+from polarguide.shading.model import GBuffer, ShadingModel
 from polarguide.shading.native import reflect_native
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 8
@@ -102,3 +103,50 @@ def test_too_few_channels_are_refused() -> None:
     features, texels = buffers()
     with pytest.raises(ValueError, match="features: expected base color, normal, strength"):
         native(features[..., :8], texels, MODELS[2])
+
+
+@pytest.mark.parametrize("wanted", [(1,), (2,), (1, 2), (0, 1, 2, 3)])
+@pytest.mark.parametrize("shading", MODELS, ids=str)
+def test_held_layers_are_those_of_normals_without_a_gradient(
+    simd: str, shading: DeferredShading, wanted: tuple[int, ...]
+) -> None:
+    """Against shading a second time, both with a gradient of the picture that does reach the normals."""
+    grid = torch.linspace(-1, 2, HEIGHT * WIDTH * 3).reshape(HEIGHT, WIDTH, 3)
+    results = []
+    for function in (DeferredShading.shade_held, ShadingModel.shade_held):
+        features, texels = (t.requires_grad_() for t in buffers())
+        splatted = GBuffer(features, features[..., 0])
+        layers, held = function(shading, splatted, {"texels": texels}, camera())
+        assert held is not None
+        specular, diffuse, metal = held
+        assert metal is None
+        terms = (layers["final"], specular, diffuse, layers["specular"])
+        total = (grid * layers["final"]).sum() + sum(
+            ((i + 2) * grid.flip(0) * terms[i]).sum() for i in wanted
+        )
+        results.append((*layers.values(), specular, diffuse, *torch.autograd.grad(total, (features, texels))))
+    for mine, theirs in zip(*results, strict=True):
+        assert_close(mine, theirs, rtol=1e-4, atol=1e-4)
+
+
+def test_a_gradient_by_held_layers_needs_room_for_the_texels() -> None:
+    flat, rays = buffers()[0].flatten(0, 1), camera().world_rays().flatten(0, 1)
+    given = [torch.zeros_like(rays) for _ in range(3)]
+    with pytest.raises(ValueError, match="grad_texels: needed where a gradient by held layers is given"):
+        _native.reflect_backward_layers(
+            flat,
+            rays,
+            given[0],
+            True,
+            True,
+            1.5,
+            None,
+            None,
+            None,
+            None,
+            given[1],
+            None,
+            given[2],
+            None,
+            flat,
+        )

@@ -19,6 +19,7 @@ from raster_scenes import (
 
 from polarguide.raster import Rasterize, Splats, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.raster.interface import BLUR
 
 BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "reference"])
 
@@ -211,5 +212,5 @@ def test_radii_are_zero_outside_the_picture_and_three_sigma_inside(rasterize: Ra
     radii = rasterize(pair, camera).radii
     assert float(radii[1]) == 0
     # 5 pixels of spread and the blur; the definition adds a little under the root to round ellipses.
-    variance = (100 / 3 * 0.15) ** 2 + 0.3
+    variance = (100 / 3 * 0.15) ** 2 + BLUR
     assert float(radii[0]) == pytest.approx(3 * math.sqrt(variance + math.sqrt(0.1)), rel=1e-4)

@@ -33,7 +33,7 @@ def test_one_round_gaussian_in_closed_form(rasterize: Rasterize, opacity: float)
     picture = rasterize(at_depths([4.0], [opacity], [[2.0, -1.0]]), camera)
     assert float(picture.alpha[7, 10]) == pytest.approx(opacity, rel=1e-5)
     y, x = torch.meshgrid(torch.arange(15.0) - 7, torch.arange(21.0) - 10, indexing="ij")
-    alpha = opacity * torch.exp(-(x**2 + y**2) / (2 * (2.0**2 + 0.3)))
+    alpha = opacity * torch.exp(-(x**2 + y**2) / (2 * (2.0**2 + 0.1)))
     alpha[alpha < 1 / 255] = 0
     torch.testing.assert_close(picture.alpha, alpha, atol=2e-6, rtol=1e-5)
     torch.testing.assert_close(picture.features, alpha[..., None] * torch.tensor([2.0, -1.0]))

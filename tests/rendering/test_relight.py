@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -97,6 +99,33 @@ def test_what_is_no_panorama_is_refused(tmp_path: Path) -> None:
     for name in ("a.hdr", "b.hdr", "c.png", "d.hdr", "none.exr"):
         with pytest.raises(PolarguideError, match=r"expected a (panorama|complete|picture)"):
             read_panorama(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "found"), [(float("nan"), "NaN at 1 of 128 pixels"), (None, "no value above 0")]
+)
+def test_a_panorama_without_light_or_numbers_is_refused(
+    tmp_path: Path, spoiled: float | None, found: str
+) -> None:
+    pytest.importorskip("OpenEXR")
+    picture = torch.zeros(8, 16, 3)
+    if spoiled is not None:
+        picture += 1
+        picture[3, 4, 1] = spoiled
+    write_exr(tmp_path / "a.exr", picture)
+    with pytest.raises(PolarguideError, match=found):
+        read_panorama(tmp_path / "a.exr")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the file system takes names in UTF-8 alone")
+def test_an_exr_is_written_under_a_name_that_is_no_utf8(tmp_path: Path) -> None:
+    pytest.importorskip("OpenEXR")
+    folder = tmp_path / os.fsdecode(b"a\xff")
+    folder.mkdir()
+    write_exr(folder / "a.exr", torch.ones(8, 16, 3))
+    assert [path.name for path in folder.iterdir()] == ["a.exr"]
+    assert not (folder / "a.exr").is_symlink()
+    assert (read_panorama(folder / "a.exr") == 1).all()
 
 
 def test_a_damaged_exr_is_refused(tmp_path: Path) -> None:

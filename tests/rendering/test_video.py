@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -43,3 +44,14 @@ def test_an_encoder_that_ends_on_a_full_disk_is_noticed(
         write_video(tmp_path / "a.mp4", PICTURES, frames_per_second=10)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
     assert (tmp_path / "a.mp4").read_bytes() == b"the older one"
+
+
+def test_pictures_that_fail_leave_nothing(tmp_path: Path) -> None:
+    def pictures() -> Iterator[np.ndarray]:
+        yield from PICTURES
+        raise PolarguideError("path", expected="cameras", found="none", remedy="Give some.")
+
+    with pytest.raises(PolarguideError, match="path: expected cameras"):
+        write_video(tmp_path / "a.mp4", pictures(), frames_per_second=10)
+    time.sleep(0.3)  # an encoder that goes on would write by now
+    assert list(tmp_path.iterdir()) == []

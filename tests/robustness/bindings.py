@@ -103,12 +103,13 @@ def cubemap(rng: random.Random) -> None:
 
 def reflect(rng: random.Random) -> None:
     n, d, local = rng.choice((*SIZES, 5000)), rng.randint(5, 12), rng.random() < 0.5
-    features, rays, three = array(rng, n, d), array(rng, n, 3), [array(rng, n, 3) for _ in range(6)]
+    features, rays, three = array(rng, n, d), array(rng, n, 3), [array(rng, n, 3) for _ in range(7)]
     _native.reflect_directions(features, rays, three[0])
     model = rng.random() < 0.5, local, rng.choice((1.5, 0.0, np.nan))
     _native.reflect_layers(features, rays, three[0], *model, *three[1:5])
-    layers = [maybe(rng, values) for values in three[1:5]]
-    _native.reflect_backward_layers(features, rays, three[0], *model, *layers, three[5], array(rng, n, d))
+    layers = [maybe(rng, values) for values in (*three[1:5], *three[1:3])]
+    by_look_up = three[5], maybe(rng, three[6])
+    _native.reflect_backward_layers(features, rays, three[0], *model, *layers, *by_look_up, array(rng, n, d))
     _native.reflect_backward_directions(features, rays, three[0], array(rng, n, d))
 
 
@@ -116,7 +117,12 @@ def harmonics(rng: random.Random) -> None:
     n, degree = rng.choice((*SIZES, 3000)), rng.randint(-1, 4)
     given = array(rng, n, 3), array(rng, 3), array(rng, n, 3), array(rng, n, 15, 3)
     _native.harmonics_forward(degree, *given, array(rng, n, 3))
-    gradients = array(rng, n, 3), array(rng, n, 3), array(rng, n, 3), array(rng, n, 15, 3)
+    gradients = (
+        array(rng, n, 3),
+        maybe(rng, array(rng, n, 3)),
+        array(rng, n, 3),
+        maybe(rng, array(rng, n, 15, 3)),
+    )
     _native.harmonics_backward(degree, *given, *gradients)
 
 
@@ -145,10 +151,20 @@ def polarization(rng: random.Random) -> None:
     normal, rays, specular, diffuse = (array(rng, n, 3) for _ in range(4))
     measured, analyzers, weight = array(rng, k, n, 3), array(rng, k, 3), maybe(rng, array(rng, n))
     numbers = rng.choice((0.1, 0.0, np.nan, 3e38)), rng.choice((1.5, 1.5, 1.0, -1.0, 1e30, np.inf, np.nan))
-    gradients = (array(rng, n, 3) for _ in range(3))
+    gradients = [array(rng, n, 3) for _ in range(3)]
+    metal = maybe(rng, array(rng, n, 6))
+    layers = specular, diffuse, metal, measured, analyzers, weight
     _native.polarization(
-        normal, rays, array(rng, 3, 3), specular, diffuse, measured, analyzers, weight, *numbers, *gradients
+        normal, rays, array(rng, 3, 3), *layers, *numbers, *gradients, maybe(rng, array(rng, n, 6))
     )
+
+
+def conductor(rng: random.Random) -> None:
+    n = rng.choice((*SIZES, 5000))
+    given, derivatives = [array(rng, n), *(array(rng, n, 3) for _ in range(3))], array(rng, n, 3, 4)
+    _native.conductor_values(*given, maybe(rng, derivatives))
+    by = maybe(rng, array(rng, n, 3)), maybe(rng, array(rng, n, 3))
+    _native.conductor_backward(derivatives, *by, array(rng, n), array(rng, n, 3))
 
 
 def direction(rng: random.Random) -> None:
@@ -168,7 +184,8 @@ def consistency(rng: random.Random) -> None:
 
 
 KINDS = (
-    rasterizer, photometric, cubemap, reflect, harmonics, axes, finite, gbuffer, polarization, direction, consistency,
+    rasterizer, photometric, cubemap, reflect, harmonics, axes, finite, gbuffer, polarization, direction,
+    consistency, conductor,
 )  # fmt: skip
 
 

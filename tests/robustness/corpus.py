@@ -18,6 +18,7 @@ import spoil
 from base import EVAL, MOSAICS, READ, RESUME, SHOTS, TRAIN
 from corpus_more import more_cases
 from corpus_shots import shot_cases
+from fifth import fifth_cases
 from forked import Case
 from fourth import fourth_cases
 from further import further_cases
@@ -43,6 +44,7 @@ def corpus(first_seed: int = 0, times: int = 1) -> Iterator[Case]:
     yield from shot_cases()
     yield from further_cases(every=times > 1)
     yield from fourth_cases(every=times > 1)
+    yield from fifth_cases(every=times > 1)
 
 
 def case(

@@ -53,5 +53,7 @@ def warm_up(few_gaussians: bool = True) -> None:
 def _shrink(registry: object) -> None:
     for recipes in (registry.RECIPES, registry._BUILT_IN):  # type: ignore[attr-defined]
         for name, recipe in recipes.items():
+            if not hasattr(recipe, "initialization"):  # it has no Gaussians
+                continue
             start = dataclasses.replace(recipe.initialization, shell=SHELL)
             recipes[name] = dataclasses.replace(recipe, initialization=start)

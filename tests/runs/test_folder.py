@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import polarguide
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.files import atomic
+from polarguide.neural.recipe import NeuralRecipe
 from polarguide.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import (
@@ -110,6 +112,16 @@ def test_scalars_survive_a_checkpoint(tmp_path: Path, state: TrainingState, busy
     assert loaded.frozen is None
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the file system takes names in UTF-8 alone")
+def test_a_checkpoint_is_read_under_a_name_that_is_no_utf8(
+    tmp_path: Path, state: TrainingState, busy_recipe: Recipe
+) -> None:
+    folder = tmp_path / os.fsdecode(b"run\xff")
+    folder.mkdir()
+    save_checkpoint(folder, state)
+    assert load_checkpoint(folder, busy_recipe).step == state.step
+
+
 @pytest.mark.parametrize("damage", ["cut", "empty", "header", "text", "missing tensor", "other rows"])
 def test_a_damaged_checkpoint_is_refused(
     tmp_path: Path, state: TrainingState, busy_recipe: Recipe, damage: str
@@ -165,6 +177,9 @@ def test_every_value_of_a_recipe_is_on_record(name: str) -> None:
     recipe = RECIPES[name]
     data = recipe.data()
     assert json.loads(json.dumps(data)) == data
+    if isinstance(recipe, NeuralRecipe):
+        assert replace(recipe, rates=replace(recipe.rates, features=1.0)).data() != data
+        return
     changed = replace(recipe, means_decay=recipe.means_decay / 2)
     assert changed.data() != data
     first = replace(recipe.stages[0], densify=not recipe.stages[0].densify)

@@ -5,16 +5,19 @@ from __future__ import annotations
 import re
 
 import pytest
+from textured_ball import cameras
 
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
+from polarguide.neural.recipe import NeuralRecipe
+from polarguide.neural.state import FieldState
 from polarguide.options import SceneOptions, gibibytes
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs import forecast as forecasts
 from polarguide.runs import memory
 from polarguide.runs.defaults import MOST_GAUSSIANS, STEPS, with_defaults
-from polarguide.runs.memory import GIBIBYTE, MemoryPlan, plan_memory
+from polarguide.runs.memory import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.settings import TrainSettings
 
 STOKES = RECIPES["polarguide-stokes"]
@@ -107,3 +110,20 @@ def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Sc
 
 def test_options_take_a_limit() -> None:
     assert SceneOptions(memory=2.5).memory == 2.5
+
+
+def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
+    field = RECIPES["gnerp"]
+    assert isinstance(field, NeuralRecipe)
+    learned = 4 * field.numbers
+    state = FieldState.first(field, cameras(4, 8, 6), 0)
+    exact = 4 * sum(values.numel() for values in state.field.parameters())
+    assert exact < learned * 1.02
+    assert learned < exact * 1.1
+    plan = plan_field_memory(SMALL, field, limit=4)
+    assert plan.kept is None
+    assert plan.peak > 400_000_000 + 4 * learned
+    with pytest.raises(PolarguideError, match="memory: expected at least") as error:
+        plan_field_memory(SMALL, field, limit=0.01)
+    assert "Gaussians" not in str(error.value)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import random
 import struct
 from pathlib import Path
 
@@ -45,6 +47,7 @@ def test_a_triangle(tmp_path: Path) -> None:
         ("m.ply", ply(3, 1, PLACES + b"\xff")),
         ("m.ply", ply(3, 0, PLACES)),
         ("m.ply", b"ply\nformat"),
+        ("m.ply", HEAD.format(3).encode() + b"\xffelement face 1\n"),
         ("m.obj", b""),
         ("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
         ("m.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
@@ -56,3 +59,22 @@ def test_damaged_ones_are_named(tmp_path: Path, name: str, data: bytes) -> None:
         _user_mesh(tmp_path / name)
     assert refused.value.where.endswith(name)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_damage_is_read_or_named(tmp_path: Path, seed: int) -> None:
+    """Corners beyond the points once made Mitsuba write where nothing was, which ended a later test or none."""
+    draw = random.Random(seed)
+    count = draw.choice([3, 40, 400])
+    points = struct.pack(f"<{3 * count}f", *(draw.uniform(-1, 1) for _ in range(3 * count)))
+    triangles = b"".join(corners(*(draw.randrange(count) for _ in range(3))) for _ in range(2 * count))
+    data = bytearray(ply(count, 2 * count, points + triangles))
+    for _ in range(draw.choice([1, 2, 20])):
+        place = draw.randrange(len(data) - 4)
+        data[place : place + 4] = struct.pack(
+            "<i", draw.choice([-1, 99_999, 2**31 - 1, draw.randrange(2**31)])
+        )
+    (tmp_path / "m.ply").write_bytes(data)
+    with contextlib.suppress(PolarguideError):
+        mesh = _user_mesh(tmp_path / "m.ply")
+        assert 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.points)

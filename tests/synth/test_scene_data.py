@@ -157,6 +157,23 @@ def test_mistakes_in_a_shape_are_named(shape: dict[str, object]) -> None:
         make_mesh(shape, "test")
 
 
+@pytest.mark.parametrize(
+    ("shape", "found"),
+    [
+        (
+            {"type": "lathe", "profile": [[0, 0]]},
+            r"an array of shape \[1, 2\] where points are \[2 or more, 2\]",
+        ),
+        ({"type": "lathe", "profile": [[0, 0], [1]]}, "points that are not all 2 numbers"),
+        ({"type": "lathe", "profile": "abc"}, "points that are not all 2 numbers"),
+        ({"type": "tube", "path": []}, r"an array of shape \[0\] where points are \[2 or more, 3\]"),
+    ],
+)
+def test_points_of_a_curve_are_counted(shape: dict[str, object], found: str) -> None:
+    with pytest.raises(PolarguideError, match=f"test shape: expected the fields of a .*, found {found}"):
+        make_mesh(shape, "test")
+
+
 @pytest.mark.parametrize("kind", [name for name in TEXTURES if name != "image"])
 def test_textures_are_reflectances(kind: str) -> None:
     picture = make_texture({"type": kind, "pixels": 64}, "test", Path())

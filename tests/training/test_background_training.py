@@ -11,7 +11,7 @@ from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, choose_backend, rasterize_reference
 from polarguide.recipes import RECIPES
-from polarguide.shading.visibility import LEAST_PIXELS, touching_views
+from polarguide.shading.visibility import LEAST_PIXELS, touched_pixels
 from polarguide.training import losses as losses_of_steps
 from polarguide.training.losses import coverage_loss
 from polarguide.training.settings import TrainSettings
@@ -116,9 +116,11 @@ def test_pictures_that_a_gaussian_adds_to_are_counted(black_scene: Scene) -> Non
         made.state.gaussians["means"][0] = torch.tensor([0.0, 0.0, 50.0])
         made.state.gaussians["opacity_logits"][1] = -12.0
     cameras = [view.camera for view in black_scene.train_views]
-    counts = touching_views(made.state.gaussians, cameras, BACKEND.rasterize)
+    counts, most = touched_pixels(made.state.gaussians, cameras, BACKEND.rasterize)
     for number in (0, 1, 2, 7):
-        assert counts[number] == sum(w >= LEAST_PIXELS for w in summed_weights(made, number))
+        weights = summed_weights(made, number)
+        assert counts[number] == sum(w >= LEAST_PIXELS for w in weights)
+        assert float(most[number]) == pytest.approx(max(weights), rel=1e-4, abs=1e-6)
     assert counts[1] == 0
     assert counts[2] > 0
 
@@ -141,6 +143,24 @@ def test_surroundings_keep_what_no_view_sees(black_scene: Scene) -> None:
     count = len(made.state.gaussians)
     made.run(lambda _: None)
     assert len(made.state.gaussians) == count
+
+
+def test_what_is_faint_in_all_views_goes_where_the_recipe_says_so(black_scene: Scene) -> None:
+    stages = {}
+    for faint in (0.0, 0.1):
+        made = trainer(black_scene, "scene", recipe="polarguide-stokes", steps=40)
+        assert made.recipe.densification.faint_pixels == 0.1
+        made.recipe = replace(
+            made.recipe, densification=replace(made.recipe.densification, faint_pixels=faint)
+        )
+        with torch.no_grad():
+            made.state.gaussians["opacity_logits"][1] = -5.4  # over the least opacity, and hardly to be seen
+        made.run(lambda _: None, until=19)
+        before = len(made.state.gaussians)
+        made.run(lambda _: None, until=20)
+        stages[faint] = before, len(made.state.gaussians)
+    assert stages[0.0][0] == stages[0.0][1] == stages[0.1][0]
+    assert 0 < stages[0.1][1] < stages[0.1][0]
 
 
 def test_all_stays_where_no_view_sees_anything(black_scene: Scene) -> None:

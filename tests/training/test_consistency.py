@@ -80,3 +80,8 @@ def test_pixels_without_weight_do_not_count() -> None:
     weight[:, 12:] = 1
     assert float(consistency_loss(result(world, depth, alpha), CAMERA, weight)) == pytest.approx(0, abs=1e-6)
     assert float(consistency_loss(result(world, depth, alpha), CAMERA, 1 - weight)) > 0.5
+
+
+def test_a_picture_without_an_inner_pixel_has_no_loss() -> None:
+    normal, ones = torch.zeros(2, 30, 3), torch.ones(2, 30)
+    assert float(consistency_loss(result(normal, ones, ones), CAMERA)) == 0

@@ -18,7 +18,7 @@ from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.angles import report_polarizers
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.polarizers import Polarizers
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer
 from tests.helpers.heard import Heard
@@ -123,7 +123,42 @@ def trained(scene: Scene, until: int, state: TrainingState | None = None) -> Tra
     return trainer
 
 
-@pytest.mark.parametrize("until", [STEPS // 2, 27])
+def test_it_begins_again_with_the_angles_that_it_found() -> None:
+    scene = captured_as(WHOLE, "unknown")
+    reports: list[StepReport] = []
+    settings = TrainSettings(steps=STEPS, background="scene")
+    trainer = Trainer(scene, STOKES, settings, CPU)
+    search = round(0.65 * STEPS)
+    assert (trainer.begins_again, trainer.total) == (True, STEPS + search)
+    trainer.run(reports.append)
+    assert [report.step for report in reports] == [*range(search), *range(STEPS)]
+    assert [report.done for report in reports] == [*range(1, STEPS + search + 1)]
+    assert trainer.done == trainer.total
+    assert trainer.polarizers.table is not None
+    assert len(trainer.polarizers.table) == 4
+
+    # From there on it is a training that has been told these angles.
+    told = Trainer(scene, STOKES, settings, CPU)
+    told.state.angles = trainer.polarizers.table
+    told.polarizers.take(trainer.polarizers.table)
+    told.run(lambda report: None)
+    ours, theirs = trainer.state.tensors(), told.state.tensors()
+    assert all(torch.equal(values, theirs[name]) for name, values in ours.items())
+
+    alongside = Trainer(scene, STOKES, dataclasses.replace(settings, begin_again=False), CPU)
+    assert alongside.total == STEPS
+    alongside.run(lambda report: None)
+    assert not torch.equal(alongside.state.gaussians["means"], trainer.state.gaussians["means"])
+
+
+@pytest.mark.parametrize("exposures", ["one", "four", "none"])
+def test_where_all_angles_are_known_nothing_begins_again(exposures: str) -> None:
+    scene = captured_as(WHOLE, exposures)  # type: ignore[arg-type]
+    trainer = Trainer(scene, STOKES, TrainSettings(steps=STEPS, background="scene"), CPU)
+    assert (trainer.begins_again, trainer.total) == (False, STEPS)
+
+
+@pytest.mark.parametrize("until", [STEPS // 2, 23, 27])
 def test_a_resumed_training_gives_the_same_bits(until: int) -> None:
     scene = captured_as(WHOLE, "unknown")
     whole = trained(scene, STEPS)

@@ -14,7 +14,7 @@ from polarguide import optics
 from polarguide.capture import GroundTruth, View, load_scene
 from polarguide.color import srgb_decode, srgb_encode
 from polarguide.training.losses import azimuth_loss
-from polarguide.training.priors import ViewPriors, guide_normals, view_priors
+from polarguide.training.priors import ViewPriors, debiased_dolp, guide_normals, view_priors
 from polarguide.training.recipe import Priors
 
 INDEX = 1.5
@@ -181,3 +181,14 @@ def test_a_live_choice_counts_wherever_the_polarization_is_strong(view: View) ->
     strong = (optics.dolp(stokes) > 0.1) & ~view.invalid & ~view.saturated
     assert torch.equal(live.weight, strong.float())
     assert 0.01 < float(strong.float().mean()) < 0.9
+
+
+def test_noise_does_not_make_a_weak_polarization_count_more() -> None:
+    generator, sigma, true = torch.Generator().manual_seed(4), 0.01, 0.04
+    clean = (1 + true * torch.tensor((1.0, 0.0, -1.0, 0.0))) / 2
+    noisy = clean[:, None, None] + sigma * torch.randn(4, 200, 200, generator=generator)
+    stokes = optics.stokes(noisy)
+    raw = float(debiased_dolp(stokes, 0.0).mean())
+    found = float(debiased_dolp(stokes, torch.full((200, 200), sigma)).mean())
+    assert raw > true + 0.001
+    assert abs(found - true) < (raw - true) / 3

@@ -24,6 +24,8 @@ from polarguide.viewer.gate import Gate
 from polarguide.viewer.messages import LARGEST, Refused, checked, choice, flag, number, pair
 from polarguide.viewer.server import _listening
 
+# The viewer ignores it itself, but each test brings back the filters of before.
+pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
 NUMBERS = [
     math.nan,
     math.inf,
@@ -261,6 +263,13 @@ def test_a_camera_is_clamped() -> None:
     assert (found["fov"], found["image_width"], found["position"]) == (0.01, 8192, [50.0, 0.0, 0.0])
     assert found["wxyz"] == [1.0, 0.0, 0.0, 0.0]
     assert "more" not in found
+
+
+def test_a_camera_that_looks_at_its_own_place_is_refused() -> None:
+    """As clamped, that is: viser asks for the direction."""
+    wild = {**CAMERA, "position": [1e300, 0, 0], "look_at": [60.0, 0, 0]}
+    with pytest.raises(Refused, match="looks at itself"):
+        checked(msgspec.msgpack.encode(wild), lambda _: None, 50.0)
 
 
 @pytest.mark.parametrize("host", ["a" * 70_000, "\udcff", "xn--\u2603.."])

@@ -18,7 +18,7 @@ from polarguide.files import require_folder
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
-_READ_FOLDERS = ("polar", "masks", "invalid", "gt", "sparse")
+_READ_FOLDERS = ("polar", "masks", "materials", "invalid", "gt", "sparse")
 _NUMBER = re.compile(r"(?<!\d)\d{1,3}(?!\d)")
 _HINT = (
     "Camera files become one by polarguide prepare FOLDER --out SCENE. Else give a folder that holds "
@@ -35,7 +35,7 @@ class Layout:
         root: the folder.
         pictures: view name -> angle in degrees -> file, of views with pictures at 0, 45, 90 and 135 degrees. Angles may
             be missing; ``select_views`` checks.
-        masks, invalid, ground_truth: view name -> file, for the views that have one.
+        masks, materials, invalid, ground_truth: view name -> file, for the views that have one.
         warnings: about files that are not used.
         others: view name -> its files and what they are, of views with other pictures, which ``angles.csv`` lists.
         table: ``angles.csv``, if there is one.
@@ -49,6 +49,7 @@ class Layout:
     warnings: tuple[str, ...]
     others: Mapping[str, tuple[tuple[Path, Exposure], ...]] = field(default_factory=dict)
     table: Path | None = None
+    materials: Mapping[str, Path] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -87,7 +88,8 @@ def find_layout(root: Path) -> Layout:
     if not names:
         raise PolarguideError(root, expected="pictures of at least one view", found="none", remedy=_HINT)
     sides: dict[str, dict[str, Path]] = {}
-    for folder, suffixes in (("masks", SUFFIXES), ("invalid", SUFFIXES), ("gt", (".npz",))):
+    kinds = (("masks", SUFFIXES), ("materials", SUFFIXES), ("invalid", SUFFIXES), ("gt", (".npz",)))
+    for folder, suffixes in kinds:
         files = index_files(root / folder, suffixes)
         strangers = sorted(path.name for stem, path in files.items() if stem not in names)
         if strangers:
@@ -99,9 +101,8 @@ def find_layout(root: Path) -> Layout:
     without = sorted(names - sides["masks"].keys())
     if sides["masks"] and without:
         warnings.append(f"masks/ has no file for {len(without)} of {len(names)} views ({listed(without)}).")
-    return Layout(
-        root, pictures, sides["masks"], sides["invalid"], sides["gt"], tuple(warnings), others, table
-    )
+    given = sides["masks"], sides["invalid"], sides["gt"]
+    return Layout(root, pictures, *given, tuple(warnings), others, table, sides["materials"])
 
 
 def require_four(layout: Layout, what: str) -> None:

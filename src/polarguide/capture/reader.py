@@ -118,11 +118,13 @@ def load_scene(
     stored = read_views(layout, names, model, **how)  # type: ignore[arg-type]
     for item in stored.data:
         files.digests.update(item.digests)
-    if all(item.invalid.all() for item in stored.data):
+    untold = [item.name for item in stored.data if item.invalid.all()]
+    counted = {item.name for item in stored.data} - (set(tests) if views is None else set())
+    if counted and counted <= set(untold):
         raise PolarguideError(
             root / "invalid",
-            expected="at least one pixel that is not invalid",
-            found=f"none in {len(stored.data)} views",
+            expected="at least one pixel to train on that is not invalid",
+            found=f"none in {len(counted)} views",
             remedy="White is invalid there: invert the pictures, or remove them.",
         )
     pictures = ViewFiles(layout, downscale, transfer, files.digests)
@@ -134,7 +136,14 @@ def load_scene(
         if camera is not None
     )
     told_apart = any(item.ground_truth and item.ground_truth.object_ids is not None for item in stored.data)
-    warnings = [*layout.warnings, *model.warnings, *stray, *_pose_warnings(model, layout.names, stored.data)]
+    warnings = [
+        *layout.warnings,
+        *model.warnings,
+        *stray,
+        *_untold(untold, len(stored.data)),
+        *_alike(layout, stored.data),
+        *_pose_warnings(model, layout.names, stored.data),
+    ]
     return Scene(
         root=root,
         name=root.resolve().name,
@@ -309,6 +318,33 @@ def _odd_pictures(stored: StoredViews) -> list[str]:
             f"{len(gray)} of {count} views have gray pictures among others in color ({listed(gray)})."
         )
     return warnings
+
+
+def _untold(names: list[str], count: int) -> list[str]:
+    """The warning about views that tell nothing."""
+    if not names:
+        return []
+    listing = f"{len(names)} of {count} views are invalid at every pixel ({listed(names)})"
+    return [
+        f"{listing}: they tell nothing. White is invalid in invalid/: invert the pictures, or remove them."
+    ]
+
+
+def _alike(layout: Layout, data: Sequence[ViewData]) -> list[str]:
+    """The warning about views whose angles are all one file: light without polarization has noise, too."""
+    names = [
+        item.name
+        for item in data
+        if item.peak.any()
+        and len(paths := layout.files(item.name)) > 1
+        and len({item.digests[path] for path in paths}) == 1
+    ]
+    if not names:
+        return []
+    listing = (
+        f"The pictures at all angles are the same file in {len(names)} of {len(data)} views ({listed(names)})"
+    )
+    return [f"{listing}: they look unpolarized. Copy those of the other angles."]
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:

@@ -90,6 +90,7 @@ class StoredView(View):
             "mask": None if data.mask is None else torch.from_numpy(data.mask),
             "exposures": data.exposures,
             "mount": mount,
+            "materials": None if data.materials is None else torch.from_numpy(data.materials),
             "_files": files,
             "_size": (data.size[1], data.size[0]),
             "_masked": masked,

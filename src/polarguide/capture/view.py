@@ -67,6 +67,8 @@ class View:
         ground_truth: or None.
         exposures: what the K pictures are.
         mount: where the polarizer was.
+        materials: what the user says of surfaces (``materials/<view>.png``): 0 nothing, 1 dielectric, 2 metal, [H, W]
+            uint8, or None.
     """
 
     name: str
@@ -78,6 +80,7 @@ class View:
     ground_truth: GroundTruth | None = None
     exposures: tuple[Exposure, ...] = FOUR
     mount: Mount = "sensor"
+    materials: Tensor | None = None
 
     @property
     def is_four(self) -> bool:
@@ -109,6 +112,7 @@ class View:
             mask,
             exposures=self.exposures,
             mount=self.mount,
+            materials=None if self.materials is None else self.materials.to(device),
         )
 
     def with_exposures(self, exposures: tuple[Exposure, ...]) -> View:

@@ -20,7 +20,13 @@ from polarguide.capture import checks
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.integrity import declared_size
-from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes, read_file
+from polarguide.capture.formats.pictures import (
+    decode_mask,
+    decode_materials,
+    decode_picture,
+    linear_codes,
+    read_file,
+)
 from polarguide.capture.ground_truth import read_ground_truth
 from polarguide.capture.layout import Layout
 from polarguide.capture.view import GroundTruth, View
@@ -59,7 +65,7 @@ class ViewData:
     """The pixels of one view, before the full scale of the whole capture is known.
 
     Attributes:
-        name, codes, invalid, mask, ground_truth, exposures: as in ``View``, with arrays instead of tensors.
+        name, codes, invalid, mask, materials, ground_truth, exposures: as in ``View``, with arrays instead of tensors.
         size: width and height of the pictures as stored.
         peak: largest stored value over angles, channels and the pixels of a box, [H, W].
         black: whether some pixel of the box is 0 in all angles and channels, [H, W].
@@ -78,6 +84,7 @@ class ViewData:
     ground_truth: GroundTruth | None
     digests: dict[Path, str]
     exposures: tuple[Exposure, ...]
+    materials: NDArray[np.uint8] | None = None
 
     def saturated(self, scale: int | None) -> NDArray[np.bool_]:
         """``View.saturated``, given the stored value at which the capture saturates (None: it does not)."""
@@ -95,6 +102,7 @@ class ViewData:
             ground_truth=self.ground_truth,
             exposures=self.exposures,
             mount=mount,
+            materials=None if self.materials is None else torch.from_numpy(self.materials),
         )
 
 
@@ -121,6 +129,13 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         invalid = _read_mask(files, layout.invalid[name], (height, width), any_value=True)
     if name in layout.masks:
         mask = _read_mask(files, layout.masks[name], (height, width), any_value=False)
+    materials = None
+    if name in layout.materials:
+        path = layout.materials[name]
+        data = files.picture(path)
+        require_size(path, data, (height, width))
+        materials = decode_materials(path, data)
+        _require_same(path, (materials.shape[1], materials.shape[0]), (height, width))
     if name in layout.ground_truth:
         path = layout.ground_truth[name]
         ground_truth = read_ground_truth(path, files.read(path), size=(height, width), factor=factor)
@@ -136,6 +151,9 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         ground_truth=ground_truth,
         digests=files.digests,
         exposures=layout.exposures(name),
+        materials=None
+        if materials is None
+        else boxes.agreed(materials.astype(np.int32), factor).astype(np.uint8),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import polarguide
@@ -9,6 +10,7 @@ from polarguide.cli.compare import Options, Scenes, Settings, print_results
 from polarguide.cli.console import use_threads
 from polarguide.cli.job_progress import JobReporter
 from polarguide.system import signals_as_interrupts
+from polarguide.training.settings import TrainSettings
 
 
 def ablate(
@@ -16,6 +18,7 @@ def ablate(
     /,
     *,
     out: Path,
+    steps: int = TrainSettings.steps,
     settings: Settings,
     options: Options,
     base: str = "polarguide",
@@ -29,6 +32,7 @@ def ablate(
     Args:
         scenes: Scene folders, as for train.
         out: Folder to write, as for compare.
+        steps: Optimizer steps of every run.
         base: The recipe whose ablations to train.
         only: Names of the ablations to take, such as without-normals; all if none is given.
         reference: Recipes to add as first rows, such as 3dgs-dr.
@@ -41,7 +45,7 @@ def ablate(
             out,
             only=only,
             reference=reference,
-            settings=settings,
+            settings=replace(settings, steps=steps),
             options=options,
             reporter=JobReporter(),
         )

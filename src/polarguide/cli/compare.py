@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,18 +14,18 @@ from polarguide.cli.job_progress import JobReporter
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
 from polarguide.system import signals_as_interrupts
-from polarguide.training.settings import Background, TrainSettings
+from polarguide.training.settings import Background, Materials, TrainSettings
 
 if TYPE_CHECKING:
     from polarguide.experiments.results import Results
 
 
 def compared_settings(
-    steps: int = TrainSettings.steps,
     refractive_index: float = TrainSettings.refractive_index,
     background: Background = TrainSettings.background,
+    materials: Materials = TrainSettings.materials,
 ) -> TrainSettings:
-    return TrainSettings(steps=steps, refractive_index=refractive_index, background=background)
+    return TrainSettings(refractive_index=refractive_index, background=background, materials=materials)
 
 
 # Of these options; the seeds are counted, the others are fixed.
@@ -40,6 +41,7 @@ def compare(
     *,
     recipes: tuple[str, ...],
     out: Path,
+    steps: tuple[str, ...] = (str(TrainSettings.steps),),
     settings: Settings,
     options: Options,
 ) -> None:
@@ -52,13 +54,46 @@ def compare(
         scenes: Scene folders, as for train.
         recipes: The recipes to compare, by name: 3dgs, 3dgs-dr, polarguide, polarguide:without-normals, ...
         out: Folder to write.
+        steps: Optimizer steps of every run, and RECIPE=STEPS for each recipe that takes its own number: 5000
+            gnerp=10000.
     """
     use_threads(options.threads)
+    common, steps_of = chosen_steps(steps)
     with signals_as_interrupts():
         results = polarguide.compare(
-            scenes, recipes, out, settings=settings, options=options, reporter=JobReporter()
+            scenes,
+            recipes,
+            out,
+            settings=replace(settings, steps=common),
+            options=options,
+            steps_of=steps_of,
+            reporter=JobReporter(),
         )
     print_results(results, out)
+
+
+def chosen_steps(words: tuple[str, ...]) -> tuple[int, dict[str, int]]:
+    """The number of steps that all take, and those of recipes by name.
+
+    Raises:
+        PolarguideError: a word that is neither, or one twice.
+    """
+    common: list[int] = []
+    own: dict[str, int] = {}
+    for word in words:
+        name, _, number = word.rpartition("=")
+        if not number.isdecimal() or name in own or (not name and common):
+            raise PolarguideError(
+                "--steps",
+                expected="a number of steps, and RECIPE=STEPS for a recipe of its own, each once",
+                found=" ".join(words),
+                remedy="For example --steps 5000 gnerp=10000.",
+            )
+        if name:
+            own[name] = int(number)
+        else:
+            common.append(int(number))
+    return (common or [TrainSettings.steps])[0], own
 
 
 def print_results(results: Results, out: Path) -> None:

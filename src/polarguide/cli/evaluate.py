@@ -65,10 +65,15 @@ def _errors(record: dict[str, Any]) -> Table:
     table.add_column("pixels", justify="right", no_wrap=True)
     for metric in columns:
         table.add_column(metric.heading, justify="right", min_width=8)
+    told = any(errors.get("metal_share") is not None for errors in record["objects"].values())
+    if told:
+        table.add_column("metal", justify="right", no_wrap=True)
 
     def add(name: str, errors: dict[str, Any]) -> None:
         values = [errors[metric.key] for metric in columns]
         texts = ["n/a" if v is None else f"{v:.{m.digits}f}" for m, v in zip(columns, values, strict=True)]
+        share = errors.get("metal_share")
+        texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if told else []
         table.add_row(Text(printable(name)), f"{errors['pixels']:,}", *texts)
 
     for name, errors in record["objects"].items():

@@ -53,7 +53,8 @@ def inspect(
         found, folder, reporter
     )
     _print_checks(found.checks)
-    _print_angles(found.angles)
+    if found.capture.four:
+        _print_angles(found.angles)
     _print_verdict(found)
     say(f"page: {page}   figures: {record}")
     if fix is not None:
@@ -63,6 +64,13 @@ def inspect(
 def _fix(found: Any, out: Path, reporter: ConsoleReporter) -> None:
     """Write the corrected copy, or say that there is nothing to correct."""
     fixing = importlib.import_module("polarguide.inspection.fix")
+    if not found.capture.four:
+        raise PolarguideError(
+            "--fix",
+            expected="a scene with four pictures of each view",
+            found="one with other pictures, whose angles are said in a table",
+            remedy="Correct SCENE/angles.csv as the report says, or repeat prepare.",
+        )
     change = fixing.correction(found.capture, found.angles)
     if change is None:
         say("fix: order, sense and zero are right; nothing was written.")

@@ -7,7 +7,7 @@ from pathlib import Path
 from polarguide.capture.filter.ring_scale import ring_scale
 from polarguide.cli.console import console
 from polarguide.errors import PolarguideError
-from polarguide.files import read_file, write_whole
+from polarguide.files import make_folder, read_file, write_whole
 from polarguide.options import check_finite
 
 
@@ -26,5 +26,6 @@ def scale(*, diameter: float, out: Path = Path("filter-scale.svg")) -> None:
     data = ring_scale(diameter).encode()
     if out.exists() and (out.is_dir() or read_file(out) != data):
         raise PolarguideError(out, expected="a new file", found="another one", remedy="Give another --out.")
+    make_folder(out.parent)
     write_whole(out, data)
     console.print(f"scale: {out} (print at 100 %, and measure the 50 mm line)", markup=False)

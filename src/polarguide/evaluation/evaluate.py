@@ -15,6 +15,7 @@ import polarguide
 from polarguide import _native
 from polarguide.capture import View
 from polarguide.capture.view import listed
+from polarguide.errors import PolarguideError
 from polarguide.evaluation.error_sheet import ERRORS_FILE, ErrorSheet
 from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.held_out import cross_fitted
@@ -25,13 +26,17 @@ from polarguide.evaluation.record import METRICS_FILE, write_metrics
 from polarguide.evaluation.scores import ViewScores, score_view
 from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.target import ViewTarget
+from polarguide.neural.model import FieldModel
 from polarguide.progress import SILENT, Reporter
+from polarguide.rendering.fusion import Surface
+from polarguide.rendering.mesh import RESOLUTION, fused_surface, implicit_surface
 from polarguide.runs.folder import RunLog
 from polarguide.runs.opened import OpenedRun
 from polarguide.system import peak_memory_mib
 from polarguide.training.stopwatch import Stopwatch
 
 MINIMUM_SECONDS = 1.5
+MOST_SECONDS = 40.0
 NOT_ALONE = "other work ran on the machine meanwhile"
 
 
@@ -50,6 +55,13 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
         PolarguideError: the scene cannot be read, or has no test views.
     """
     tests = run.scene.test_views
+    if not tests:
+        raise PolarguideError(
+            run.scene.root,
+            expected="test views to score the run on",
+            found="none: it was trained on all views",
+            remedy='Name some in split.json, {"test": ["<view>", ...]}, and train again.',
+        )
     facts = SceneFacts.of(run.scene)
     for warning in facts.warnings:
         reporter.warn(warning)
@@ -66,7 +78,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
     sheet.write(run.folder / ERRORS_FILE)
     memory = peak_memory_mib()  # before the mesh, which is no part of what a run needs
     with reporter.track("measuring the mesh"):
-        mesh = mesh_scores(run.cameras, lambda camera: run.model.render(camera, depth=True), tests)
+        mesh = mesh_scores(lambda: _surface(run), tests)
     objects, materials = by_object.records()
     seconds, alone = RunLog(run.folder).elapsed()
     fps = _speed(run, normals=False) if speed else None
@@ -79,7 +91,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
             "fps_layers": _speed(run, depth=True) if speed else None,
             "train_seconds": seconds if alone and seconds > 0 else None,
             "train_seconds_reason": None if alone and seconds > 0 else "no log of it" if alone else NOT_ALONE,
-            "gaussians": len(run.model),
+            "gaussians": run.model.gaussians,
             "steps": run.steps,
             "peak_memory_mib": memory,
             **mesh,
@@ -105,6 +117,16 @@ def _score(
         in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
     sheet.add(view, target, result, stokes)
     return score_view(target, result, stokes=stokes, in_front=in_front, by_object=by_object)
+
+
+def _surface(run: OpenedRun) -> Surface:
+    """What the mesh scores look at: of a field its zero set, of Gaussians their depths fused."""
+    if isinstance(run.model, FieldModel):
+        return implicit_surface(run.cameras, run.model, resolution=RESOLUTION)
+    fused, _, _ = fused_surface(
+        run.cameras, lambda camera: run.model.render(camera, depth=True), resolution=RESOLUTION
+    )
+    return fused
 
 
 def _speed(run: OpenedRun, **layers: bool) -> float | None:
@@ -144,6 +166,9 @@ def _provenance(run: OpenedRun) -> dict[str, Any]:
 def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> float | None:
     """Median over views of 1 / seconds for ``draw``, after one warm-up of each; nothing is waited for but the call.
 
+    Where that would take longer than ``MOST_SECONDS``, as with pictures that take seconds each, as many views as fit
+    into it are timed once, after a warm-up of the first.
+
     Args:
         draw: renders one view and returns when it is done.
         views: what to render; each is timed at least three times.
@@ -151,15 +176,24 @@ def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> 
     Returns:
         Frames a second, or None where other work ran on the machine meanwhile.
     """
-    for view in views:
-        draw(view)
-    stopwatch = Stopwatch()
-    times: dict[int, list[float]] = {index: [] for index in range(len(views))}
-    begin = time.perf_counter()
-    while len(times[0]) < 3 or time.perf_counter() - begin < MINIMUM_SECONDS:
-        for index, view in enumerate(views):
-            start = time.perf_counter()
+    first = _seconds(draw, views[0])
+    rounds, slow = 3, 4 * len(views) * first > MOST_SECONDS
+    if slow:
+        rounds, views = 1, views[: max(1, int(MOST_SECONDS / first))]
+    else:
+        for view in views[1:]:
             draw(view)
-            times[index].append(time.perf_counter() - start)
+    times: list[list[float]] = [[] for _ in views]
+    stopwatch = Stopwatch()
+    begin = time.perf_counter()
+    while len(times[0]) < rounds or (not slow and time.perf_counter() - begin < MINIMUM_SECONDS):
+        for taken, view in zip(times, views, strict=True):
+            taken.append(_seconds(draw, view))
     _, alone = stopwatch.read()
-    return 1 / statistics.median(statistics.median(t) for t in times.values()) if alone else None
+    return 1 / statistics.median(statistics.median(taken) for taken in times) if alone else None
+
+
+def _seconds(draw: Callable[[View], object], view: View) -> float:
+    start = time.perf_counter()
+    draw(view)
+    return time.perf_counter() - start

@@ -15,6 +15,9 @@ from polarguide.evaluation.metrics import Selection, decibels, normal_angles_deg
 from polarguide.evaluation.table import HIGHEST_PSNR, OBJECT_METRICS, Layers
 from polarguide.evaluation.target import ViewTarget
 
+HALF = 0.5
+"""Share of metals from which on a pixel counts as one."""
+
 
 class ErrorMap(NamedTuple):
     """An error of every pixel; over any pixels the metric is the sum of ``error`` over that of ``weight``.
@@ -73,6 +76,7 @@ class ErrorsByObject:
             [[item.material.kind == kind for item in objects] for kind in self._kinds], dtype=torch.float64
         ).reshape(len(self._kinds), len(self._objects))
         self._sums: Tensor | None = None
+        self._tells_metals = False
 
     def add(self, target: ViewTarget, layers: Layers) -> None:
         """Add a view; one whose pixels' objects are not known adds nothing."""
@@ -84,7 +88,10 @@ class ErrorsByObject:
         nothing = torch.zeros_like(target.photograph[..., 0])
         lit = nothing if target.polarized is None else 2 * target.photograph.sum(-1) * target.polarized.mask
         columns = [values for key in OBJECT_METRICS for values in maps.get(key, (nothing, nothing))]
-        columns += [lit, counts.to(torch.float64)]
+        metalness = layers.get("metalness")
+        self._tells_metals = metalness is not None
+        metal = nothing if metalness is None else (metalness > HALF).to(torch.float64)
+        columns += [metal, lit, counts.to(torch.float64)]
         table = torch.stack(columns, dim=-1).flatten(0, 1) * counts.flatten()[:, None]
         sums = torch.stack(
             [(owner.flatten() == place).to(table.dtype) @ table for place in range(len(self._objects))]
@@ -97,7 +104,7 @@ class ErrorsByObject:
         """Errors by the object's name, and by class of material, as ``metrics.json`` has them; waits for the device."""
         if self._sums is None:
             return {}, {}
-        rows = [_record(row) for row in self._sums.cpu().tolist()]
+        rows = [_record(row, metals=self._tells_metals) for row in self._sums.cpu().tolist()]
         count = len(self._objects)
         by_object = {
             item.name: {"material": item.material.kind, **row}
@@ -106,8 +113,8 @@ class ErrorsByObject:
         return by_object, dict(zip(self._kinds, rows[count:], strict=True))
 
 
-def _record(sums: Sequence[float]) -> dict[str, Any]:
-    *pairs, light, pixels, views = sums
+def _record(sums: Sequence[float], *, metals: bool) -> dict[str, Any]:
+    *pairs, metal, light, pixels, views = sums
     record: dict[str, Any] = {"pixels": int(pixels), "views": int(views)}
     for key, error, weight in zip(OBJECT_METRICS, pairs[::2], pairs[1::2], strict=True):
         known = weight > 0 and (key != "stokes_error" or weight >= LEAST_POLARIZED * light)
@@ -115,4 +122,6 @@ def _record(sums: Sequence[float]) -> dict[str, Any]:
         if value is not None and key.endswith("psnr"):
             value = min(decibels(value), HIGHEST_PSNR)
         record[key] = value
+    if metals and pixels:
+        record["metal_share"] = metal / pixels
     return record

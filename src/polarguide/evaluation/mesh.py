@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,11 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from polarguide.camera import Camera, seen_at
+from polarguide.camera import seen_at
 from polarguide.capture import View
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.evaluation.target import jumps
 from polarguide.rendering.fusion import NoSurfaceError, Surface, seen_points
-from polarguide.rendering.mesh import RESOLUTION, fused_surface
-from polarguide.shading.result import RenderResult
 
 THRESHOLDS = {"05": 0.005, "1": 0.01}
 """Distances that count as right, as shares of the object's diagonal, by the end of their keys."""
@@ -33,14 +31,11 @@ FINEST = 6
 Points = NDArray[np.float64]
 
 
-def mesh_scores(
-    cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], views: Sequence[View]
-) -> dict[str, float]:
+def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> dict[str, float]:
     """The scores of the mesh that ``polarguide export --format mesh`` writes, by key.
 
     Args:
-        cameras: those that the mesh is fused from. render: as of ``scene_mesh``.
-        views: the test views; those with a true depth count.
+        surface: makes it, as the export does. views: the test views; those with a true depth count.
 
     Returns:
         Shares in [0, 1]; nothing where no depth is known, or a library is missing. Where there is no surface to fuse,
@@ -52,12 +47,12 @@ def mesh_scores(
     if not any(bool(_known(view)[1].any()) for view in known):
         return {}
     try:
-        surface, _, _ = fused_surface(cameras, render, resolution=RESOLUTION)
+        made = surface()
     except NoSurfaceError:
         return {
             f"mesh_{name}_{end}": 0.0 for end in THRESHOLDS for name in ("accuracy", "completeness", "fscore")
         }
-    return surface_scores(surface, known)
+    return surface_scores(made, known)
 
 
 def surface_scores(surface: Surface, views: Sequence[View]) -> dict[str, float]:

@@ -61,6 +61,7 @@ class ObjectErrors(msgspec.Struct, kw_only=True):
     diffuse_psnr: _Decibels
     stokes_error: float | None
     material: str | None = None
+    metal_share: float | None = None
 
 
 _VIEW = msgspec.defstruct("View", [*_fields(VIEW_METRICS), *_REASONS])

@@ -47,7 +47,7 @@ def score_view(
         target: what it is compared with, on the same device.
         rendered: an object with ``final`` [H, W, 3] linear, and, each None where the recipe has no such
             layer, ``normal`` [H, W, 3] world of any length, ``specular`` and ``diffuse`` [H, W, 3] linear
-            contributions to the final picture; ``depth`` and ``alpha`` [H, W] may be missing.
+            contributions to the final picture; ``depth``, ``alpha`` and ``metalness`` [H, W] may be missing.
         stokes: [3, H, W, 3] predicted Stokes vectors on the scale where the picture is S0/2; None: no prediction.
         in_front: [H, W] share of the weight before ``HAZE_DEPTH`` times the true depth; None: not measured.
         by_object: gets the view's errors added.
@@ -59,7 +59,7 @@ def score_view(
         ValueError: shapes that do not fit.
     """
     layers = {name: _plain(getattr(rendered, name)) for name in ("final", "normal", "specular", "diffuse")}
-    layers |= {name: _plain(getattr(rendered, name, None)) for name in ("depth", "alpha")}
+    layers |= {name: _plain(getattr(rendered, name, None)) for name in ("depth", "alpha", "metalness")}
     layers["polarization"] = None if stokes is None else _plain(stokes[1:].movedim(0, 2).flatten(2))
     layers["in_front"] = _plain(in_front)
     broken = torch.zeros_like(target.valid.mask)

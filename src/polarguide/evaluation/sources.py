@@ -17,6 +17,8 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 TRAINED_BY = ("training/trainer.py", "capture/reader.py", "raster/backends.py", "recipes/__init__.py")
 """What trains, and what makes its scene, backend and shading: with all that they import, they decide the result."""
+FIELDS_TRAINED_BY = ("neural/trainer.py",)
+"""What trains a field beside that."""
 SCORED_BY = ("evaluation/evaluate.py",)
 """What decides, beside that, the numbers of a finished training."""
 DATA = "recipes"
@@ -37,6 +39,12 @@ def training_digest(package: Path = PACKAGE) -> str:
 def scoring_digest(package: Path = PACKAGE) -> str:
     """The same for the code that renders and scores."""
     return digest_of(package, imported_files(package, TRAINED_BY + SCORED_BY))
+
+
+@lru_cache
+def field_digest(package: Path = PACKAGE) -> str:
+    """The same for the code that trains fields, which no other training depends on."""
+    return digest_of(package, imported_files(package, FIELDS_TRAINED_BY))
 
 
 def model_digest(kind: type) -> str:

@@ -12,7 +12,7 @@ from polarguide.experiments.results import Results
 from polarguide.options import PathLike, check_choice
 from polarguide.progress import SILENT, Reporter
 from polarguide.recipes.registry import ABLATIONS, ablations_of
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Method
 from polarguide.training.settings import TrainSettings
 
 
@@ -22,7 +22,7 @@ def ablate(
     out: PathLike,
     *,
     only: Sequence[str] = (),
-    reference: Sequence[str | Recipe] = (),
+    reference: Sequence[str | Method] = (),
     settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,

@@ -55,6 +55,7 @@ def collect(
             "jobs": comparison.options.parallel,
             "against": comparison.options.against,
             "background": comparison.settings.background,
+            "materials": comparison.settings.materials,
         },
         scenes=[
             {

@@ -25,7 +25,7 @@ from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.system import only_writer
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Method
 from polarguide.training.settings import TrainSettings
 
 LOCK = ".lock"
@@ -33,12 +33,13 @@ LOCK = ".lock"
 
 def compare(
     scenes: Sequence[PathLike],
-    recipes: Sequence[str | Recipe],
+    recipes: Sequence[str | Method],
     out: PathLike,
     *,
     settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     seeds_of: Mapping[str, int] = MappingProxyType({}),
+    steps_of: Mapping[str, int] = MappingProxyType({}),
     asked: str = "",
     reporter: Reporter = SILENT,
 ) -> Results:
@@ -57,6 +58,7 @@ def compare(
         settings: of each training; ``seed`` is the first of ``options.seeds``.
         options: how runs are trained, timed and shown.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
+        steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
         asked: the command line that asked, for the record, if not ``polarguide compare``.
         reporter: receives messages and progress.
 
@@ -73,11 +75,15 @@ def compare(
         options=options,
         out=Path(out),
         seeds_of=dict(seeds_of),
+        steps_of=dict(steps_of),
         asked=asked,
     )
     for name, count in seeds_of.items():
         check_choice("seeds_of", name, [recipe.name for recipe in comparison.recipes])
         check_count("seeds_of", count, 1, MOST_SEEDS)
+    for name, count in steps_of.items():
+        check_choice("steps", name, [recipe.name for recipe in comparison.recipes])
+        check_count("steps", count)
     if not scenes:
         raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
     refuse_scene(comparison.out)
@@ -100,11 +106,11 @@ def compare(
     return results
 
 
-def _checked_recipes(recipes: Sequence[str | Recipe]) -> tuple[Recipe, ...]:
+def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
     """The recipes as they are registered: runs are trained in other processes, which know recipes by name."""
     found = tuple(recipe_named(recipe if isinstance(recipe, str) else recipe.name) for recipe in recipes)
     for asked, known in zip(recipes, found, strict=True):
-        if isinstance(asked, Recipe) and asked != known:
+        if isinstance(asked, Method) and asked != known:
             raise PolarguideError(
                 "recipes",
                 expected=f"the registered recipe {known.name}",

@@ -101,8 +101,9 @@ class Child:
         """Pass on how far it is."""
         note = "" if isinstance(self._task, Training) else "scoring"
         row = last_row(self.job.folder / LOG)
-        if not note and row is not None and row.psnr is not None and row.gaussians is not None:
-            note = f"PSNR {row.psnr:.1f} dB  {row.gaussians:,} Gaussians"
+        if not note and row is not None and row.psnr is not None:
+            count = "" if row.gaussians is None else f"  {row.gaussians:,} Gaussians"
+            note = f"PSNR {row.psnr:.1f} dB{count}"
         self._advance(self.job.step(), note=note)
 
     def interrupt(self) -> None:

@@ -20,14 +20,15 @@ from polarguide.capture.background import without_surroundings
 from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.record import read_metrics
-from polarguide.evaluation.sources import model_digest, scoring_digest, training_digest
+from polarguide.evaluation.sources import field_digest, model_digest, scoring_digest, training_digest
 from polarguide.experiments.options import CompareOptions
 from polarguide.options import Exposures, SceneOptions, check_count
 from polarguide.progress import SILENT, Reporter
 from polarguide.recipes.registry import ablations_of
-from polarguide.runs.folder import CONFIGURATION, PLY, RunConfiguration
+from polarguide.runs.families import family_of
+from polarguide.runs.folder import CONFIGURATION, RunConfiguration, trained_steps
 from polarguide.runs.opened import read_scene
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import TrainSettings
 
 State = Literal["new", "begun", "trained", "done"]
@@ -42,17 +43,21 @@ class TableRow:
     """What a row of the tables is: a recipe, and the pictures that it gets.
 
     Attributes:
-        name: as the tables and the run folders call it.
+        name: as the tables and the run folders call it. steps: where that is not the others' number.
     """
 
     name: str
-    recipe: Recipe
+    recipe: Method
     exposures: Exposures = "captured"
+    steps: int | None = None
 
     @property
     def about(self) -> str:
         """In one line."""
-        return self.recipe.about if self.name == self.recipe.name else f"{self.recipe.name}, {self.exposures}"
+        about = (
+            self.recipe.about if self.name == self.recipe.name else f"{self.recipe.name}, {self.exposures}"
+        )
+        return about if self.steps is None else f"{about.removesuffix('.')}; {self.steps:,} steps."
 
 
 @dataclass(frozen=True)
@@ -65,15 +70,17 @@ class Comparison:
         options: how runs are trained, timed and shown.
         out: folder to write.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
+        steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
         asked: the command line that asked, if not ``polarguide compare``.
     """
 
     scenes: tuple[Path, ...]
-    recipes: tuple[Recipe, ...]
+    recipes: tuple[Method, ...]
     settings: TrainSettings
     options: CompareOptions
     out: Path
     seeds_of: Mapping[str, int] = field(default_factory=dict)
+    steps_of: Mapping[str, int] = field(default_factory=dict)
     asked: str = ""
 
     def __post_init__(self) -> None:
@@ -84,14 +91,21 @@ class Comparison:
         """What the tables compare, in their order."""
         words, recipes = self.options.exposures, self.recipes
         if not words:
-            return tuple(TableRow(r.name, r, self.settings.exposures) for r in recipes)
+            return tuple(
+                TableRow(r.name, r, self.settings.exposures, self.steps_of.get(r.name)) for r in recipes
+            )
         return tuple(
-            TableRow(word if len(recipes) == 1 else f"{recipe.name} {word}", _for(recipe, word), word)
+            TableRow(
+                word if len(recipes) == 1 else f"{recipe.name} {word}",
+                _for(recipe, word),
+                word,
+                self.steps_of.get(recipe.name),
+            )
             for recipe in recipes
             for word in words
         )
 
-    def seeds(self, recipe: Recipe) -> range:
+    def seeds(self, recipe: Method) -> range:
         """The seeds of a recipe."""
         first = self.settings.seed
         return range(first, first + self.seeds_of.get(recipe.name, self.options.seeds))
@@ -104,10 +118,12 @@ class Comparison:
         settings, options = self.settings, self.options
         words = ["polarguide", "compare", *map(str, self.scenes)]
         words += ["--recipes", *(recipe.name for recipe in self.recipes)]
-        words += ["--steps", str(settings.steps), "--seeds", str(options.seeds), "--out", str(self.out)]
+        words += ["--steps", str(settings.steps), *(f"{name}={n}" for name, n in self.steps_of.items())]
+        words += ["--seeds", str(options.seeds), "--out", str(self.out)]
         words += ["--downscale", str(options.downscale), "--transfer", options.transfer]
         words += ["--refractive-index", str(settings.refractive_index)]
         words += ["--background", settings.background, "--split", options.split]
+        words += [] if settings.materials == "auto" else ["--materials", settings.materials]
         words += ["--exposures", *options.exposures] if options.exposures else []
         return shlex.join(words)
 
@@ -140,7 +156,7 @@ class PlannedRun:
         return f"{self.scene.name}, {self.row.name}, seed {self.settings.seed}"
 
     @property
-    def recipe(self) -> Recipe:
+    def recipe(self) -> Method:
         """The method."""
         return self.row.recipe
 
@@ -155,7 +171,9 @@ class PlannedRun:
             return "done"
         # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
         moved = found.scene != str(self.scene.path.resolve())
-        return "trained" if (self.folder / PLY).exists() and not moved else "begun"
+        leaves = family_of(self.recipe).leaves
+        finished = (self.folder / leaves).exists() and trained_steps(self.folder) == self.settings.steps
+        return "trained" if finished and not moved else "begun"
 
     def metrics(self) -> dict[str, Any] | None:
         """The record of its scores, or None where there is no valid one by this version."""
@@ -227,7 +245,7 @@ def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[Plan
     ]
 
 
-def _for(recipe: Recipe, exposures: Exposures) -> Recipe:
+def _for(recipe: Method, exposures: Exposures) -> Method:
     """What is trained on such pictures: without any of polarization, the recipe without its terms, if there is one."""
     if exposures != "none":
         return recipe
@@ -237,12 +255,18 @@ def _for(recipe: Recipe, exposures: Exposures) -> Recipe:
 
 def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int) -> PlannedRun:
     recipe, options = row.recipe, comparison.options
-    settings = replace(comparison.settings, seed=seed, exposures=row.exposures)
+    steps = row.steps or comparison.settings.steps
+    settings = replace(comparison.settings, steps=steps, seed=seed, exposures=row.exposures)
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
-    code = f"{__version__} {training_digest()}{model_digest(type(recipe.shading))}"
+    code = f"{__version__} {training_digest()}{_own_digest(recipe)}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     folder = comparison.out / RUNS / scene.name / _folder_name(row.name) / f"{seed}-{key}"
     return PlannedRun(scene, row, settings, reading, folder)
+
+
+def _own_digest(recipe: Method) -> str:
+    """Of the code that trains this recipe and not others."""
+    return model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else field_digest()
 
 
 def _folder_name(name: str) -> str:

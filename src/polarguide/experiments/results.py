@@ -46,6 +46,7 @@ class Settings(TypedDict):
     jobs: int
     against: str | None
     background: str
+    materials: str
 
 
 class SceneRecord(TypedDict):
@@ -99,8 +100,10 @@ def read_results(path: Path) -> Results:
     """
     record = read_record(path, dict[str, Any], remedy=_REMEDY)
     settings = record.get("settings")
-    if isinstance(settings, dict):  # the first records lack it: all took surroundings to be there
-        record["settings"] = {"background": "scene", **settings}
+    if isinstance(
+        settings, dict
+    ):  # the first records lack them: surroundings were taken to be there, metals not sought
+        record["settings"] = {"background": "scene", "materials": "dielectric", **settings}
     if record.get("format") != FORMER:
         return validate_results(record, path)
     results = validate_results(_completed(record), path)

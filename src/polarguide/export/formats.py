@@ -24,11 +24,13 @@ from polarguide.export.share import share_page
 from polarguide.export.sog import write_sog
 from polarguide.export.spz import write_spz
 from polarguide.files import holds_files, make_folder, require_inside, temporary_folder, write_text
+from polarguide.neural.model import FieldModel
 from polarguide.options import ExportFormat, PathLike, check_choice, check_range
 from polarguide.presentation import balanced
 from polarguide.progress import SILENT, Reporter
-from polarguide.rendering.mesh import RESOLUTION, scene_mesh
+from polarguide.rendering.mesh import RESOLUTION, ColoredMesh, implicit_mesh, scene_mesh
 from polarguide.rendering.relight import needs_radiance, panorama, write_exr
+from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.point_cloud import write_run_ply
 from polarguide.shading.gbuffer import render
@@ -39,6 +41,8 @@ from polarguide.visualization import figures
 TRANSFORMS = "transforms.json"
 
 PANORAMA_HEIGHT = 512
+SPLATS = ("ply", "spz", "sog", "points")
+"""Formats of Gaussians."""
 
 
 def export(
@@ -85,6 +89,8 @@ def export(
     check_choice("format", format, writers)
     check_range("resolution", resolution, 16, 1024)
     check_range("spz_version", spz_version, 3, 4)
+    if format in SPLATS:
+        run.gaussian_model(f"format {format}")
     shown = _Shown(run)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
@@ -113,14 +119,16 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         raise PolarguideError(
             "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
         )
+    model = run.gaussian_model("share")
     shown = _Shown(run)
+    assert shown.gaussians is not None
     views = run.scene.test_views + run.scene.train_views
     scored = (run.folder / METRICS_FILE).exists()
     scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
     page = share_page(
         shown.gaussians,
-        run.model.light,
-        run.model.shading,
+        model.light,
+        model.shading,
         {view.name: view.camera for view in views},
         first=views[0].name,
         title=title or shown.presentation.title or run.scene.name,
@@ -145,10 +153,12 @@ class _Shown:
 
     def __init__(self, run: OpenedRun) -> None:
         self.presentation = run.presentation
-        self.gaussians: Parameters = run.model.state.gaussians
+        model = run.model
+        gaussians = model.state.gaussians if isinstance(model, GaussianModel) else None
+        self.gaussians: Parameters | None = gaussians
         self.kept: Tensor | None = None
-        if (crop := self.presentation.crop) is not None:
-            self.kept = crop.inside(self.gaussians["means"].detach(), run.camera_frame)
+        if gaussians is not None and (crop := self.presentation.crop) is not None:
+            self.kept = crop.inside(gaussians["means"].detach(), run.camera_frame)
             if not bool(self.kept.any()):
                 raise PolarguideError(
                     "the crop box",
@@ -156,8 +166,7 @@ class _Shown:
                     found=f"none of {len(self.kept)}",
                     remedy="Move it: polarguide present RUN --crop, or in polarguide view.",
                 )
-            names = run.model.state.gaussians.names
-            self.gaussians = {name: self.gaussians[name].detach()[self.kept] for name in names}
+            self.gaussians = {name: gaussians[name].detach()[self.kept] for name in gaussians.names}
         around = run.frame if self.presentation.up_axis is not None else None
         self.placement = Placement.of(self.presentation, around)
         scene = run.configuration.scene_digest[:12]
@@ -172,7 +181,8 @@ class _Shown:
 def _ply(run: OpenedRun, shown: _Shown, path: Path, placement: Placement | None = None) -> Path:
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
-        write_run_ply(whole, run.model.state, run.model.shading, _camera_centers(run))
+        model = run.gaussian_model("format ply")
+        write_run_ply(whole, model.state, model.shading, _camera_centers(run))
         kept = None if shown.kept is None else shown.kept.cpu()
         rewrite_splats(path, whole, placement or shown.placement, kept, shown.comments)
     return path
@@ -212,21 +222,10 @@ def _sog(run: OpenedRun, shown: _Shown, path: Path) -> Path:
 
 
 def _mesh(run: OpenedRun, shown: _Shown, folder: Path, resolution: int, reporter: Reporter) -> list[Path]:
-    model = run.model
-
-    def seen(camera: Camera) -> RenderResult:
-        return render(
-            shown.gaussians,
-            camera,
-            model.backend.rasterize,
-            shading=model.shading,
-            light=model.light,
-            normals=True,
-            depth=True,
-        )
-
-    with torch.no_grad():
-        mesh = scene_mesh(run.cameras, seen, resolution=resolution)
+    if isinstance(run.model, FieldModel):
+        mesh = implicit_mesh(run.cameras, run.model, resolution=resolution)
+    else:
+        mesh = _fused(run, shown, resolution)
     if (crop := shown.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
@@ -237,8 +236,30 @@ def _mesh(run: OpenedRun, shown: _Shown, folder: Path, resolution: int, reporter
     return paths
 
 
+def _fused(run: OpenedRun, shown: _Shown, resolution: int) -> ColoredMesh:
+    """The mesh of Gaussians."""
+    model = run.gaussian_model("format mesh")
+    gaussians = shown.gaussians
+    assert gaussians is not None
+
+    def seen(camera: Camera) -> RenderResult:
+        return render(
+            gaussians,
+            camera,
+            model.backend.rasterize,
+            shading=model.shading,
+            light=model.light,
+            normals=True,
+            depth=True,
+        )
+
+    with torch.no_grad():
+        return scene_mesh(run.cameras, seen, resolution=resolution)
+
+
 def _points(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
-    path, model, placement = folder / "points.ply", run.model, shown.placement
+    path, model, placement = folder / "points.ply", run.gaussian_model("format points"), shown.placement
+    assert shown.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
     places, normals, colors = surface_points(shown.gaussians, model.shading, views, rasterize)
     write_points(path, placement.points(places), placement.directions(normals), colors, shown.comments)

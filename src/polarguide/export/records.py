@@ -11,6 +11,7 @@ texel content
 2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; side u16 (1: the axis points outward)
 3-5   ``harmonics`` of degrees 1 to 3, 45 signed bytes in steps of their scale; or ``features`` 4 x i16 in texel 3
 6-9   light of its own: ``own_color`` of degree 0 3 x f16, scale f16; then ``own_harmonics`` as above
+10    ``metal``: reflectance 3 x f16, roughness f16; 0 of what is no metal
 ===== ==================================================================================================
 
 The harmonics' scale is each Gaussian's own: the largest of its 45 values is 127 steps. A shading model says which of
@@ -49,6 +50,7 @@ SLOTS = {
     "own_color": (96, "3<f2"),
     "own_harmonics_scale": (102, "<f2"),
     "own_harmonics": (112, "45i1"),
+    "metal": (160, "4<f2"),
 }
 """First byte and NumPy type of what a record can hold; a shading model gives ``share`` and what has a color."""
 

@@ -47,7 +47,7 @@ SHADERS = {
     "light": "light.glsl",
     "shade": "shade.frag",
 }
-LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal")
+LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal", "metalness")
 """Layers that the page can show, in its order."""
 BAKED = (
     "This page has no shaders for the reflections of this model. Each Gaussian shows its color toward the eye, with "
@@ -89,7 +89,9 @@ def share_page(
         "kind": page.kind,
         "texels": quantized.itemsize // TEXEL,
         "count": len(quantized),
-        "layers": [name for name in LAYERS if name in layers],
+        "layers": [
+            name for name in LAYERS if name in layers and (name != "metalness" or "metal" in page.values)
+        ],
         "index": 1.5,
         "resolution": int(page.light[0].shape[1]) if page.light else 1,
         "levels": max(1, len(page.light)),

@@ -29,6 +29,8 @@ class Densification:
             is the interval of the opacity resets. large_minimum: and never before this step.
         pixels_each: least number of pixels, of all training pictures, for each Gaussian. A Gaussian has some sixty
             parameters and a pixel three values: with fewer than twenty pixels each, unknowns outnumber data.
+        faint_pixels: Gaussians go, once, when the density control ends, whose blending weights add up to less than this
+            in every training picture: three in ten, which cost time and show nothing. 0: none goes.
     """
 
     every: int = 100
@@ -40,6 +42,7 @@ class Densification:
     large_from: float = 0.1
     large_minimum: int = 700
     pixels_each: float = 20.0
+    faint_pixels: float = 0.0
 
     def prunes_large(self, step: int, steps: int) -> bool:
         """Whether a round after a number of steps, of ``steps`` in all, prunes huge Gaussians."""

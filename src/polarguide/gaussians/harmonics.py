@@ -99,8 +99,9 @@ class _Harmonics(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         means, center, dc, rest = ctx.saved_tensors
-        to_dc, to_rest = torch.empty_like(dc), torch.empty_like(rest)
+        to_dc = torch.empty_like(dc)
         to_means = torch.empty_like(means) if ctx.needs_input_grad[0] else None
+        to_rest = torch.empty_like(rest) if ctx.needs_input_grad[3] else None
         _native.harmonics_backward(
             ctx.degree, means, center, dc, rest, grad.contiguous(), to_means, to_dc, to_rest
         )

@@ -15,9 +15,10 @@ from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
+from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.pictures import decode_picture, read_file
-from polarguide.capture.layout import Layout, find_layout, require_four, select_views
+from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import applied_calibration, refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
@@ -30,16 +31,17 @@ LONGEST = 640
 
 @dataclass(frozen=True, eq=False)
 class InspectedView:
-    """The four pictures of a view, and its pose if it has one.
+    """The pictures of a view, four mostly, and its pose if it has one.
 
     Attributes:
         name: of the view.
-        codes: linear intensities as in ``View.codes``, [4, H, W, 3] uint16.
+        codes: linear intensities as in ``View.codes``, [K, H, W, 3] uint16.
         invalid, saturated: as in ``View``, [H, W] bool.
         black: pixels that are 0 in all angles; they count as ``saturated``, too.
         camera: at the size of ``codes``, or None.
         measures: what ``capture.checks`` measures on them.
         peak: largest stored value.
+        exposures: what the pictures are.
     """
 
     name: str
@@ -50,9 +52,10 @@ class InspectedView:
     camera: Camera | None
     measures: checks.Measures
     peak: int
+    exposures: tuple[Exposure, ...] = FOUR
 
     def intensities(self) -> Tensor:
-        """Linear intensities in [0, 1] at 0, 45, 90, 135 degrees, as the files say: [4, H, W, 3] float32."""
+        """Linear intensities in [0, 1], at 0, 45, 90, 135 degrees mostly, as the files say: [K, H, W, 3] float32."""
         return self.codes.to(torch.float32) / FULL_CODE
 
     @property
@@ -90,6 +93,11 @@ class Capture:
     digest: str
 
     @property
+    def four(self) -> bool:
+        """Whether every view has its four pictures at 0, 45, 90 and 135 degrees."""
+        return all(view.exposures == FOUR for view in self.views)
+
+    @property
     def posed(self) -> tuple[InspectedView, ...]:
         """The views with a pose."""
         return tuple(view for view in self.views if view.camera is not None)
@@ -116,7 +124,6 @@ def read_capture(
     check_transfer(transfer)
     root = Path(path)
     layout = find_layout(root)
-    require_four(layout, "inspection")
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
@@ -141,7 +148,7 @@ def read_capture(
 
 
 def _fitting_factor(layout: Layout, name: str) -> int:
-    path = next(iter(layout.pictures[name].values()))
+    path = layout.files(name)[0]
     height, width = decode_picture(path, read_picture(path)).shape[:2]
     return max(1, math.ceil(max(height, width) / LONGEST))
 
@@ -157,4 +164,5 @@ def _inspected(stored: StoredViews, number: int) -> InspectedView:
         camera=stored.cameras[number],
         measures=stored.measures[number],
         peak=int(item.peak.max()),
+        exposures=item.exposures,
     )

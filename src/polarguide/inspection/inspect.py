@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from polarguide.capture import load_scene
+from polarguide.capture import Scene, load_scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, require_inside
@@ -23,11 +23,12 @@ from polarguide.inspection.capture import Capture, InspectedView, read_capture
 from polarguide.inspection.dielectric import dielectric_check
 from polarguide.inspection.likelihood import Evidence
 from polarguide.inspection.measurements import ViewMeasurements, measure_view
-from polarguide.inspection.picture_checks import find_pairing, picture_checks
+from polarguide.inspection.picture_checks import find_pairing, light_checks, picture_checks
 from polarguide.inspection.points import point_evidence
 from polarguide.inspection.pose_checks import coverage_check, pose_check
 from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.short_run import LONGEST, short_run, surface_of
+from polarguide.inspection.shots import ShotFindings, find_shots, pictures_check, shot_checks
 from polarguide.inspection.surfaces import Surface, SurfaceSamples, normal_evidence, sample_surfaces
 from polarguide.inspection.verdict import Check, Verdict, worst
 from polarguide.progress import SILENT, Reporter
@@ -46,7 +47,8 @@ class Inspection:
 
     Attributes:
         capture: what was inspected. settings: how. index: the refractive index that was used.
-        readings: of each view. checks: in the order in which they are shown. angles: order, sense and zero.
+        measurements: of each view. checks: in the order in which they are shown.
+        angles: order, sense and zero; of a capture with other pictures, what each tells of its polarizer.
     """
 
     capture: Capture
@@ -54,7 +56,7 @@ class Inspection:
     index: float
     measurements: tuple[ViewMeasurements, ...]
     checks: tuple[Check, ...]
-    angles: AngleFindings
+    angles: AngleFindings | ShotFindings
 
     @property
     def verdict(self) -> Verdict:
@@ -97,6 +99,13 @@ def inspect_scene(
     """
     check_options(settings)
     capture = read_capture(path, downscale=settings.downscale, transfer=settings.transfer, reporter=reporter)
+    if settings.calibration is not None and not capture.four:
+        raise PolarguideError(
+            "--calibration",
+            expected="a scene with four pictures of each view",
+            found="one with other pictures",
+            remedy="Leave --calibration out.",
+        )
     if settings.calibration is not None:
         capture = corrected(capture, settings.calibration)
     index = settings.refractive_index or capture.refractive_index or 1.5
@@ -105,6 +114,9 @@ def inspect_scene(
         for view in capture.views:
             measurements.append(measure_view(view, index))
             advance(len(measurements))
+    if not capture.four:
+        checks, shots = _shots(capture, measurements, out, settings, backend, reporter)
+        return Inspection(capture, settings, index, tuple(measurements), tuple(checks), shots)
     pairing = find_pairing(capture)
     checks = picture_checks(capture, measurements, pairing)
     calibrated = analyzer_check(capture, settings.calibration)
@@ -115,6 +127,38 @@ def inspect_scene(
     checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
     checks.append(dielectric_check(measurements, pixels, index))
     return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
+
+
+def _shots(
+    capture: Capture,
+    measurements: Sequence[ViewMeasurements],
+    out: Path,
+    settings: InspectSettings,
+    backend: Backend,
+    reporter: Reporter,
+) -> tuple[list[Check], ShotFindings]:
+    """The checks of a capture with other pictures than four angles a view, and what these tell of their polarizers."""
+    checks = [pictures_check(capture), *light_checks(capture, measurements)]
+    with reporter.track("matching features", 1):
+        checks += [pose_check(capture), coverage_check(capture)]
+    if len(capture.posed) < FEWEST_TO_TRAIN:
+        why = f"The angles are checked by a short training, which takes {FEWEST_TO_TRAIN} views with a pose."
+        found = ShotFindings(why=why)
+    elif settings.normals == "points":
+        found = ShotFindings(
+            why="The angles are checked by a short training, which --normals points leaves out."
+        )
+    else:
+        scene = _training_scene(capture, settings, reporter, held_out=())
+        with reporter.track("short training", settings.steps) as advance:
+            found = find_shots(
+                scene,
+                out / RUN_FOLDER,
+                steps=settings.steps,
+                backend=backend,
+                on_step=lambda report: advance(min(report.step + 1, settings.steps)),
+            )
+    return checks + shot_checks(found), found
 
 
 def _angles(
@@ -147,15 +191,8 @@ def _angles(
 def _trained_pixels(
     capture: Capture, out: Path, settings: InspectSettings, pairing: int, backend: Backend, reporter: Reporter
 ) -> SurfaceSamples:
-    factor = max(1, math.ceil(max(capture.size) / LONGEST))
     names = [view.name for view in capture.posed]
-    scene = load_scene(
-        capture.root, downscale=factor, transfer=settings.transfer, views=names, reporter=reporter
-    )
-    if not scene.train_views:
-        raise PolarguideError(
-            capture.root, expected="views to train on", found="none", remedy="Use --normals points."
-        )
+    scene = _training_scene(capture, settings, reporter)
     with reporter.track("short training", settings.steps) as advance:
         state = short_run(
             scene,
@@ -172,3 +209,24 @@ def _trained_pixels(
                 advance(done + 1)
 
         return sample_surfaces(surfaces(), pairing)
+
+
+def _training_scene(
+    capture: Capture, settings: InspectSettings, reporter: Reporter, held_out: Sequence[str] | None = None
+) -> Scene:
+    """The views with a pose at the size of a short training; ``held_out``: those to leave out, None: as ever."""
+    factor = max(1, math.ceil(max(capture.size) / LONGEST))
+    names = [view.name for view in capture.posed]
+    scene = load_scene(
+        capture.root,
+        downscale=factor,
+        transfer=settings.transfer,
+        views=names,
+        test_views=held_out,
+        reporter=reporter,
+    )
+    if not scene.train_views:
+        raise PolarguideError(
+            capture.root, expected="views to train on", found="none", remedy="Use --normals points."
+        )
+    return scene

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,16 +55,42 @@ LAYERS: tuple[Layer, ...] = (
 )  # fmt: skip
 
 
-def layer_uris(view: InspectedView) -> dict[str, str]:
-    """All layers of a view as data URIs, by key."""
+SHOT_LAYERS: tuple[Layer, ...] = (
+    Layer("s0", "Picture", "Mean of the view's pictures in sRGB; its 99th percentile is white.", None,
+          lambda r: f"{r.exposures}; 99 % under {r.bright:.2f}"),
+    Layer("saturation", "Saturation", "Red: one picture at full scale. Blue: marked invalid, or black.", None,
+          lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
+)  # fmt: skip
+"""Of captures with other pictures than four angles a view."""
+
+
+def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
+    """Layers of a view as data URIs, by key."""
+    return {layer.key: data_uri(picture, layer.key, SIDE) for layer, picture in _drawn(view, layers)}
+
+
+def _drawn(view: InspectedView, layers: Sequence[Layer]) -> Iterator[tuple[Layer, Picture]]:
+    pictures = _shot_pictures(view) if layers is SHOT_LAYERS else _pictures(view)
+    return ((layer, pictures[layer.key]) for layer in layers)
+
+
+def _shot_pictures(view: InspectedView) -> dict[str, Picture]:
+    shown = _shown(view.intensities().mean(dim=0))
+    return {"s0": shown, "saturation": _marked(shown, view)}
+
+
+def _shown(photograph: Tensor) -> Picture:
+    return figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
+
+
+def _pictures(view: InspectedView) -> dict[str, Picture]:
     intensities = view.intensities()
     gray = intensities.mean(dim=-1)
     stokes = optics.stokes(gray)
     s0, degree = stokes[0].clamp(min=1e-6), optics.dolp(stokes)
-    photograph = intensities.mean(dim=0)
-    shown = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
+    shown = _shown(intensities.mean(dim=0))
     excess = (gray[0] + gray[2] - gray[1] - gray[3]).abs() / s0
-    pictures: dict[str, Picture] = {
+    return {
         "s0": shown,
         "dolp": figures.dolp_to_rgb(degree, DOLP_HIGH),
         "aolp": figures.aolp_to_rgb(optics.aolp(stokes), degree / AOLP_FULL_DOLP),
@@ -72,7 +98,6 @@ def layer_uris(view: InspectedView) -> dict[str, str]:
         "noise": figures.scalar_to_rgb(optics.intensity_noise(gray) / (s0 / 2), 0.0, NOISE_HIGH),
         "consistency": figures.scalar_to_rgb(excess, 0.0, EXCESS_HIGH, "magma"),
     }
-    return {key: data_uri(picture, key, SIDE) for key, picture in pictures.items()}
 
 
 def _marked(shown: Picture, view: InspectedView) -> Picture:

@@ -9,12 +9,15 @@ import numpy as np
 from torch import Tensor
 
 from polarguide import optics
+from polarguide.capture.exposures import FOUR
 from polarguide.inspection.capture import InspectedView
 
 DARK = 1.0 / 256.0
 """Mean intensity below which a pixel is too dark to be used."""
 POLARIZED = 0.05
 """DoLP from which a pixel counts as polarized."""
+OF_FOUR = ("noise", "noise_share", "pair_ratio", "sum_error", "dolp", "polarized", "above_limit")
+"""What only four angles of a view tell."""
 _QUANTILE_SAMPLES = 200_000
 
 
@@ -34,6 +37,8 @@ class ViewMeasurements:
         dolp: quantiles 0.5 and 0.99 of the DoLP.
         polarized: share with a DoLP over 0.05 and over three times its noise.
         above_limit: share with a DoLP over the limit of diffuse light by three times its noise.
+        exposures: the angles of its pictures where they are not 0, 45, 90 and 135 degrees; then noise and all that
+            follows from four angles is not measured.
     """
 
     view: str
@@ -48,10 +53,14 @@ class ViewMeasurements:
     dolp: tuple[float, float] = (0.0, 0.0)
     polarized: float = 0.0
     above_limit: float = 0.0
+    exposures: str = ""
 
     def record(self) -> dict[str, Any]:
         """As plain JSON types."""
-        return {**vars(self), "dolp": {"median": self.dolp[0], "p99": self.dolp[1]}}
+        measured = {**vars(self), "dolp": {"median": self.dolp[0], "p99": self.dolp[1]}}
+        if self.exposures:
+            return {key: None if key in OF_FOUR else value for key, value in measured.items()}
+        return measured
 
 
 def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
@@ -62,18 +71,19 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
         index: refractive index.
     """
     gray = view.intensities().mean(dim=-1)
-    stokes = optics.stokes(gray)
     dark = gray.mean(dim=0) < DARK
     good = view.usable & ~dark
     share = float(good.float().mean())
-    noise = optics.intensity_noise(gray)
     bright = quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
     # Black is no fault: prepare marks it invalid, because nothing can be read from it.
     lost = (view.saturated & ~view.black, view.invalid & ~dark, dark)
     saturated, invalid, black = (float(mask.float().mean()) for mask in lost)
     nothing = ViewMeasurements(view.name, bright, saturated, invalid, black)
+    if view.exposures != FOUR:
+        return replace(nothing, exposures=", ".join(exposure.words for exposure in view.exposures))
     if share < 0.001:
         return nothing
+    stokes, noise = optics.stokes(gray), optics.intensity_noise(gray)
     i0, i45, i90, i135 = (angle[good] for angle in gray)
     s0 = stokes[0][good]
     degree, spread = optics.dolp(stokes)[good], optics.dolp_noise(stokes, noise)[good]

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import html
 import math
+from collections.abc import Sequence
 from string import Template
 
 import torch
 
 from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.inspect import Inspection
-from polarguide.inspection.layers import LAYERS, layer_uris
+from polarguide.inspection.layers import LAYERS, SHOT_LAYERS, Layer, layer_uris
 from polarguide.inspection.measurements import ViewMeasurements
+from polarguide.inspection.shots import ShotFindings
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.progress import SILENT, Reporter
 from polarguide.visualization import figures
@@ -35,36 +37,37 @@ def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
         reporter: receives the progress.
     """
     capture = found.capture
+    layers = LAYERS if capture.four else SHOT_LAYERS
     marked = {name for check in found.checks for name in check.views}
     tiles = []
     with reporter.track("drawing", len(capture.views)) as advance:
         for view, measured in zip(capture.views, found.measurements, strict=True):
-            tiles.append(_tile(layer_uris(view), measured, view.name in marked))
+            tiles.append(_tile(layer_uris(view, layers), layers, measured, view.name in marked))
             advance(len(tiles))
     posed = f"{len(capture.posed)} with a pose" if capture.model is not None else "no poses"
     width, height = capture.size
     return Template(page_part(__package__, "inspection.html")).substitute(
         policy=content_policy(),
         title=html.escape(f"Inspection of {capture.name}"),
-        style=Template(page_part(__package__, "inspection.css")).substitute(switching=_switching()),
+        style=Template(page_part(__package__, "inspection.css")).substitute(switching=_switching(layers)),
         summary=html.escape(f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}"),
         overall=found.verdict,
         overall_class=_CLASSES[found.verdict],
         checks="".join(map(_check_row, found.checks)),
-        angles=_angles(found.angles),
+        angles=_angles(found.angles) if isinstance(found.angles, AngleFindings) else _shots(found.angles),
         inputs="".join(
             f'<input type="radio" name="layer" id="layer-{layer.key}"{" checked" if not k else ""}>'
-            for k, layer in enumerate(LAYERS)
+            for k, layer in enumerate(layers)
         ),
-        labels="".join(f'<label for="layer-{layer.key}">{html.escape(layer.label)}</label>' for layer in LAYERS),
-        legends=_legends(),
+        labels="".join(f'<label for="layer-{layer.key}">{html.escape(layer.label)}</label>' for layer in layers),
+        legends=_legends(layers),
         tiles="".join(tiles),
         figures=_figures(found.measurements),
         facts=_facts(found),
     )  # fmt: skip
 
 
-def _switching() -> str:
+def _switching(layers: Sequence[Layer]) -> str:
     """CSS rules that show the layer of the selected radio button."""
     return "\n".join(
         f"#layer-{layer.key}:checked ~ .tiles .{layer.key} {{ display: block; }}\n"
@@ -73,7 +76,7 @@ def _switching() -> str:
         "{ background: var(--accent); color: #fff; }\n"
         f"#layer-{layer.key}:focus-visible ~ .switch label[for=layer-{layer.key}] "
         "{ outline: 2px solid var(--accent); outline-offset: 2px; }"
-        for layer in LAYERS
+        for layer in layers
     )
 
 
@@ -116,9 +119,29 @@ def _angles(angles: AngleFindings) -> str:
     )
 
 
-def _legends() -> str:
+def _shots(found: ShotFindings) -> str:
+    if found.why:
+        return f"<p>{html.escape(found.why)}</p>"
+    rows = []
+    for judgment, said in zip(found.judgments, found.said, strict=True):
+        tells = "without a filter, as it looks" if judgment.unfiltered else f"{judgment.angle:.0f}°"
+        tells = "too little polarization to tell" if judgment.vague else tells
+        rows.append(
+            f"<tr><th>{html.escape(judgment.view)}</th><td>{html.escape(said.words)}</td><td>{tells}</td>"
+            f"<td>{judgment.spread:.1f}°</td><td>{judgment.certainty:.2f}</td><td>{judgment.gain:.2f}</td></tr>"
+        )
+    return (
+        "<p>A short training that was told no angle found these. It is good to a few degrees; training itself finds "
+        'unknown angles more exactly.</p><details><summary>All pictures</summary><table class="odds"><thead><tr>'
+        "<th>view</th><th>said</th><th>found</th><th>spread</th><th>certainty</th><th>gain</th></tr></thead><tbody>"
+        + "".join(rows)
+        + "</tbody></table></details>"
+    )
+
+
+def _legends(layers: Sequence[Layer]) -> str:
     parts = []
-    for layer in LAYERS:
+    for layer in layers:
         bar = ""
         if layer.ramp is not None:
             stops = figures.color_gradient(layer.ramp)
@@ -150,11 +173,11 @@ def aolp_wheel() -> str:
     return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by color">{drawing}</svg>'
 
 
-def _tile(uris: dict[str, str], measured: ViewMeasurements, marked: bool) -> str:
+def _tile(uris: dict[str, str], layers: Sequence[Layer], measured: ViewMeasurements, marked: bool) -> str:
     name = html.escape(measured.view)
-    captions = "".join(f'<span class="{la.key}">{html.escape(la.caption(measured))}</span>' for la in LAYERS)
+    captions = "".join(f'<span class="{la.key}">{html.escape(la.caption(measured))}</span>' for la in layers)
     pictures = "".join(
-        f'<img class="{la.key}" src="{uris[la.key]}" alt="{name}, {html.escape(la.label)}">' for la in LAYERS
+        f'<img class="{la.key}" src="{uris[la.key]}" alt="{name}, {html.escape(la.label)}">' for la in layers
     )
     kind = "tile marked" if marked else "tile"
     return f'<figure class="{kind}"><figcaption><b>{name}</b>{captions}</figcaption>{pictures}</figure>'
@@ -163,6 +186,8 @@ def _tile(uris: dict[str, str], measured: ViewMeasurements, marked: bool) -> str
 def _figures(measurements: tuple[ViewMeasurements, ...]) -> str:
     heads = ("view", "99 % under", "saturated", "invalid", "dark", "noise", "pair ratio", "sum error", "DoLP median",
              "DoLP 99 %", "polarized", "above diffuse limit")  # fmt: skip
+    if any(r.exposures for r in measurements):
+        return _shot_figures(measurements)
     rows = []
     for r in measurements:
         ratio = "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}"
@@ -172,6 +197,21 @@ def _figures(measurements: tuple[ViewMeasurements, ...]) -> str:
         rows.append(
             f"<tr><th>{html.escape(r.view)}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
         )
+    return _table(heads, rows)
+
+
+def _shot_figures(measurements: tuple[ViewMeasurements, ...]) -> str:
+    rows = []
+    for r in measurements:
+        cells = (r.exposures or "0, 45, 90, 135", f"{r.bright:.3f}", f"{r.saturated:.2%}", f"{r.invalid:.2%}",
+                 f"{r.dark:.2%}")  # fmt: skip
+        rows.append(
+            f"<tr><th>{html.escape(r.view)}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        )
+    return _table(("view", "pictures", "99 % under", "saturated", "invalid", "dark"), rows)
+
+
+def _table(heads: Sequence[str], rows: Sequence[str]) -> str:
     head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
     return f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
 

@@ -27,6 +27,9 @@ LITTLE, ALMOST_NONE = 0.05, 0.005
 NOISY = 0.03
 """Noise of one intensity as a share of S0 / 2: three times its DoLP noise is then 0.13."""
 
+DARK = 0.01
+"""99th percentile of the values below which a view is dark."""
+
 
 def find_pairing(capture: Capture) -> int | None:
     """The pairs of perpendicular pictures by their sums, an index into ``PAIRINGS``; None if they do not decide."""
@@ -52,6 +55,11 @@ def picture_checks(
         _noise(measurements),
         _polarization(measurements),
     ]
+
+
+def light_checks(capture: Capture, measurements: Sequence[ViewMeasurements]) -> list[Check]:
+    """Those of them that pictures at any angle carry: saturation and brightness."""
+    return [_saturation(capture, measurements), _brightness(measurements)]
 
 
 def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
@@ -158,7 +166,7 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
     share, bright = (
         float(np.median([getattr(r, k) for r in measurements])) for k in ("noise_share", "bright")
     )
-    off = tuple(r.view for r in measurements if r.noise_share > NOISY or r.bright < 0.01)
+    off = tuple(r.view for r in measurements if r.noise_share > NOISY or r.bright < DARK)
     said = (
         f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), so that a DoLP "
         f"of {3 * 2**0.5 * share / 2:.3f} is three times its noise; "
@@ -167,10 +175,23 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
     figures = {"noise_share": share, "bright": bright}
     if not off:
         return Check(key, title, "ok", said, figures=figures)
-    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < 0.01 else "warning"
+    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < DARK else "warning"
     return Check(
         key, title, verdict, f"{said} Dark or noisy: {len(off)} views ({listed(list(off))}).",
         "Use a longer exposure at the lowest gain, or average several shots.", off, figures,
+    )  # fmt: skip
+
+
+def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:
+    key, title = "brightness", "Brightness"
+    bright = float(np.median([r.bright for r in measurements]))
+    said = f"The 99th percentile of the values is {bright:.0%} of full scale (median view)."
+    off = tuple(r.view for r in measurements if r.bright < DARK)
+    if not off:
+        return Check(key, title, "ok", said, figures={"bright": bright})
+    return Check(
+        key, title, "wrong" if 2 * len(off) > len(measurements) else "warning",
+        f"{said} Dark: {len(off)} views ({listed(list(off))}).", "Use a longer exposure.", off, {"bright": bright},
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ import torch
 
 from polarguide import __version__
 from polarguide.capture import Scene, View
+from polarguide.capture.exposures import FOUR
 from polarguide.errors import PolarguideError
 from polarguide.files import write_text
 from polarguide.inspection.surfaces import Surface
@@ -26,6 +27,7 @@ from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.shading.gbuffer import render
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
+from polarguide.training.recipe import Recipe
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import StepReport, Trainer, TrainSettings
 from polarguide.vectors import dot, unit
@@ -48,6 +50,8 @@ def photograph_digest(scene: Scene) -> str:
         digest.update(view.invalid.numpy().tobytes())
         digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
         digest.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
+        if view.exposures != FOUR:
+            digest.update(repr(view.exposures).encode())
     return digest.hexdigest()
 
 
@@ -58,6 +62,8 @@ def short_run(
     steps: int,
     backend: Backend,
     on_step: Callable[[StepReport], None],
+    recipe: Recipe | None = None,
+    until: int = 0,
 ) -> TrainingState:
     """Train, or go on, or take what is there.
 
@@ -67,24 +73,30 @@ def short_run(
         steps: optimizer steps.
         backend: device and rasterizer.
         on_step: called after every step.
+        recipe: what trains; None: ``RECIPE``.
+        until: the step to stop after; 0: the last.
     """
-    recipe = recipe_named(RECIPE)
+    if recipe is None:
+        named = recipe_named(RECIPE)
+        assert isinstance(named, Recipe)
+        recipe = named
     wanted = {
         "photographs": photograph_digest(scene),
         "steps": steps,
-        "recipe": RECIPE,
+        "recipe": recipe.name,
         "version": __version__,
     }
+    until = until or steps
     state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
-    trainer = Trainer(scene, recipe, TrainSettings(steps, 0), backend, state)
+    trainer = Trainer(scene, recipe, TrainSettings(steps, 0, begin_again=False), backend, state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)
         write_text(folder / KEY, json.dumps(wanted))
     try:
-        while trainer.state.step < steps:
+        while trainer.state.step < until:
             on_step(trainer.step())
-            if trainer.state.step % SAVE_EVERY == 0 or trainer.state.step == steps:
+            if trainer.state.step % SAVE_EVERY == 0 or trainer.state.step == until:
                 save_checkpoint(folder, trainer.state)
     except KeyboardInterrupt:
         if trainer.whole:

@@ -6,6 +6,12 @@ polarization, normal and grazing incidence).
 
 from polarguide.optics.analyzers import Mount, analyzer, filter_analyzer, fitted_stokes
 from polarguide.optics.chromatic import ChromaticNormals, chromatic_normals
+from polarguide.optics.conductor import (
+    conductor,
+    conductor_dolp_slope,
+    conductor_index,
+    conductor_reflectances,
+)
 from polarguide.optics.frames import azimuth, lens_frame, normal_from_angles, zenith
 from polarguide.optics.fresnel import (
     brewster,
@@ -56,6 +62,10 @@ __all__ = [
     "azimuth",
     "brewster",
     "chromatic_normals",
+    "conductor",
+    "conductor_dolp_slope",
+    "conductor_index",
+    "conductor_reflectances",
     "diffuse_dolp",
     "diffuse_dolp_limit",
     "diffuse_zenith",

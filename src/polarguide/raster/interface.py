@@ -4,7 +4,7 @@
 a scene, and knows nothing of colors: base color, normal, strength or depth are channels like any other.
 
 Definition, the same in every backend up to the differences that the backend's module names: EWA projection of the
-covariance (Zwicker et al. 2001; Kerbl et al. 2023, Eq. 5) with 0.3 px^2 added, alpha = min(0.99, opacity *
+covariance (Zwicker et al. 2001; Kerbl et al. 2023, Eq. 5) with 0.1 px^2 added (there 0.3), alpha = min(0.99, opacity *
 exp(-d^T conic d / 2)), contributions with alpha < 1/255 dropped, a pixel ends before the Gaussian that would bring
 its transmittance below 1e-4, front to back in order of camera depth (ties: by index). Behind the last Gaussian is 0.
 """
@@ -20,7 +20,7 @@ from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 
 NEAR_PLANE = 0.01
-BLUR = 0.3
+BLUR = 0.1
 MINIMUM_ALPHA = 1.0 / 255.0
 MAXIMUM_ALPHA = 0.99
 MINIMUM_TRANSMITTANCE = 1e-4

@@ -67,6 +67,7 @@ RECIPE_POLARGUIDE: Recipe = replace(
         final_rates=_SLOW,
     ),
     hold_normals=True,
+    densification=replace(RECIPE_3DGS_DR.densification, faint_pixels=0.1),
     priors=Priors(
         # An ideal sensor measures the azimuth down to a DoLP of a percent; noise has its own mask.
         threshold=0.01,
@@ -80,7 +81,7 @@ RECIPE_POLARGUIDE: Recipe = replace(
     ),
 )
 
-SHADING_STOKES = replace(SHADING_3DGS_DR, blend="fresnel", local=True, first_strength=0.5)
+SHADING_STOKES = replace(SHADING_3DGS_DR, blend="fresnel", local=True, first_strength=0.5, metal=True)
 
 RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     RECIPE_POLARGUIDE,
@@ -102,6 +103,7 @@ RECIPE_POLARGUIDE_PAPER: Recipe = replace(
     about="PolarGuide-GSDR to the letter: its four candidates and its separation cue; its kind reading is :kind.",
     stages=_stages(Weights(specular=0.5, diffuse=0.2, normal=0.2), Weights(normal=0.2)),
     hold_normals=False,
+    densification=RECIPE_3DGS_DR.densification,
     priors=Priors(candidates="paper", separation="paper", azimuth_weight=0.0),
 )
 

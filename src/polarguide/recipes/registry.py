@@ -18,13 +18,14 @@ from polarguide.recipes.ablations import (
     ABLATIONS_STOKES,
 )
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
+from polarguide.recipes.gnerp import ABLATIONS_GNERP, RECIPE_GNERP
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
 from polarguide.recipes.ref_gs import RECIPE_REF_GS
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Method
 
 GROUP = "polarguide.recipes"
 
-RECIPES: dict[str, Recipe] = {
+RECIPES: dict[str, Method] = {
     recipe.name: recipe
     for recipe in (
         RECIPE_3DGS,
@@ -33,22 +34,24 @@ RECIPES: dict[str, Recipe] = {
         RECIPE_POLARGUIDE_PAPER,
         RECIPE_POLARGUIDE,
         RECIPE_POLARGUIDE_STOKES,
+        RECIPE_GNERP,
     )
 }
 """The built-in recipes."""
 
-ABLATIONS: dict[str, tuple[Recipe, ...]] = {
+ABLATIONS: dict[str, tuple[Method, ...]] = {
     "3dgs-dr": ABLATIONS_3DGS_DR,
     "polarguide-paper": ABLATIONS_PAPER,
     "polarguide": ABLATIONS_POLARGUIDE,
     "polarguide-stokes": ABLATIONS_STOKES,
+    "gnerp": ABLATIONS_GNERP,
 }
 """Variations of a built-in recipe by its name, each with one thing changed, named ``recipe:variation``."""
 
 _BUILT_IN = {**RECIPES, **{recipe.name: recipe for group in ABLATIONS.values() for recipe in group}}
 
 
-def recipe_named(name: str) -> Recipe:
+def recipe_named(name: str) -> Method:
     """A recipe or a variation by name; plug-ins are loaded if it is not built in.
 
     Raises:
@@ -80,7 +83,7 @@ def recipe_named(name: str) -> Recipe:
     )
 
 
-def ablations_of(name: str) -> tuple[Recipe, ...]:
+def ablations_of(name: str) -> tuple[Method, ...]:
     """The ablations of a recipe: built-in ones, or what plug-ins offer as ``name:variation``; there may be none.
 
     Raises:
@@ -92,9 +95,9 @@ def ablations_of(name: str) -> tuple[Recipe, ...]:
     return tuple(recipe_named(key) for key in _plugins()[0] if key.startswith(f"{name}:"))
 
 
-def _plugins() -> tuple[dict[str, dict[str, Recipe]], dict[str, PolarguideError]]:
+def _plugins() -> tuple[dict[str, dict[str, Method]], dict[str, PolarguideError]]:
     """Recipes of plug-ins by name, each by the entry points that offer it; and failures by the entry point's name."""
-    offers: dict[str, dict[str, Recipe]] = {}
+    offers: dict[str, dict[str, Method]] = {}
     failures: dict[str, PolarguideError] = {}
     for entry in entry_points(group=GROUP):
         try:
@@ -106,7 +109,7 @@ def _plugins() -> tuple[dict[str, dict[str, Recipe]], dict[str, PolarguideError]
 
 
 @lru_cache
-def _recipes_of(entry: EntryPoint) -> tuple[Recipe, ...]:
+def _recipes_of(entry: EntryPoint) -> tuple[Method, ...]:
     """What an entry point offers.
 
     Raises:
@@ -117,12 +120,12 @@ def _recipes_of(entry: EntryPoint) -> tuple[Recipe, ...]:
     try:
         given = entry.load()
         given = given() if callable(given) else given
-        recipes = (given,) if isinstance(given, Recipe) else tuple(given)
+        recipes = (given,) if isinstance(given, Method) else tuple(given)
     except Exception as error:
         found = f"{type(error).__name__}: {error}"
         raise PolarguideError(where, expected="recipes", found=found, remedy=remedy) from error
     for recipe in recipes:
-        if not isinstance(recipe, Recipe):
+        if not isinstance(recipe, Method):
             raise PolarguideError(where, expected="recipes", found=repr(recipe), remedy=remedy)
         if recipe.name in _BUILT_IN:
             found = f"{recipe.name}, which is built in"

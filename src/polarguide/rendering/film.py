@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -69,7 +68,15 @@ def write_film(
     """
     out, names = Path(out), checked_layers(list(layers))
     cameras, speed = path_cameras(run, path, frames)
-    width, height = max(((c.width, c.height) for c in cameras), key=math.prod)
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) > 1:
+        raise PolarguideError(
+            "path",
+            expected="cameras of one size",
+            found=", ".join(f"{width}x{height}" for width, height in sizes[:4]),
+            remedy="Give all the same width and height.",
+        )
+    width, height = sizes[0]
     remedy = "Give the cameras of the path a smaller width and height."
     require_memory(Path(path), RENDERED * width * height, f"pictures of {width}x{height}", remedy=remedy)
     pictures = _pictures(run, names, cameras, reporter)
@@ -88,19 +95,10 @@ def _pictures(
     run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter
 ) -> Iterator[Picture]:
     depths = _depths(run, cameras) if "depth" in layers else None
-    shape: tuple[int, ...] | None = None
     gains = run.presentation.gains
     with reporter.track("rendering", len(cameras)) as advance:
         for number, camera in enumerate(cameras):
             picture = _picture(run, layers, camera, depths, gains)
-            if shape is not None and picture.shape != shape:
-                raise PolarguideError(
-                    "path",
-                    expected="cameras of one size",
-                    found="several",
-                    remedy="Give all the same width and height.",
-                )
-            shape = picture.shape
             advance(number + 1)
             yield picture
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from polarguide.vectors import dot, unit
 RESOLUTION = 192
 """Voxels along the longest side, unless something else is asked for."""
 OPAQUE = 0.8
+COARSE = 64
+"""Voxels along the sides of the box in which a field's surface is looked for."""
 # Pixels whose surface is seen at a flatter angle than this cosine do not give depth.
 _STEEPEST = 0.1
 
@@ -78,6 +81,60 @@ def fused_surface(
     box = box_around(points, around.center, around.distance, resolution)
     field, weight = fuse(box, ((camera, seen.depth, seen.mask) for camera, seen in views))
     return surface_of(box, field, weight), views, box
+
+
+class ImplicitModel(Protocol):
+    """A model whose surface is the zero set of a signed distance: see ``neural.model.FieldModel``."""
+
+    def lattice(self, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        """Distances [X, Y, Z] in world units, positive outside, at all combinations of world coordinates."""
+
+    def surface(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit normals and linear colors, [N, 3] each, at places [N, 3] of the surface."""
+
+
+def implicit_surface(cameras: Mapping[str, Camera], model: ImplicitModel, *, resolution: int) -> Surface:
+    """The zero set of a model's distance, where at least two cameras may see it: nearer than their own distance.
+
+    Args:
+        cameras: at least two. model: of the run. resolution: voxels along the longest side.
+
+    Raises:
+        PolarguideError: there is no surface, or a library is missing.
+    """
+    optional_import("skimage.measure", "a mesh")
+    around = scene_frame(list(cameras.values()))
+    reach = around.distance
+    coarse = 2 * reach / COARSE
+    whole = Box(around.center - reach, coarse, (COARSE, COARSE, COARSE))
+    places, distance = _sampled(whole, model)
+    near = places[(distance.abs() < coarse) & (_in_pictures(cameras, places) >= 2)]
+    box = box_around([near], around.center, reach, resolution)
+    places, distance = _sampled(box, model)
+    seen = _in_pictures(cameras, places)
+    return surface_of(box, distance, seen)
+
+
+def implicit_mesh(cameras: Mapping[str, Camera], model: ImplicitModel, *, resolution: int) -> ColoredMesh:
+    """``implicit_surface`` with the model's own normals and colors; see there."""
+    surface = implicit_surface(cameras, model, resolution=resolution)
+    normals, colors = model.surface(torch.from_numpy(surface.vertices))
+    return ColoredMesh(Surface(surface.vertices, surface.faces, normals.numpy()), colors.clamp(0, 1).numpy())
+
+
+def _sampled(box: Box, model: ImplicitModel) -> tuple[Tensor, Tensor]:
+    """Places [X, Y, Z, 3] of a box's voxels, and the distances [X, Y, Z] there."""
+    x, y, z = (box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts))
+    return torch.stack(torch.meshgrid(x, y, z, indexing="ij"), dim=-1), model.lattice((x, y, z))
+
+
+def _in_pictures(cameras: Mapping[str, Camera], places: Tensor) -> Tensor:
+    """How many cameras have places [..., 3] in their pictures, hidden ones included: [...]."""
+    counts = torch.zeros(places.shape[:-1])
+    for camera in cameras.values():
+        for part, count in zip(places, counts, strict=True):
+            count += seen_at((part - camera.center).view(-1, 3), camera)[2].view(count.shape)
+    return counts
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,7 @@ _RADIANCE = "linear radiance, R G B; 1 is full scale of the photograph S0/2"
 UNITS = {
     **dict.fromkeys(("final", "base", "reflection", "specular", "diffuse"), _RADIANCE),
     "strength": "share of the reflection, 0 to 1",
+    "metalness": "share of metals, 0 to 1",
     "normal": "world axes of the scene, x y z; blended, so up to length 1, and 0 where nothing is",
     "depth": "distance along the camera's axis, in the scene's units",
     "alpha": "coverage, 0 to 1",

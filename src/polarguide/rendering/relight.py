@@ -18,7 +18,7 @@ from torch.nn.functional import grid_sample, pad
 
 from polarguide.capture.formats.radiance import read_radiance
 from polarguide.errors import PolarguideError, optional_import
-from polarguide.files import atomic
+from polarguide.files import atomic, in_utf8
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.runs.opened import OpenedRun
@@ -128,9 +128,9 @@ def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -
     exr = optional_import("OpenEXR", "an EXR file")
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage, **attributes}
     pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32))
-    with atomic(path) as temporary, exr.File(header, {"RGB": pixels}) as file:
+    with atomic(path) as temporary, in_utf8(temporary) as name, exr.File(header, {"RGB": pixels}) as file:
         try:
-            file.write(str(temporary))
+            file.write(str(name))
         except RuntimeError as error:
             raise OSError(str(error).strip().splitlines()[-1]) from None
 
@@ -139,7 +139,7 @@ def read_panorama(path: Path) -> Tensor:
     """Read a panorama of linear radiance, Radiance HDR or OpenEXR: [H, W, 3] float32, not negative.
 
     Raises:
-        PolarguideError: no such file, not twice as wide as high, or not such a picture.
+        PolarguideError: no such file, not twice as wide as high, not such a picture, without light, or NaN somewhere.
     """
     expected = "a panorama of linear radiance, .hdr or .exr, twice as wide as high"
     remedy = "Give an equirectangular picture."
@@ -151,4 +151,12 @@ def read_panorama(path: Path) -> Tensor:
         found = f"a picture of shape {list(pixels.shape)}"
         raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
     values = torch.tensor(pixels)
-    return values.nan_to_num(0.0, 6e4, 0.0).clamp(0, 6e4)
+    missing = int(values.isnan().any(dim=-1).sum())
+    if missing or not bool((values > 0).any()):
+        raise PolarguideError(
+            path,
+            expected="radiance at every pixel, and light somewhere",
+            found=f"NaN at {missing} of {values[..., 0].numel()} pixels" if missing else "no value above 0",
+            remedy="Export the panorama again, or paint the pixels.",
+        )
+    return values.clamp(0, 6e4)

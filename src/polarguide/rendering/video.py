@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,8 @@ def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: f
     # The encoder chooses the format by the name's suffix.
     with atomic(path) as temporary:
         named = temporary.with_name(temporary.name + ".mp4")
+        writer = None
         try:
-            writer = None
             for picture in pictures:
                 height, width = (side - side % 2 for side in picture.shape[:2])
                 if writer is None:
@@ -55,6 +56,9 @@ def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: f
                 remedy="Make room, choose another place or fewer layers.",
             ) from None
         finally:
+            if writer is not None:
+                with contextlib.suppress(OSError, RuntimeError):
+                    writer.close()  # the encoder would go on to write what is unlinked here
             named.unlink(missing_ok=True)
     return count
 

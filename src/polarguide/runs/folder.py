@@ -15,7 +15,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, overload
 
 import msgspec
 import torch
@@ -27,14 +27,17 @@ from torch import Tensor
 from polarguide import __version__
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
-from polarguide.files import atomic, make_folder, read_file, require_file, write_text, writing
+from polarguide.files import atomic, in_utf8, make_folder, read_file, require_file, write_text, writing
+from polarguide.neural.recipe import NeuralRecipe
+from polarguide.neural.state import FieldState
 from polarguide.options import Transfer
 from polarguide.records import LARGEST_RECORD, decode
 from polarguide.training.checked import refuse_foreign
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
 
+AnyState = TrainingState | FieldState
 CONFIGURATION = "run.json"
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
@@ -58,7 +61,7 @@ class RunConfiguration:
         test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
     """
 
-    scene: str
+    scene: Annotated[str, msgspec.Meta(min_length=1)]
     scene_digest: str
     recipe: str
     recipe_data: dict[str, Any]
@@ -71,7 +74,7 @@ class RunConfiguration:
 
     @classmethod
     def of(
-        cls, scene: Scene, recipe: Recipe, settings: TrainSettings, device: torch.device
+        cls, scene: Scene, recipe: Method, settings: TrainSettings, device: torch.device
     ) -> RunConfiguration:
         """What is recorded of a training."""
         return cls(
@@ -130,7 +133,7 @@ def _series(version: str) -> str:
     return ".".join(version.split(".")[:2])
 
 
-def save_checkpoint(run: Path, state: TrainingState, *, optimizer: bool = True) -> None:
+def save_checkpoint(run: Path, state: AnyState, *, optimizer: bool = True) -> None:
     """Write the state so that a kill at any moment leaves either the old checkpoint or the new one.
 
     Args:
@@ -152,7 +155,15 @@ def save_checkpoint(run: Path, state: TrainingState, *, optimizer: bool = True) 
             raise OSError(str(error)) from None
 
 
-def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState:
+@overload
+def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState: ...
+
+
+@overload
+def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu") -> AnyState: ...
+
+
+def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu") -> AnyState:
     """Read the state of a run, whatever it was trained on, to a device.
 
     Raises:
@@ -168,9 +179,11 @@ def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu
         )
     require_file(path, expected="a checkpoint of this program", remedy="Train again into a new folder.")
     try:
-        with safe_open(path, framework="pt") as file:
-            names = list(file.keys())
-            tensors: dict[str, Tensor] = {key: file.get_tensor(key) for key in names}
+        with in_utf8(path) as name, safe_open(name, framework="pt") as file:
+            tensors: dict[str, Tensor] = {key: file.get_tensor(key) for key in list(file.keys())}
+        if isinstance(recipe, NeuralRecipe):
+            return FieldState.from_tensors(tensors, recipe, device)
+        assert isinstance(recipe, Recipe)
         refuse_foreign(tensors, recipe)
     except (SafetensorError, ValueError, OSError, RuntimeError) as error:
         raise PolarguideError(
@@ -180,6 +193,16 @@ def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu
             remedy="Train again into a new folder.",
         ) from None
     return TrainingState.from_tensors({name: values.to(device) for name, values in tensors.items()}, recipe)
+
+
+def trained_steps(run: Path) -> int | None:
+    """After how many steps a run's checkpoint was written; None where there is none that says so."""
+    try:
+        with safe_open(run / CHECKPOINT, framework="pt") as file:
+            said = (file.metadata() or {}).get("polarguide", "")
+        return int(said.rpartition(" ")[2])
+    except (SafetensorError, OSError, ValueError):
+        return None
 
 
 @contextlib.contextmanager

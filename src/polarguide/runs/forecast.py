@@ -70,10 +70,12 @@ def forecast(
     most = max(first, min(GROWTH * first, settings.gaussians or GROWTH * first))
     seconds, priors = _measured(trainer)
     priors *= _priors_made(recipe, settings, len(scene.train_views))
-    if most == first:
-        return Forecast(seconds + priors, seconds + priors, first, most, peak)
-    _multiply(trainer, most)
-    return Forecast(seconds + priors, _measured(trainer)[0] + priors, first, most, peak)
+    again = trainer.total / settings.steps
+    least = greatest = again * (seconds + priors)
+    if most != first:
+        _multiply(trainer, most)
+        greatest = again * (_measured(trainer)[0] + priors)
+    return Forecast(least, greatest, first, most, peak)
 
 
 def in_words(seconds: float) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.memory import GIBIBYTE, KEPT, MASKS, READ, SHARE, stated_pixels
 from polarguide.errors import PolarguideError
+from polarguide.neural.recipe import NeuralRecipe
 from polarguide.system import free_memory, resident_memory
 from polarguide.training.recipe import Recipe
 
@@ -28,6 +29,10 @@ COPIES, WRITTEN = 5, 4
 """Of a Gaussian's parameters: values, gradients, two moments, frozen; and those in the file that is written."""
 SPLAT = 600
 """Bytes a Gaussian of what a rasterizer makes of it."""
+FIELD_COPIES = 5
+"""Of what a field learns: values, gradients, two moments, and those in the file that is written."""
+SAMPLE, READ_VIEW, TARGET_KEPT = 14_000, 60, 10
+"""Bytes a sample of a field's step, a pixel of the view it looks at, and a pixel of what is kept of each view."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +63,37 @@ def plan_memory(
     Raises:
         PolarguideError: a limit that was given is too small; the message has the least that suffices.
     """
-    largest, total = max(pixels, default=0), sum(pixels)
+    largest = max(pixels, default=0)
     floats = sum(math.prod(shape) for shape in recipe.shapes.values())
     guided = any(stage.weights.priors for stage in recipe.stages)
     of_view = SHOWN_KEPT + (PRIORS_KEPT + UNGUIDED_KEPT if guided else 0)
-    now = resident_memory() or 0
     step = (max(STEP, PRIORS) if guided else STEP) * largest + SPLAT * gaussians
-    work = now + PROCESS + 4 * floats * COPIES * gaussians + max(step, 4 * floats * WRITTEN * gaussians)
+    own = PROCESS + 4 * floats * COPIES * gaussians + max(step, 4 * floats * WRITTEN * gaussians)
+    what = f" and up to {gaussians:,} Gaussians"
+    return _shared(pixels, own, of_view, limit, held, what, "fewer --gaussians, or ")
+
+
+def plan_field_memory(
+    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float, held: bool = False
+) -> MemoryPlan:
+    """The same for a field: ``plan_memory``."""
+    largest = max(pixels, default=0)
+    own = PROCESS + 4 * recipe.numbers * FIELD_COPIES + SAMPLE * recipe.sampling.samples + READ_VIEW * largest
+    return _shared(pixels, own, TARGET_KEPT, limit, held, "", "")
+
+
+def _shared(
+    pixels: Sequence[int], own: int, of_view: int, limit: float, held: bool, what: str, less: str
+) -> MemoryPlan:
+    """Share out memory: ``own`` is what a training takes beside its views, ``of_view`` a pixel of what it keeps of
+    them.
+
+    Raises:
+        PolarguideError: a limit that was given is too small; ``what`` it is for beside pictures, ``less`` helps, too.
+    """
+    largest, total = max(pixels, default=0), sum(pixels)
+    now = resident_memory() or 0
+    work = now + own
     pictures = 0 if held else (KEPT - MASKS) * total
     masks = 0 if held else (MASKS - 3) * total
     # The photograph of one view, decoded again, and its targets.
@@ -74,7 +103,7 @@ def plan_memory(
     if limit > 0:
         allowed = int(limit * GIBIBYTE)
         if allowed < least:
-            raise too_little(least, allowed, gaussians)
+            raise too_little(least, allowed, what, less)
     else:
         free = free_memory()
         if free is None:
@@ -97,13 +126,13 @@ def pixels_of(folder: Path, downscale: int) -> list[int]:
     return [count // downscale**2 for count in stated_pixels(layout, select_views(layout, None))]
 
 
-def too_little(least: int, allowed: int, gaussians: int) -> PolarguideError:
-    """The error that a limit is too small."""
+def too_little(least: int, allowed: int, what: str, less: str) -> PolarguideError:
+    """The error that a limit is too small for pictures and ``what``; ``less`` helps, too."""
     return PolarguideError(
         "memory",
-        expected=f"at least {in_gigabytes(least)} for pictures of this size and up to {gaussians:,} Gaussians",
+        expected=f"at least {in_gigabytes(least)} for pictures of this size{what}",
         found=in_gigabytes(allowed, up=False),
-        remedy=f"Give --memory {in_gigabytes(least).replace(' ', '')}, fewer --gaussians, or --downscale 2.",
+        remedy=f"Give --memory {in_gigabytes(least).replace(' ', '')}, {less}--downscale 2.",
     )
 
 

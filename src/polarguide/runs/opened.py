@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
-import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
@@ -21,75 +20,14 @@ from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
 from polarguide.presentation import Presentation, read_presentation
 from polarguide.progress import SILENT, Reporter
-from polarguide.raster import Backend, choose_backend
-from polarguide.raster.in_front import alpha_in_front
+from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
+from polarguide.runs.families import family_of
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
+from polarguide.runs.model import GaussianModel, Model
 from polarguide.scene_frame import SceneFrame, scene_frame
-from polarguide.shading.gbuffer import render, splats
-from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
-from polarguide.training.recipe import Recipe
-from polarguide.training.state import TrainingState
-
-
-@dataclass(frozen=True, eq=False)
-class GaussianModel:
-    """What was learned, for whoever scores or shows it: Gaussians, their light, and how they are shaded."""
-
-    state: TrainingState
-    shading: ShadingModel
-    backend: Backend
-
-    @property
-    def device(self) -> torch.device:
-        """Where layers are rendered."""
-        return self.backend.device
-
-    @property
-    def light(self) -> dict[str, Tensor]:
-        """Parameters of the learned light by name; empty for a recipe without."""
-        return self.state.light
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the layers that it renders, in the order of ``LAYERS``."""
-        return tuple(name for name in LAYERS if name in self.shading.layers)
-
-    @property
-    def steps(self) -> int:
-        """How many steps it has been trained for."""
-        return self.state.step
-
-    def __len__(self) -> int:
-        """How many Gaussians it has."""
-        return len(self.state.gaussians)
-
-    @torch.no_grad()
-    def render(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
-        """All layers; ``normals`` where the model can do without them, and ``depth``, only if asked for."""
-        return render(
-            self.state.gaussians,
-            camera,
-            self.backend.rasterize,
-            shading=self.shading,
-            light=self.light,
-            normals=normals,
-            depth=depth,
-        )
-
-    @torch.no_grad()
-    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """The Stokes vectors [3, H, W, 3] that a rendered picture predicts; None without both layers and a normal."""
-        if any(layer is None for layer in (result.specular, result.diffuse, result.normal)):
-            return None
-        return self.shading.predicted_stokes(result, camera)
-
-    @torch.no_grad()
-    def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Share of each pixel's alpha that lies nearer than a depth [H, W], see ``raster.in_front``."""
-        return alpha_in_front(splats(self.state.gaussians), camera, depth, self.backend.rasterize)
-
+from polarguide.training.recipe import Method
 
 Opened = TypeVar("Opened", bound="OpenedRun")
 
@@ -109,8 +47,8 @@ class OpenedRun:
         self,
         folder: Path,
         configuration: RunConfiguration,
-        recipe: Recipe,
-        model: GaussianModel,
+        recipe: Method,
+        model: Model,
         *,
         scene: Scene | PathLike | None = None,
         reporter: Reporter = SILENT,
@@ -119,15 +57,15 @@ class OpenedRun:
         self._scene_source, self._reporter = scene, reporter
 
     def __repr__(self) -> str:
-        gaussians = f"{len(self.model)} Gaussians"
-        return f"<{type(self).__name__} {self.folder}: {self.recipe.name}, {self.steps} steps, {gaussians}>"
+        of = f"{self.recipe.name}, {self.steps} steps, {self.model.size}"
+        return f"<{type(self).__name__} {self.folder}: {of}>"
 
     @classmethod
     def open(
         cls: type[Opened],
         folder: PathLike,
         *,
-        recipe: Recipe | str | None = None,
+        recipe: Method | str | None = None,
         scene: Scene | PathLike | None = None,
         device: DeviceName = "auto",
         reporter: Reporter = SILENT,
@@ -146,20 +84,20 @@ class OpenedRun:
         """
         folder = Path(folder)
         configuration = RunConfiguration.load(folder)
-        if not isinstance(recipe, Recipe):
-            recipe = recipe_named(recipe or configuration.recipe)
-        if recipe.name != configuration.recipe:
+        method = recipe if isinstance(recipe, Method) else recipe_named(recipe or configuration.recipe)
+        if method.name != configuration.recipe:
             expected, remedy = f"{configuration.recipe}, which {folder} was trained with", "Give that recipe."
-            raise PolarguideError("recipe", expected=expected, found=recipe.name, remedy=remedy)
+            raise PolarguideError("recipe", expected=expected, found=method.name, remedy=remedy)
+        method = method.as_recorded(configuration.recipe_data)
         backend = choose_backend(device, say=reporter.say)
-        state = load_checkpoint(folder, recipe, backend.device)
-        if recipe.data() != configuration.recipe_data:
+        state = load_checkpoint(folder, method, backend.device)
+        if method.differs(configuration.recipe_data):
             _warn(
-                f"{folder} was trained with other values of the recipe {recipe.name} than this version has; its "
+                f"{folder} was trained with other values of the recipe {method.name} than this version has; its "
                 "pictures are shaded with this version's."
             )
-        model = GaussianModel(state, recipe.shading.bind(configuration.settings.refractive_index), backend)
-        return cls(folder, configuration, recipe, model, scene=scene, reporter=reporter)
+        model = family_of(method).model(state, method, configuration.settings, backend)
+        return cls(folder, configuration, method, model, scene=scene, reporter=reporter)
 
     @classmethod
     def of(cls: type[Opened], run: OpenedRun) -> Opened:
@@ -174,9 +112,28 @@ class OpenedRun:
 
     @property
     def gaussians(self) -> dict[str, Tensor]:
-        """Parameters by name, one row a Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Not to be written to."""
-        found = self.model.state.gaussians
+        """Parameters by name, one row a Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Not to be written to.
+
+        Raises:
+            PolarguideError: the recipe learns something else.
+        """
+        found = self.gaussian_model("gaussians").state.gaussians
         return {name: found[name].detach() for name in found.names}
+
+    def gaussian_model(self, what: str) -> GaussianModel:
+        """The model, for what needs Gaussians; ``what`` asks for them.
+
+        Raises:
+            PolarguideError: the recipe learns something else.
+        """
+        if isinstance(self.model, GaussianModel):
+            return self.model
+        raise PolarguideError(
+            what,
+            expected="a run of Gaussians",
+            found=f"one of {self.recipe.name}, a signed-distance field",
+            remedy="polarguide export --format mesh writes its surface.",
+        )
 
     @property
     def light(self) -> dict[str, Tensor]:
@@ -271,7 +228,7 @@ class OpenedRun:
 
         Returns:
             By name: linear radiance [H, W, 3] on the scale of S0/2, world normals [H, W, 3] of any length, or [H, W]
-            for strength, depth and alpha.
+            for strength, metalness, depth and alpha.
 
         Raises:
             PolarguideError: there is no such layer, or this recipe has not got it.

@@ -23,30 +23,24 @@ from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
-from polarguide.runs.angles import report_polarizers
-from polarguide.runs.defaults import most_gaussians, with_defaults
+from polarguide.runs.families import AnyTrainer, Family, family_of
 from polarguide.runs.folder import (
     CHECKPOINT,
     CONFIGURATION,
-    PLY,
     RunConfiguration,
     RunLog,
     load_checkpoint,
     save_checkpoint,
     writing_to,
 )
-from polarguide.runs.forecast import forecast
-from polarguide.runs.memory import MemoryPlan, pixels_of, plan_memory
-from polarguide.runs.opened import GaussianModel, OpenedRun, read_scene
-from polarguide.runs.point_cloud import write_run_ply
+from polarguide.runs.memory import MemoryPlan, pixels_of
+from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.system import return_freed_memory
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.losses import refuse_diverged
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Method
 from polarguide.training.settings import StepReport, TrainSettings
-from polarguide.training.state import TrainingState
 from polarguide.training.stopwatch import Stopwatch
-from polarguide.training.trainer import Trainer
 from polarguide.training.view_store import ViewStore
 
 LOG_EVERY = 10
@@ -72,14 +66,14 @@ def train(
     scene: Scene | PathLike,
     out: PathLike,
     *,
-    recipe: Recipe | str = "polarguide-stokes",
+    recipe: Method | str = "polarguide-stokes",
     settings: TrainSettings = TrainSettings(),
     session: SessionOptions = SessionOptions(),
     reading: SceneOptions = SceneOptions(),
     resume: bool = False,
     reporter: Reporter = SILENT,
     should_stop: Ends = lambda: False,
-    watch: Callable[[Trainer], AbstractContextManager[Look]] | None = None,
+    watch: Callable[[AnyTrainer], AbstractContextManager[Look]] | None = None,
 ) -> OpenedRun:
     """Train a recipe on a scene, into a run folder.
 
@@ -104,6 +98,7 @@ def train(
     out = Path(out)
     use_threads(session.threads)
     chosen = recipe_named(recipe) if isinstance(recipe, str) else recipe
+    family = family_of(chosen)
     with process_group(session.device, out) as ranks, ExitStack() as locked:
         leads = ranks.rank == 0
         reporter = reporter if leads else SILENT
@@ -113,7 +108,7 @@ def train(
         )
         backend = backend_of(ranks, session.device, reporter)
         earlier = RunConfiguration.load(out).settings if resume else None
-        plan = _planned(scene, chosen, settings, earlier, reading)
+        plan = _planned(family, scene, chosen, settings, earlier, reading)
         # Other pictures are made of those that are held.
         hold = plan.hold or settings.exposures != "captured"
         whole = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=hold)
@@ -121,7 +116,7 @@ def train(
         if settings.background == "masked":
             loaded = without_surroundings(loaded)
         _check_scene(loaded)
-        settings = with_defaults(settings, loaded, chosen, earlier)
+        settings = family.filled(settings, loaded, chosen, earlier)
         configuration = RunConfiguration.of(loaded, chosen, settings, backend.device)
         state = None
         if resume:
@@ -130,22 +125,15 @@ def train(
             _check_same(RunConfiguration.load(out), configuration, out)
             if (out / CHECKPOINT).exists():
                 state = load_checkpoint(out, chosen, backend.device)
-                _check_slots(state, settings, out)
+                family.check(state, settings, out)
         expected = None
         if ranks.world == 1 and not resume:
-            expected = forecast(loaded, chosen, settings, backend, plan.peak)
+            expected = family.forecast(loaded, chosen, settings, backend, plan.peak)
             if expected is not None:
                 reporter.say(expected.sentence())
         return_freed_memory()  # of decoded files, and of what was only measured
         store = locked.enter_context(closing(_store(plan, backend, out, reporter)))
-        trainer = Trainer(loaded, chosen, settings, backend, state, ranks, store)
-        if trainer.black and settings.background == "auto":
-            reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
-        if trainer.polarizers.ignored:
-            reporter.warn(
-                f"the recipe {chosen.name} has no term for single pictures through a filter: it takes them for "
-                "photographs without one."
-            )
+        trainer = family.trainer(loaded, chosen, settings, backend, state, ranks, store, reporter)
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
@@ -155,13 +143,11 @@ def train(
                         raise problem
                 configuration.save(out)
             seconds = _Loop(trainer, out, session, reporter, should_stop, look).run()
-        model = GaussianModel(trainer.state, trainer.shading, backend)
+        model = family.model(trainer.state, chosen, settings, backend)
         if expected is not None:
             reporter.say(expected.truth(seconds))
         if leads:
-            report_polarizers(out, loaded, trainer.polarizers, reporter)
-            centers = torch.stack([view.camera.center for view in loaded.views])
-            write_run_ply(out / PLY, model.state, model.shading, centers)
+            family.finish(out, trainer, model, reporter)
     return OpenedRun(out, configuration, chosen, model, scene=whole, reporter=reporter)
 
 
@@ -170,7 +156,7 @@ class _Loop:
 
     def __init__(
         self,
-        trainer: Trainer,
+        trainer: AnyTrainer,
         out: Path,
         session: SessionOptions,
         reporter: Reporter,
@@ -187,9 +173,9 @@ class _Loop:
     def run(self) -> float:
         """Train; see ``train``. Returns the seconds that it took."""
         trainer = self._trainer
-        with self._reporter.track("training", trainer.settings.steps) as advance:
+        with self._reporter.track("training", trainer.total) as advance:
             meter = _Meter(advance, self._log, self._stopwatch)
-            advance(trainer.state.step)
+            advance(trainer.done)
             try:
                 stopped = self._steps(meter)
             except KeyboardInterrupt:
@@ -243,7 +229,9 @@ class _Meter:
     def take(self, report: StepReport) -> None:
         """Take one step's report."""
         if self._first < 0:
-            self._first = report.step
+            self._first = report.done - 1
+        elif report.step == 0 and self._log is not None:
+            self._log.cut(0)  # it has begun again
         self._waiting.append(report)
         if (report.step + 1) % LOG_EVERY == 0:
             loss, psnr = self.read()
@@ -276,18 +264,17 @@ class _Meter:
             keep = 0.0 if math.isnan(self._loss) else 0.98
             self._loss = loss if keep == 0 else keep * self._loss + (1 - keep) * loss
             self._psnr = psnr if keep == 0 else keep * self._psnr + (1 - keep) * psnr
-        rate = (last.step + 1 - self._first) / max(1e-9, time.perf_counter() - self._began)
-        note = (
-            f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  "
-            f"{last.gaussians:,} Gaussians  {rate:.1f} it/s"
-        )
-        self._advance(last.step + 1, note=note)
+        rate = (last.done - self._first) / max(1e-9, time.perf_counter() - self._began)
+        count = "" if last.gaussians is None else f"{last.gaussians:,} Gaussians  "
+        note = f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  {count}{rate:.1f} it/s"
+        self._advance(last.done, note=note)
         return loss, psnr
 
 
 def _planned(
+    family: Family,
     scene: Scene | PathLike,
-    recipe: Recipe,
+    recipe: Method,
     settings: TrainSettings,
     resumed: TrainSettings | None,
     reading: SceneOptions,
@@ -298,8 +285,7 @@ def _planned(
     else:
         pixels = pixels_of(Path(scene), reading.downscale)
     asked = settings.gaussians or (resumed.gaussians if resumed is not None else 0)
-    gaussians = asked or most_gaussians(sum(pixels), recipe)
-    return plan_memory(pixels, recipe, gaussians, limit=reading.memory, held=isinstance(scene, Scene))
+    return family.plan(pixels, recipe, asked, reading, held=isinstance(scene, Scene))
 
 
 def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
@@ -356,26 +342,6 @@ def _check_scene(scene: Scene) -> None:
     if len(scene.points) and not any(bool(each.any()) for each in ahead):
         said = f"{scene.root}: all points lie behind all cameras: poses and points do not belong together."
         warnings.warn(said, PolarguideWarning, stacklevel=2)
-
-
-def _check_slots(state: TrainingState, settings: TrainSettings, out: Path) -> None:
-    """Refuse a later step than ``run.json`` states, and sums of the density control for other views a step."""
-    if state.step > settings.steps:
-        raise PolarguideError(
-            out / CHECKPOINT,
-            expected=f"the state of a training of {settings.steps} steps",
-            found=f"one after step {state.step}",
-            remedy="Train again into a new folder.",
-        )
-    sums = state.statistics.gradient
-    found = sums.shape[0] if sums.ndim == 2 else 1
-    if found != settings.views_per_step:
-        raise PolarguideError(
-            out / CHECKPOINT,
-            expected=f"the state of a training with {settings.views_per_step} views a step",
-            found=f"one with {found}",
-            remedy="Train again into a new folder.",
-        )
 
 
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:

@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
+from polarguide import optics
 from polarguide.camera import Camera
+from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import mirrored_directions
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.optics import reflectances_from_cosine
+from polarguide.shading.conversion import convert, mirror_base, scale_light
 from polarguide.shading.cubemap import cubemap_lookup
+from polarguide.shading.metal import (
+    BLUR,
+    CHANNELS,
+    FIRST_REFLECTANCE,
+    FIRST_ROUGHNESS,
+    add_metal,
+    any_metal,
+    metal_channels,
+    metal_mips,
+    metal_pixels,
+    metalness_picture,
+    reflectance,
+    reflectance_logits,
+    with_metal,
+)
+from polarguide.shading.mips import mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
     GBuffer,
@@ -29,7 +48,7 @@ from polarguide.shading.model import (
     mirrored,
 )
 from polarguide.shading.native import reflect_native
-from polarguide.shading.result import LAYERS
+from polarguide.shading.result import LAYERS, HeldLayers
 from polarguide.vectors import dot, unit
 
 Blend = Literal["lerp", "fresnel"]
@@ -57,6 +76,8 @@ class DeferredShading(ShadingModel):
         environment_spread: first raw texels are uniform in plus or minus this.
         environment_rate: learning rate of the texels.
         environment_resolution: texels along a cube face's side.
+        metal: whether Gaussians can be metals, see ``shading.metal``; with the blend "fresnel".
+        metal_rate: learning rate of their reflectance and roughness.
     """
 
     blend: Blend = "lerp"
@@ -67,18 +88,33 @@ class DeferredShading(ShadingModel):
     environment_spread: float = 5.0
     environment_rate: float = 0.05
     environment_resolution: int = 128
+    metal: bool = False
+    metal_rate: float = 0.01
 
     stream: ClassVar[int] = 1
 
+    def as_recorded(self, data: Mapping[str, Any]) -> ShadingModel:
+        """Without metals where there could be none."""
+        return self if data.get("metal", False) else replace(self, metal=False)
+
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """``strength_logits`` and, with ``local``, harmonics of the mirrored direction."""
+        """``strength_logits``; with ``local`` harmonics of the mirrored direction; with ``metal`` its three."""
         minimum = float(torch.logit(torch.tensor(RESET_STRENGTH, dtype=torch.float64)))
         own = {
             "local_dc": Parameter((3,), self.local_rate),
             "local_rest": Parameter((15, 3), self.local_rate / 20),
         }
-        return {"strength_logits": Parameter((), self.strength_rate, minimum), **(own if self.local else {})}
+        metals = {
+            "metalness": Parameter((), 0.0),
+            "reflectance_logits": Parameter((3,), self.metal_rate),
+            "roughness_logits": Parameter((), self.metal_rate),
+        }
+        return {
+            "strength_logits": Parameter((), self.strength_rate, minimum),
+            **(own if self.local else {}),
+            **(metals if self.metal else {}),
+        }
 
     @property
     def light_parameters(self) -> Mapping[str, Parameter]:
@@ -87,10 +123,14 @@ class DeferredShading(ShadingModel):
         return {"texels": Parameter((6, side, side, 3), self.environment_rate)}
 
     def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """The same strength everywhere, and no light of the Gaussians' own."""
+        """The same strength everywhere, no light of the Gaussians' own, and no metal."""
         zeros = {name: torch.zeros(len(colors), *given.shape) for name, given in self.parameters.items()}
         logit = torch.logit(torch.tensor(self.first_strength))
-        return {**zeros, "strength_logits": logit.expand(len(colors)).clone()}
+        first = {**zeros, "strength_logits": logit.expand(len(colors)).clone()}
+        if self.metal:
+            first["reflectance_logits"] = reflectance_logits(torch.full((len(colors), 3), FIRST_REFLECTANCE))
+            first["roughness_logits"] = torch.logit(torch.full((len(colors),), FIRST_ROUGHNESS))
+        return first
 
     def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Uniform texels."""
@@ -103,8 +143,8 @@ class DeferredShading(ShadingModel):
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """All."""
-        return LAYERS
+        """All, ``metalness`` if there can be metals."""
+        return LAYERS if self.metal else tuple(name for name in LAYERS if name != "metalness")
 
     def radiance(self, texels: Tensor) -> Tensor:
         """Radiance of raw texel values."""
@@ -143,33 +183,118 @@ class DeferredShading(ShadingModel):
         return strength * (0.5 * (s + p)) * light, base
 
     def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
-        """Base color [N, 3], strength [N, 1] and, with ``local``, the Gaussians' own light [N, 3]."""
+        """Base color [N, 3], strength [N, 1], with ``local`` the Gaussians' own light [N, 3], and where some are metals
+        what these need [N, 5].
+        """
         channels = [base_colors(gaussians, center, degree), self.strength(gaussians)[:, None]]
         if self.local:
             directions = mirrored_directions(gaussians["means"], center, normals)
             channels.append(local_light(gaussians, directions, degree))
+        if self._has_metal(gaussians):
+            body = 1 - gaussians["metalness"].detach()[:, None]
+            channels = [channels[0] * body, channels[1] * body, *channels[2:], self._metals(gaussians)]
         return channels
 
-    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
-        """``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], and ``strength`` [H, W]."""
+    @property
+    def knows_metals(self) -> bool:
+        """With ``metal``."""
+        return self.metal
+
+    def become_metal(
+        self,
+        gaussians: Gaussians,
+        light: Light,
+        metal: Tensor,
+        reflectance: Tensor,
+        gain: Callable[[], float],
+    ) -> None:
+        """See ``ShadingModel`` and ``shading.conversion``."""
+        first = not any_metal(gaussians["metalness"])
+        fresh = convert(gaussians, metal, reflectance)
+        if not any_metal(gaussians["metalness"]):
+            return
+        if first:
+            scale_light(gaussians, light["texels"], gain())
+        if self.local:
+            mirror_base(gaussians, light["texels"], fresh, self.radiance)
+
+    def _has_metal(self, gaussians: Parameters) -> bool:
+        """Whether one of the Gaussians is a metal; without, everything is as if there could be none."""
+        return self.metal and any_metal(gaussians["metalness"])
+
+    @staticmethod
+    def _metals(gaussians: Parameters) -> Tensor:
+        """Per Gaussian [N, 5], as of ``metal_channels``."""
+        values = reflectance(gaussians["reflectance_logits"]), torch.sigmoid(gaussians["roughness_logits"])
+        return metal_channels(gaussians["metalness"].detach(), *values)
+
+    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
+        """``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], and ``strength`` [H, W].
+
+        With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``.
+        """
         features, texels = splatted.features, light["texels"]
-        strength = features[..., 6]
-        if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (features, texels)):
-            size = features.shape[:2]
-            found = reflect_native(
-                features.flatten(0, 1),
-                camera.world_rays().flatten(0, 1),
-                texels,
-                fresnel=self.blend == "fresnel",
-                local=self.local,
-                refractive_index=self.refractive_index,
+        if _fits_native(features, texels):
+            return self._with_metals(
+                self._shade_native(features, texels, camera, held=False), splatted, texels, camera
             )
-            final, specular, diffuse, reflection = (layer.unflatten(0, size) for layer in found)
-            layers = {"final": final, "specular": specular, "diffuse": diffuse, "reflection": reflection}
-        else:
-            local = features[..., 7:10] if self.local else None
-            layers = reflect_reference(splatted.color, splatted.normal, strength, texels, camera, self, local)
-        return {**layers, "strength": strength}
+        strength = features[..., 6]
+        local = features[..., 7:10] if self.local else None
+        layers = reflect_reference(splatted.color, splatted.normal, strength, texels, camera, self, local)
+        return self._with_metals({**layers, "strength": strength}, splatted, texels, camera)
+
+    def shade_held(
+        self, splatted: GBuffer, light: Light, camera: Camera
+    ) -> tuple[dict[str, Any], HeldLayers | None]:
+        """As ``ShadingModel`` has it; on the CPU in float32 one native pass."""
+        texels = light["texels"]
+        if not _fits_native(splatted.features, texels):
+            return super().shade_held(splatted, light, camera)
+        layers: dict[str, Any] = self._shade_native(splatted.features, texels, camera, held=True)
+        specular, diffuse = layers.pop("held specular"), layers.pop("held diffuse")
+        layers = self._with_metals(layers, splatted, texels, camera)
+        metal = layers.get("metal")
+        if metal is not None:
+            specular = add_metal(specular, metal)
+        return layers, (specular, diffuse, metal)
+
+    def _with_metals(
+        self, layers: dict[str, Tensor], splatted: GBuffer, texels: Tensor, camera: Camera
+    ) -> dict[str, Any]:
+        """The layers of dielectrics with what metals add; as they are where the model knows no metals."""
+        if not self.metal:
+            return layers
+        features, first, metal = splatted.features, 10 if self.local else 7, splatted.metal
+        # Of a depth behind the channels of dielectrics there is one; of metals, five more.
+        if metal is None and features.shape[-1] >= first + CHANNELS:
+            rays = camera.world_rays(dtype=features.dtype, device=features.device)
+            metal = metal_pixels(
+                features[..., first : first + CHANNELS].flatten(0, 1),
+                rays.flatten(0, 1),
+                splatted.normal.flatten(0, 1),
+                self.radiance(texels),
+                features[..., 7:10].flatten(0, 1) if self.local else None,
+            )
+        found = layers if metal is None else with_metal(layers, metal)
+        return {**found, "metalness": metalness_picture(metal, features), "metal": metal}
+
+    def _shade_native(
+        self, features: Tensor, texels: Tensor, camera: Camera, *, held: bool
+    ) -> dict[str, Tensor]:
+        found = reflect_native(
+            features.flatten(0, 1),
+            camera.world_rays().flatten(0, 1),
+            texels,
+            fresnel=self.blend == "fresnel",
+            local=self.local,
+            refractive_index=self.refractive_index,
+            held=held,
+        )
+        names = ("final", "specular", "diffuse", "reflection", "held specular", "held diffuse")
+        layers = {
+            name: layer.unflatten(0, features.shape[:2]) for name, layer in zip(names, found, strict=False)
+        }
+        return {**layers, "strength": features[..., 6]}
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Colors [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
@@ -180,24 +305,58 @@ class DeferredShading(ShadingModel):
         cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
         base, strength = harmonic_colors(gaussians, rays), self.strength(gaussians)[:, None]
         specular, diffuse = self.contributions(base, strength, seen, cosine)
-        return specular + diffuse
+        if not self._has_metal(gaussians):
+            return specular + diffuse
+        metal = self._metals(gaussians)
+        blurred = mip_lookup(metal_mips(self.radiance(light["texels"])), directions, BLUR * metal[:, 4])
+        if self.local:
+            blurred = (blurred + local_light(gaussians, directions, 3)).clamp(min=0)
+        mean, _ = optics.conductor(cosine, reflectance(gaussians["reflectance_logits"]))
+        return torch.where(metal[:, 3:4] > 0, mean * blurred, specular + diffuse)
+
+    def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
+        """Linear colors [N, 3] without reflections: none of metals."""
+        colors = super().diffuse_colors(gaussians, rays)
+        return colors * (1 - gaussians["metalness"][:, None]) if self._has_metal(gaussians) else colors
 
     def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """Linear harmonics of the base color, and ``strength`` [N]."""
-        return {**super().fields(gaussians), "strength": self.strength(gaussians)}
+        """Linear harmonics of the base color, ``strength`` [N], and of metals ``metalness`` [N], ``reflectance`` [N, 3]
+        and ``roughness`` [N].
+        """
+        own = {**super().fields(gaussians), "strength": self.strength(gaussians)}
+        if self.metal:
+            own["metalness"] = gaussians["metalness"]
+            own["reflectance"] = reflectance(gaussians["reflectance_logits"])
+            own["roughness"] = torch.sigmoid(gaussians["roughness_logits"])
+        return own
 
     def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
-        """Harmonics, strength and texels."""
+        """Harmonics, strength and texels; where there is metal, also what that needs."""
         values = {**harmonic_values(gaussians), "share": self.strength(gaussians)}
         if self.local:
             values |= {"own_color": gaussians["local_dc"], "own_harmonics": gaussians["local_rest"]}
+        constants: dict[str, Any] = {"blend": self.blend, "index": self.refractive_index}
+        texels = [light["texels"]]
+        if self._has_metal(gaussians):
+            if not self.local or self.blend != "fresnel":
+                return None  # no recipe has such metals, and the page no shaders for them
+            metal = self._metals(gaussians)
+            values["metal"] = torch.cat((metal[:, :3], metal[:, 4:]), dim=1)
+            mips = metal_mips(self.radiance(light["texels"]))
+            texels += mips
+            constants |= {"metal": True, "mips": len(mips)}
         return PageShading(
             kind="local" if self.local else "reflection",
             values=values,
-            light=[light["texels"]],
-            constants={"blend": self.blend, "index": self.refractive_index},
+            light=texels,
+            constants=constants,
             notes=[self.local_note] if self.local else [],
         )
+
+
+def _fits_native(*tensors: Tensor) -> bool:
+    """Whether the native pass takes these."""
+    return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
 
 
 def local_light(gaussians: Parameters, directions: Tensor, sh_degree: int) -> Tensor:

@@ -57,24 +57,22 @@ def render(
         channels.append(((means - center) @ pose.rotation[2])[:, None])
     picture = rasterize(splats(gaussians, torch.cat(channels, dim=1)), camera, statistic=statistic)
     features, normal, camera_depth = split(picture.features, picture.alpha, normals=normals, depth=depth)
-    layers = shading.shade(GBuffer(features, picture.alpha), light, camera)
-    again = shading.shade(_hold_normals(features, picture.alpha), light, camera) if held and normals else {}
+    splatted = GBuffer(features, picture.alpha)
+    if held and normals:
+        layers, again = shading.shade_held(splatted, light, camera)
+    else:
+        layers, again = shading.shade(splatted, light, camera), None
     return RenderResult(
         final=layers["final"],
         base=features[..., :3],
-        **{name: layers.get(name) for name in ("specular", "diffuse", "reflection", "strength")},
+        **{name: layers.get(name) for name in ("specular", "diffuse", "reflection", "strength", "metalness")},
         normal=normal,
         depth=camera_depth,
         alpha=picture.alpha,
         radii=picture.radii,
-        held=(again["specular"], again["diffuse"]) if "specular" in again else None,
+        held=again,
+        metal=layers.get("metal"),
     )
-
-
-def _hold_normals(features: Tensor, alpha: Tensor) -> GBuffer:
-    """The G-buffer of blended [H, W, D] channels, with normals that get no gradient."""
-    normal = features[..., 3:6].detach()
-    return GBuffer(torch.cat((features[..., :3], normal, features[..., 6:]), dim=-1), alpha)
 
 
 Split = tuple[Tensor, Tensor | None, Tensor | None]

@@ -18,8 +18,10 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
+from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.harmonics import evaluate_sh
-from polarguide.shading.result import RenderResult
+from polarguide.shading.metal import MetalPixels, metal_stokes
+from polarguide.shading.result import HeldLayers, RenderResult
 from polarguide.vectors import dot
 
 # Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
@@ -61,10 +63,12 @@ class GBuffer(NamedTuple):
         features: [H, W, 6 + K] blended color, normal (world axes) and channels of the shading model; others may
             follow.
         alpha: [H, W].
+        metal: what metals add to the picture, where that is known before; None: not yet.
     """
 
     features: Tensor
     alpha: Tensor
+    metal: MetalPixels | None = None
 
     @property
     def color(self) -> Tensor:
@@ -146,6 +150,10 @@ class ShadingModel(ABC):
         del values["refractive_index"]
         return {"model": type(self).__name__, **values}
 
+    def as_recorded(self, data: Mapping[str, Any]) -> ShadingModel:
+        """The model as a run has it, given what ``data`` was then: without parameters that came later."""
+        return self
+
     # What is learned
 
     @property
@@ -191,6 +199,27 @@ class ShadingModel(ABC):
             remedy='Take the action "propagate_normals" out of the recipe, or define strength().',
         )
 
+    @property
+    def knows_metals(self) -> bool:
+        """Whether Gaussians can be metals; then ``become_metal`` makes them."""
+        return False
+
+    def become_metal(
+        self,
+        gaussians: Gaussians,
+        light: Light,
+        metal: Tensor,
+        reflectance: Tensor,
+        gain: Callable[[], float],
+    ) -> None:
+        """Change which Gaussians are metals, of a model that knows them.
+
+        Args:
+            metal: [N] bool. reflectance: [N, 3] at normal incidence that new ones begin with.
+            gain: by how much all light should be brighter, asked for when the first metals are there.
+        """
+        raise NotImplementedError
+
     # What it renders
 
     @property
@@ -212,8 +241,22 @@ class ShadingModel(ABC):
         """
 
     @abstractmethod
-    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
-        """Layers of a picture by their names in ``RenderResult``; ``final`` at least."""
+    def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
+        """Layers of a picture by their names in ``RenderResult``; ``final`` at least. And ``metal``, where there is."""
+
+    def shade_held(
+        self, splatted: GBuffer, light: Light, camera: Camera
+    ) -> tuple[dict[str, Any], HeldLayers | None]:
+        """``shade``, and if it reflects ``specular`` and ``diffuse`` again, without a gradient on the normals but by
+        what metals mirror, and those metals.
+        """
+        layers, features = self.shade(splatted, light, camera), splatted.features
+        if "specular" not in layers:
+            return layers, None
+        parts = features[..., :3], features[..., 3:6].detach(), features[..., 6:]
+        held = GBuffer(torch.cat(parts, dim=-1), splatted.alpha, layers.get("metal"))
+        again = self.shade(held, light, camera)
+        return layers, (again["specular"], again["diffuse"], again.get("metal"))
 
     @property
     def smooth_dielectric(self) -> bool:
@@ -229,13 +272,18 @@ class ShadingModel(ABC):
         assert result.specular is not None
         assert result.diffuse is not None
         assert result.normal is not None
-        return optics.predicted_stokes(
+        stokes = optics.predicted_stokes(
             2 * result.specular,
             2 * result.diffuse,
             camera.to_camera(result.normal),
             camera.rays(device=result.normal.device),
             self.refractive_index,
         )
+        if result.metal is None:
+            return stokes
+        layers, index = (result.specular, result.diffuse, result.normal), self.refractive_index
+        metal = metal_stokes(*layers, result.metal, camera, index)
+        return stokes.flatten(1, 2).index_copy(1, result.metal.pixels, metal).view_as(stokes)
 
     # What exports need
 

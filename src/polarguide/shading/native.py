@@ -1,7 +1,7 @@
 """Native passes over the G-buffer on the CPU.
 
 The reference implementation of ``reflect_native`` is ``deferred.reflect_reference``, that of ``split_native`` is
-``gbuffer.split_reference``.
+``gbuffer.split_reference``, that of ``conductor_native`` is ``optics.conductor``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ from polarguide import _native
 class _Reflect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, features: Tensor, rays: Tensor, texels: Tensor, fresnel: bool, local: bool, ior: float
+        ctx: Any,
+        features: Tensor,
+        rays: Tensor,
+        texels: Tensor,
+        fresnel: bool,
+        local: bool,
+        ior: float,
+        held: bool,
     ) -> tuple[Tensor, ...]:
         features, rays, texels = (t.detach().contiguous() for t in (features, rays, texels))
         directions, seen = torch.empty_like(rays), torch.empty_like(rays)
@@ -29,25 +36,40 @@ class _Reflect(torch.autograd.Function):
         ctx.save_for_backward(features, rays, texels, directions, seen)
         ctx.model = (fresnel, local, ior)
         ctx.set_materialize_grads(False)
-        return layers
+        return (*layers, layers[1].clone(), layers[2].clone()) if held else layers
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         features, rays, texels, directions, seen = ctx.saved_tensors
-        to_layers = (None if g is None else g.contiguous() for g in grads)
+        to_layers = [None if g is None else g.contiguous() for g in grads]
+        to_layers += [None] * (6 - len(to_layers))
         to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
-        given: list[Any] = [features, rays, seen, *ctx.model, *to_layers, to_seen, to_features]
+        # What comes by the held layers goes to the texels, and not by way of the directions to the normals.
+        held = to_layers[4] is not None or to_layers[5] is not None
+        to_look_up = torch.empty_like(seen) if held else None
+        given: list[Any] = [features, rays, seen, *ctx.model, *to_layers, to_seen, to_look_up, to_features]
         _native.reflect_backward_layers(*given)
         to_texels, to_directions = torch.empty_like(texels), torch.empty_like(directions)
-        _native.cubemap_backward(texels, directions, to_seen, to_texels, to_directions)
+        if to_look_up is None:
+            _native.cubemap_backward(texels, directions, to_seen, to_texels, to_directions)
+        else:
+            _native.cubemap_backward(texels, directions, to_look_up, to_texels, None)
+            _native.cubemap_backward(texels, directions, to_seen, None, to_directions)
         _native.reflect_backward_directions(features, rays, to_directions, to_features)
-        return to_features, None, to_texels, None, None, None
+        return to_features, None, to_texels, None, None, None, None
 
 
 def reflect_native(
-    features: Tensor, rays: Tensor, texels: Tensor, *, fresnel: bool, local: bool, refractive_index: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    features: Tensor,
+    rays: Tensor,
+    texels: Tensor,
+    *,
+    fresnel: bool,
+    local: bool,
+    refractive_index: float,
+    held: bool = False,
+) -> tuple[Tensor, ...]:
     """The layers of a picture from its G-buffer (Ye et al. 2024, Eq. 5, or Fresnel-weighted).
 
     Args:
@@ -56,18 +78,59 @@ def reflect_native(
         fresnel: Fresnel's weight and exponential light in place of the lerp and the logistic function.
         local: whether channels 7 to 9 are light that is added to the environment's.
         refractive_index: of Fresnel's weight.
+        held: also ``specular`` and ``diffuse`` once more, without a gradient on the normals.
 
     Returns:
-        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and texels;
-        the same bits for any number of threads.
+        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and texels,
+        and with ``held`` the two that are held; the same bits for any number of threads.
 
     Raises:
         ValueError: if a shape is not as above.
     """
-    final, specular, diffuse, reflection = _Reflect.apply(
-        features, rays, texels, fresnel, local, refractive_index
+    layers: tuple[Tensor, ...] = _Reflect.apply(
+        features, rays, texels, fresnel, local, refractive_index, held
     )
-    return final, specular, diffuse, reflection
+    return layers
+
+
+class _Conductor(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, cosine: Tensor, reflectance: Tensor) -> tuple[Tensor, Tensor]:
+        cosine, reflectance = cosine.detach().contiguous(), reflectance.detach().contiguous()
+        mean, slope = torch.empty_like(reflectance), torch.empty_like(reflectance)
+        derivatives = reflectance.new_empty(*reflectance.shape, 4) if any(ctx.needs_input_grad) else None
+        _native.conductor_values(cosine, reflectance, mean, slope, derivatives)
+        ctx.save_for_backward(derivatives)
+        ctx.set_materialize_grads(False)
+        return mean, slope
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        (derivatives,) = ctx.saved_tensors
+        to_cosine, to_reflectance = (
+            derivatives.new_empty(len(derivatives)),
+            derivatives.new_empty(len(derivatives), 3),
+        )
+        by_mean, by_slope = (None if g is None else g.contiguous() for g in grads)
+        _native.conductor_backward(derivatives, by_mean, by_slope, to_cosine, to_reflectance)
+        return to_cosine, to_reflectance
+
+
+def conductor_native(cosine: Tensor, reflectance: Tensor) -> tuple[Tensor, Tensor]:
+    """``optics.conductor``, which is the reference implementation, of three colors a pixel.
+
+    Args:
+        cosine: [K]. reflectance: [K, 3]. Both float32 on the CPU.
+
+    Returns:
+        (R, rho / sin^2), each [K, 3].
+
+    Raises:
+        ValueError: if a shape is not as above.
+    """
+    mean, slope = _Conductor.apply(cosine, reflectance)
+    return mean, slope
 
 
 class _Split(torch.autograd.Function):

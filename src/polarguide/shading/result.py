@@ -8,8 +8,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-LAYERS = ("final", "base", "reflection", "specular", "diffuse", "strength", "normal", "depth", "alpha")
+from polarguide.shading.metal import MetalPixels
+
+LAYERS = (
+    "final",
+    "base",
+    "reflection",
+    "specular",
+    "diffuse",
+    "strength",
+    "metalness",
+    "normal",
+    "depth",
+    "alpha",
+)
 """The pictures in a ``RenderResult``, by name."""
+
+
+HeldLayers = tuple[Tensor, Tensor, MetalPixels | None]
+"""``specular``, ``diffuse`` and ``metal`` of a result, without a gradient on the normals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +40,14 @@ class RenderResult:
         base: blended base color.
         reflection: the environment seen along the mirrored ray; None where the shading has no such layer.
         strength: [H, W] reflection strength in [0, 1]; None where the shading has none.
+        metalness: [H, W] share of metals in [0, 1]; None where the shading knows none.
         normal: blended normal in world axes, not normalized; None where the stage does not splat it.
         depth: [H, W] expected camera depth over alpha; None where not asked for.
         alpha: [H, W] in [0, 1].
         radii: [N] pixels, of the projected Gaussians; 0 where culled; None where there are no Gaussians.
-        held: ``specular`` and ``diffuse`` once more, without a gradient on the normals; None where not asked for.
+        held: ``specular``, ``diffuse`` and ``metal`` once more, without a gradient on the normals; None where not asked
+            for.
+        metal: what metals add to ``specular``; None where there is none.
     """
 
     final: Tensor
@@ -40,10 +60,25 @@ class RenderResult:
     depth: Tensor | None
     alpha: Tensor
     radii: Tensor | None = None
-    held: tuple[Tensor, Tensor] | None = None
+    held: HeldLayers | None = None
+    metal: MetalPixels | None = None
+    metalness: Tensor | None = None
 
     def to(self, device: torch.device | str) -> RenderResult:
         """The same on a device, but for ``held``; nothing is copied that is there already."""
-        layers = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "held"}
-        moved: dict[str, Any] = {name: t.to(device) for name, t in layers.items() if t is not None}
-        return replace(self, held=None, **moved)
+        layers = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {name: t.to(device) for name, t in layers.items() if isinstance(t, Tensor)}
+        metal = None if self.metal is None else type(self.metal)(*(t.to(device) for t in self.metal))
+        return replace(self, held=None, metal=metal, **moved)
+
+    def resized(self, width: int, height: int) -> RenderResult:
+        """The pictures in another size, each pixel that of the nearest place; without ``held`` and ``radii``."""
+        found: dict[str, Any] = {}
+        for name in LAYERS:
+            if (layer := getattr(self, name)) is not None:
+                rows, columns = (
+                    (torch.arange(new, device=layer.device) * old) // new
+                    for new, old in zip((height, width), layer.shape[:2], strict=True)
+                )
+                found[name] = layer[rows][:, columns]
+        return replace(self, held=None, radii=None, metal=None, **found)

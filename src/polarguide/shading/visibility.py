@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -45,17 +46,28 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
     return total
 
 
-def touching_views(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> Tensor:
-    """To how many pictures each Gaussian adds something: its blending weights there add up to ``LEAST_PIXELS``.
+class Touched(NamedTuple):
+    """What training pictures show of each Gaussian.
+
+    Attributes:
+        views: [N] float32, to how many pictures it adds something: its blending weights there add up to
+            ``LEAST_PIXELS``.
+        most: [N] pixels that it fills in the picture to which it adds most, counted by its blending weights.
+    """
+
+    views: Tensor
+    most: Tensor
+
+
+def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> Touched:
+    """What pictures from some cameras show of each Gaussian.
 
     Args:
         gaussians: the Gaussians. cameras: of the pictures. rasterize: of the backend.
-
-    Returns:
-        [N] float32 counts.
     """
     given = splats(gaussians)
-    counts = torch.zeros(len(given.means), device=given.means.device)
+    views = torch.zeros(len(given.means), device=given.means.device)
+    most = torch.zeros_like(views)
     for camera in cameras:
         # The gradient of the summed weights with respect to a feature is the sum of its Gaussian's weights.
         with torch.enable_grad():
@@ -63,5 +75,7 @@ def touching_views(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
             fixed = type(given)(*(tensor.detach() for tensor in given))
             rasterize(fixed._replace(features=features), camera).features.sum().backward()
         assert features.grad is not None
-        counts += (features.grad[:, 0] >= LEAST_PIXELS).float()
-    return counts
+        pixels = features.grad[:, 0]
+        views += (pixels >= LEAST_PIXELS).float()
+        most = torch.maximum(most, pixels)
+    return Touched(views, most)

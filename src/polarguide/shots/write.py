@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.errors import PolarguideError, optional_import
-from polarguide.files import atomic, make_folder, write_text, write_whole
+from polarguide.files import atomic, in_utf8, make_folder, write_text, write_whole
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
 from polarguide.shots.catalog import KINDS
@@ -189,8 +189,8 @@ def _write_exr(path: Path, values: NDArray[Any], unit: str, note: str) -> None:
     )
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage, "unit": unit, "comments": note}
     channels = {"Y": numbers} if numbers.ndim == 2 else {"RGB": numbers}
-    with atomic(path) as temporary, exr.File(header, channels) as file:
+    with atomic(path) as temporary, in_utf8(temporary) as name, exr.File(header, channels) as file:
         try:
-            file.write(str(temporary))
+            file.write(str(name))
         except RuntimeError as error:
             raise OSError(str(error).strip().splitlines()[-1]) from None

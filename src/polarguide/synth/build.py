@@ -103,27 +103,17 @@ def _radius(thing: Thing) -> float:
 
 def _user_mesh(path: Path) -> Mesh:
     """The mesh in a user's PLY or OBJ file, read by Mitsuba."""
-    import mitsuba as mi
-
     kind = path.suffix.lower().lstrip(".")
     require_unicode(path)
     if kind not in ("ply", "obj") or not path.is_file():
         raise PolarguideError(
             path,
             expected="a mesh as .ply or .obj",
-            found="nothing" if not path.is_file() else f"a {path.suffix} file",
+            found="nothing" if not path.is_file() else f"a name that ends in {path.suffix or 'nothing'}",
             remedy="File names of meshes are relative to the folder of the scene file.",
         )
-    try:
-        params = mi.traverse(mi.load_dict({"type": kind, "filename": str(path)}))
-    except RuntimeError as error:  # what Mitsuba says ends in the reason
-        reason = str(error).rpartition("shape plugin of type")[2].partition(": ")[2] or str(error)
-        raise PolarguideError(
-            path,
-            expected="a complete mesh of triangles",
-            found=" ".join(reason.split())[:200],
-            remedy="Export it again.",
-        ) from None
+    # flat first: Mitsuba makes normals before it compares corners with points, and writes where there are none
+    params = _mesh_arrays(path, kind, flat=True)
     points = np.array(params["vertex_positions"], float).reshape(-1, 3)
     faces = np.array(params["faces"], np.int64).reshape(-1, 3)
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # Mitsuba takes a negative corner for the first
@@ -132,11 +122,33 @@ def _user_mesh(path: Path) -> Mesh:
         raise PolarguideError(
             path, expected="triangles between its points", found=found, remedy="Export it again."
         )
+    params = _mesh_arrays(path, kind, flat=False)
     normals = np.array(params["vertex_normals"], float).reshape(-1, 3)
     uv = np.array(params["vertex_texcoords"], float).reshape(-1, 2)
     return Mesh(
         points, faces, uv if len(uv) else np.zeros((len(points), 2)), normals if len(normals) else None
     )
+
+
+def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
+    """What Mitsuba reads of a mesh, by its names; ``flat`` leaves normals at points out."""
+    import mitsuba as mi
+
+    try:
+        return mi.traverse(mi.load_dict({"type": kind, "filename": str(path), "face_normals": flat}))
+    except (
+        RuntimeError,
+        UnicodeDecodeError,
+    ) as error:  # what Mitsuba says ends in the reason, or quotes the file
+        quoted = isinstance(error, UnicodeDecodeError)
+        said = "a line of its header that is no text" if quoted else str(error)
+        reason = said.rpartition("shape plugin of type")[2].partition(": ")[2] or said
+        raise PolarguideError(
+            path,
+            expected="a complete mesh of triangles",
+            found=" ".join(reason.split())[:200],
+            remedy="Export it again.",
+        ) from None
 
 
 def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:

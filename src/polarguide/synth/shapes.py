@@ -65,7 +65,7 @@ def lathe(profile: list[list[float]], segments: int = 96, smooth: int = 8) -> Me
 
     ``smooth`` points are put between two points of the profile, on a Catmull-Rom curve; 0 keeps them as they are.
     """
-    corners = np.array(profile, float)
+    corners = _corners(profile, 2)
     if (corners[:, 0] < 0).any():
         raise ValueError(f"a radius of {corners[:, 0].min():g} in the profile")
     line = _curve(corners, smooth)
@@ -87,7 +87,7 @@ def lathe(profile: list[list[float]], segments: int = 96, smooth: int = 8) -> Me
 
 def tube(path: list[list[float]], radius: float = 0.1, segments: int = 24, smooth: int = 8) -> Mesh:
     """A round bar along a path through points."""
-    line = _curve(np.array(path, float), smooth)
+    line = _curve(_corners(path, 3), smooth)
     tangent = unit(np.gradient(line, axis=0))
     side = np.empty_like(line)
     side[0] = unit(np.cross(tangent[0], [0.3, 0.5, 0.81]))
@@ -127,6 +127,17 @@ def rock(radius: float = 1.0, rough: float = 0.25, seed: int = 0, detail: int = 
     bumps = fractal_noise(ball.points * 1.3 + 10, seed, octaves=4) - 0.5
     points = radius * ball.points * (1 + 2 * rough * bumps[:, None])
     return Mesh(points, ball.faces, ball.uv, smooth_normals(points, ball.faces))
+
+
+def _corners(points: list[list[float]], axes: int) -> Array:
+    """Two or more points of so many numbers each, as an array."""
+    try:
+        corners = np.array(points, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"points that are not all {axes} numbers") from None
+    if corners.ndim != 2 or corners.shape[1] != axes or len(corners) < 2:
+        raise ValueError(f"an array of shape {list(corners.shape)} where points are [2 or more, {axes}]")
+    return corners
 
 
 def _curve(points: Array, between: int) -> Array:

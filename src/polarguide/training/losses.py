@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from polarguide.camera import Camera
@@ -53,6 +55,8 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
 def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None = None) -> Tensor:
     """Mean of ``alpha - n . n_depth``: 0 where blended normals agree with each other and with the depth.
 
+    A picture without an inner pixel has no depth normals, and no loss.
+
     Args:
         result: with the blended normal ``n`` (unit normals times weights that add up to alpha) and the depth.
         camera: of the view.
@@ -60,6 +64,8 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
     """
     assert result.normal is not None
     assert result.depth is not None
+    if min(result.alpha.shape) < 3:
+        return result.alpha.new_zeros(())
     cosine = dot(result.normal, depth_normals(result.depth, camera))
     distance = result.alpha.detach() - cosine
     return (distance if weight is None else weight * distance)[1:-1, 1:-1].mean()
@@ -123,6 +129,27 @@ def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel)
     return (priors.stokes_weight * distance).mean()
 
 
+class _Shortest(torch.autograd.Function):
+    """Sum of the shortest scales where ``visible`` is 1.
+
+    One entry in three has a gradient, which autograd would find by comparing all of them with their minimum.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, log_scales: Tensor, visible: Tensor) -> Tensor:
+        shortest, which = log_scales.min(dim=1)
+        scales = shortest.exp_().mul_(visible)
+        ctx.save_for_backward(scales, which)
+        return scales.sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        scales, which = ctx.saved_tensors
+        to = scales.new_zeros(len(scales), 3)
+        return to.scatter_(1, which[:, None], (scales * grad)[:, None]), None
+
+
 def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
     """Mean shortest scale of the visible Gaussians in percent of the scene's extent.
 
@@ -130,8 +157,8 @@ def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
         log_scales: [N, 3]. radii: [N], 0 where not visible. extent: of the scene.
     """
     visible = (radii > 0).to(log_scales)
-    shortest = log_scales.amin(dim=1).exp()
-    return 100 / extent * (shortest * visible).sum() / visible.sum().clamp(min=1)
+    total: Tensor = _Shortest.apply(log_scales, visible)
+    return 100 / extent * total / visible.sum().clamp(min=1)
 
 
 def coverage_loss(alpha: Tensor, empty: Tensor) -> Tensor:
@@ -174,8 +201,8 @@ def step_loss(
         partial: what a view measured that does not determine the Stokes vector, in place of ``shown``.
     """
     if result.held is not None:
-        specular, diffuse = result.held
-        result = replace(result, specular=specular, diffuse=diffuse)
+        specular, diffuse, metal = result.held
+        result = replace(result, specular=specular, diffuse=diffuse, metal=metal)
     if partial is None:
         photometric = photometric_loss(result.final, shown, valid, ssim_weight)
         total = weights.photometric * photometric
@@ -212,7 +239,7 @@ def refuse_diverged(total: Tensor) -> None:
             "training",
             expected="a finite loss",
             found=str(float(total.sum())),
-            remedy="Lower the learning rates, or resume from an earlier checkpoint.",
+            remedy="Look at the pictures and poses (polarguide inspect); with a recipe of yours, lower its rates.",
         )
 
 

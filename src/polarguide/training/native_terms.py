@@ -83,9 +83,10 @@ class _PixelTerms(torch.autograd.Function):
         given = [None if t is None else t.detach().contiguous() for t in inputs]
         gradients = [None if t is None else torch.zeros_like(t) for t in given]
         # Pixels in a row; the depth stays a picture.
-        normal, specular, diffuse, depth, to_normal, to_specular, to_diffuse, to_depth = (
-            t if t is None or t.ndim == 2 else t.view(-1, 3) for t in (*given, *gradients)
-        )
+        (
+            (normal, specular, diffuse, metal, depth),
+            (to_normal, to_specular, to_diffuse, to_metal, to_depth),
+        ) = ([t if t is None or t.ndim == 2 else t.view(-1, 3) for t in of] for of in (given, gradients))
         assert normal is not None
         assert to_normal is not None
         frame = camera.rays().view(-1, 3), camera.pose(torch.float32, alpha.device).rotation
@@ -96,9 +97,22 @@ class _PixelTerms(torch.autograd.Function):
             assert to_specular is not None
             assert to_diffuse is not None
             measured, weight = p.measured.flatten(1, 2), p.weight.reshape(-1)
-            seen = specular, diffuse, measured, torch.tensor(p.analyzers), weight
-            to = to_normal, to_specular, to_diffuse
-            total += _native.polarization(normal, *frame, *seen, p.factor, p.refractive_index, *to)
+            total += _native.polarization(
+                normal,
+                *frame,
+                specular,
+                diffuse,
+                metal,
+                measured,
+                torch.tensor(p.analyzers),
+                weight,
+                p.factor,
+                p.refractive_index,
+                to_normal,
+                to_specular,
+                to_diffuse,
+                to_metal,
+            )
         for d in terms.directions:
             directions, weight = d.directions.reshape(-1, 3), d.weight.reshape(-1)
             total += _native.direction(normal, directions, weight, d.factor, d.plane, to_normal)
@@ -142,9 +156,18 @@ def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
         result.normal,
         result.specular if polarized else None,
         result.diffuse if polarized else None,
+        _field(result) if polarized else None,
         result.depth if deep else None,
     )
     return total
+
+
+def _field(result: RenderResult) -> Tensor | None:
+    """What metals add to the specular layer and to its polarization over ``sin^2(zenith)``, [P, 6]; None: no metal."""
+    if (metal := result.metal) is None:
+        return None
+    both = torch.cat((metal.specular, metal.slope * metal.specular), dim=1)
+    return both.new_zeros(result.alpha.numel(), 6).index_copy(0, metal.pixels, both)
 
 
 def fit_native(*tensors: Tensor | None) -> bool:

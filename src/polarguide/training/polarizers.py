@@ -110,7 +110,7 @@ class Polarizers:
         times = [FIRST]
         while self._unknown and times[-1] + EVERY <= LAST + 1e-9:
             times.append(times[-1] + EVERY)
-        self._due = {round(share * steps) for share in times} if self._places else set()
+        self._times = sorted({round(share * steps) for share in times}) if self._places else []
         if table is not None and table.shape[1] != len(self._places):
             raise ValueError(f"angles of {table.shape[1]} pictures, not {len(self._places)}")
         self.table = table
@@ -118,8 +118,18 @@ class Polarizers:
         self._believed = self._beliefs()
 
     def due(self, step: int) -> bool:
-        """Whether angles are to be fitted before a step."""
-        return step in self._due
+        """Whether angles are to be fitted before a step; none is once all fits have been made."""
+        return not self.settled and step in self._times
+
+    @property
+    def settled(self) -> bool:
+        """Whether all fits have been made."""
+        return self.table is not None and len(self.table) >= len(self._times)
+
+    @property
+    def search(self) -> int:
+        """Steps until unknown angles are found; 0 where there are none."""
+        return self._times[-1] if self._unknown else 0
 
     def believed(self, view: View) -> View:
         """A view with what is believed of its exposures."""

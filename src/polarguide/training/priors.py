@@ -27,6 +27,8 @@ MINIMUM_NORMAL = 0.3
 FULL_CERTAINTY = 3.0
 # Below this degree of polarization their plane takes the place of the AoLP's.
 CHROMATIC_PLANE_DOLP = 0.03
+# Shares of metals between which a pixel goes over from a dielectric to a metal.
+METAL = (0.25, 0.75)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +100,13 @@ class Unguided(NamedTuple):
 
     Attributes:
         usable: [H, W] bool, where the polarization is above the threshold and its noise.
+        degree: [H, W] DoLP, where the settings look at its noise without what that adds to it.
         zenith, azimuth: [H, W] radians, of the normals of the color differences; None where these are not asked for.
         certainty: [H, W] weight of these normals, in [0, 1], 0 where color decides nothing; None likewise.
     """
 
     usable: Tensor
+    degree: Tensor
     zenith: Tensor | None = None
     azimuth: Tensor | None = None
     certainty: Tensor | None = None
@@ -116,17 +120,32 @@ def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
         view: the capture; its device does the work. settings: of the priors. refractive_index: of all surfaces.
     """
     stokes = view.stokes()
+    luminance, noise = optics.luminance(stokes), _noise(view) if settings.snr else 0.0
     usable = optics.polarization_mask(
-        optics.luminance(stokes),
+        luminance,
         threshold=settings.threshold,
         invalid=view.invalid,
-        noise_sigma=_noise(view) if settings.snr else 0.0,
+        noise_sigma=noise,
         snr=settings.snr,
         saturated=view.saturated,
     )
+    degree = debiased_dolp(luminance, noise)
     if not settings.chromatic:
-        return Unguided(usable)
-    return Unguided(usable, *_chromatic_angles(stokes, refractive_index, ~(view.invalid | view.saturated)))
+        return Unguided(usable, degree)
+    return Unguided(
+        usable, degree, *_chromatic_angles(stokes, refractive_index, ~(view.invalid | view.saturated))
+    )
+
+
+def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
+    """DoLP [H, W] without what noise adds to it on average.
+
+    Args:
+        luminance: [3, H, W] Stokes vectors. noise: [H, W] standard deviation of one of the four intensities; 0: none.
+    """
+    if not isinstance(noise, Tensor):
+        return optics.dolp(luminance)
+    return optics.polarization_uncertainty(luminance, (noise * noise).expand(4, *noise.shape)).debiased
 
 
 def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -142,7 +161,12 @@ def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def view_priors(
-    view: View, normal: Tensor, settings: Priors, refractive_index: float, known: Unguided | None = None
+    view: View,
+    normal: Tensor,
+    settings: Priors,
+    refractive_index: float,
+    known: Unguided | None = None,
+    metal: Tensor | None = None,
 ) -> ViewPriors:
     """Compute the priors of one view.
 
@@ -152,10 +176,12 @@ def view_priors(
         settings: which candidates and which separation.
         refractive_index: of all surfaces.
         known: ``unguided`` of the view, where it is at hand.
+        metal: [H, W] share of metals: where there are some, what holds for dielectrics alone does not count. None: no
+            metal.
     """
     view = view.to(normal.device)
     rays = view.camera.rays(device=normal.device)
-    usable, *found = known or unguided(view, settings, refractive_index)
+    usable, degree, *found = known or unguided(view, settings, refractive_index)
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide, shown = guide_normals(view.camera.to_camera(normal), rays)
@@ -174,7 +200,6 @@ def view_priors(
         layers = optics.exact_separation(stokes, guide, rays, refractive_index)
         conditioned = layers.conditioned & shown & ~view.saturated
     plane = unit(torch.linalg.cross(rays, chosen))
-    degree = optics.dolp(luminance)
     weight = (degree / settings.full_dolp).clamp(max=1) * (usable if settings.live else usable & shown)
     if certainty is not None:
         # Nearly unpolarized light has no reliable AoLP; the slope among its colors may still have one.
@@ -183,10 +208,17 @@ def view_priors(
         weight = torch.maximum(weight, chromatic_weight)
     else:
         chromatic, chromatic_weight = chosen, torch.zeros_like(weight)
+    reliable = (~(view.invalid | view.saturated)).float()
+    if metal is not None:
+        body = 1 - ((metal - METAL[0]) / (METAL[1] - METAL[0])).clamp(0, 1)
+        conditioned, chromatic_weight = conditioned * body, chromatic_weight * body
+        # Light that is polarized in the plane of incidence was so before it fell on a metal: nothing here predicts it.
+        fit = 1 - (1 - body) * (_across(luminance, guide, rays) < 0)
+        weight, reliable = weight * fit, reliable * fit
     return ViewPriors(
         specular=srgb_encode((layers.specular / 2).clamp(0, 1)),
         diffuse=srgb_encode((layers.diffuse / 2).clamp(0, 1)),
-        separated=(conditioned & ~view.invalid).float(),
+        separated=conditioned * (~view.invalid).float(),
         normal=view.camera.to_world(chosen),
         plane=view.camera.to_world(plane),
         weight=weight,
@@ -194,10 +226,21 @@ def view_priors(
         chromatic_weight=chromatic_weight,
         camera=view.camera,
         stokes=stokes,
-        reliable=(~(view.invalid | view.saturated)).float(),
+        reliable=reliable,
         settings=settings,
         candidates=view.camera.to_world(_normals(candidates)) if settings.live else None,
     )
+
+
+def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
+    """Polarization [H, W] across the plane of incidence times ``sin^2(zenith)``; negative: in it.
+
+    Args:
+        luminance: [3, H, W]. normal, rays: [H, W, 3] camera axes.
+    """
+    x_ref, up_ref = optics.lens_frame(rays)
+    x, y = dot(normal, x_ref), dot(normal, up_ref)
+    return -(luminance[1] * (x * x - y * y) + luminance[2] * (2 * x * y))
 
 
 def _total(weight: Tensor, share: float) -> Tensor:

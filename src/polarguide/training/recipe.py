@@ -6,8 +6,9 @@ Nothing in the loop compares a step with a constant: boundaries are fractions of
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from polarguide.errors import PolarguideError
@@ -187,9 +188,32 @@ class Propagation:
     widen: float = 1.5
 
 
+class Method(ABC):
+    """What a run is trained as: a recipe, of Gaussians or of something else.
+
+    Attributes:
+        name: as given to ``--recipe``. about: one line.
+    """
+
+    name: str
+    about: str
+
+    @abstractmethod
+    def data(self) -> dict[str, Any]:
+        """All values as plain JSON types, for a run's folder."""
+
+    def as_recorded(self, data: Mapping[str, Any]) -> Method:
+        """The recipe as a run has it, whose folder has ``data``: of an earlier version it may know less."""
+        return self
+
+    def differs(self, data: Mapping[str, Any]) -> bool:
+        """Whether a value is another than in what a run's folder has of the recipe, as far as that goes."""
+        return _differs(self.data(), data)
+
+
 @dataclass(frozen=True)
-class Recipe:
-    """All that distinguishes one method from another.
+class Recipe(Method):
+    """All that distinguishes one method of Gaussians from another.
 
     Attributes:
         name: as given to ``--recipe``.
@@ -202,6 +226,7 @@ class Recipe:
             through what the layers mirror at them: the separated pictures are made with the normals of before, so that
             normals which follow them confirm their own errors.
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
+        metals: share of all steps between which refreshes look for metals, where the shading knows them.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
 
@@ -217,6 +242,7 @@ class Recipe:
     means_decay: float = 0.01
     hold_normals: bool = False
     oriented: bool = False
+    metals: tuple[float, float] = (0.4, 0.72)
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
     ssim_weight: float = 0.2
     densification: Densification = field(default_factory=Densification)
@@ -257,7 +283,19 @@ class Recipe:
         """Learning rates of the learned light's parameters."""
         return {name: given.rate for name, given in self.shading.light_parameters.items()}
 
+    def as_recorded(self, data: Mapping[str, Any]) -> Recipe:
+        """See ``Method``: shading that a version of before did not know is left out."""
+        return replace(self, shading=self.shading.as_recorded(data.get("shading") or {}))
+
     def data(self) -> dict[str, Any]:
         """All values as plain JSON types, for a run's folder."""
         plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "shading": self.shading.data()}))
         return plain
+
+
+def _differs(now: Mapping[str, Any], then: Mapping[str, Any]) -> bool:
+    """Whether one of the values of ``then`` is another now."""
+    return any(
+        _differs(now.get(key) or {}, value) if isinstance(value, dict) else now.get(key) != value
+        for key, value in then.items()
+    )

@@ -10,6 +10,8 @@ from polarguide.options import EXPOSURES, Exposures, check_choice, check_count
 
 MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
 Background = Literal["auto", "scene", "black", "masked"]
+Materials = Literal["auto", "dielectric"]
+MATERIALS: tuple[Materials, ...] = ("auto", "dielectric")
 BACKGROUNDS: tuple[Background, ...] = ("auto", "scene", "black", "masked")
 
 if TYPE_CHECKING:
@@ -37,6 +39,10 @@ class TrainSettings:
             views, 400,000 at most (or what the run to resume took).
         exposures: Which pictures of a scene with four to train on, as if no others had been taken: captured, all that
             there are. See compare.
+        begin_again: Where angles are unknown, begin again once they have been found, after two thirds of the steps:
+            normals follow polarization best where they know its angles from the start.
+        materials: What surfaces are made of: auto looks for metals, and heeds materials/ where the scene has it;
+            dielectric takes it that there is no metal.
     """
 
     steps: int = 5000
@@ -46,6 +52,8 @@ class TrainSettings:
     background: Background = "auto"
     gaussians: int = 0
     exposures: Exposures = "captured"
+    begin_again: bool = True
+    materials: Materials = "auto"
 
     def __post_init__(self) -> None:
         check_count("steps", self.steps, 0)
@@ -54,6 +62,7 @@ class TrainSettings:
         check_count("seed", self.seed, 0, MOST_SEEDS)
         check_choice("background", self.background, BACKGROUNDS)
         check_choice("exposures", self.exposures, EXPOSURES)
+        check_choice("materials", self.materials, MATERIALS)
         if not 1.0 < self.refractive_index < 4.0:
             raise PolarguideError(
                 "refractive_index",
@@ -68,15 +77,17 @@ class StepReport:
     """What a step reports to the progress display.
 
     Attributes:
-        step, stage, gaussians: plain values.
+        step, stage, gaussians: plain values; None of what has no Gaussians. done: steps so far, with those before the
+            training began again.
         measured: [3] photometric loss, PSNR and whole loss of this rank's views (their mean), on the device. Reading
             them waits for the device.
     """
 
     step: int
     stage: str
-    gaussians: int
+    gaussians: int | None
     measured: Tensor
+    done: int
 
     @property
     def loss(self) -> float:

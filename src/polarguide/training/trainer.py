@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -18,14 +19,22 @@ from polarguide.capture.background import empty_pixels, has_black_background
 from polarguide.color import srgb_encode
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
-from polarguide.gaussians.initialize import scene_extent
+from polarguide.gaussians.initialize import far_away, scene_extent
 from polarguide.raster import Backend, ScreenStatistic
 from polarguide.shading.gbuffer import COLOR_CHANNELS, render
 from polarguide.shading.model import PLAIN
-from polarguide.shading.visibility import outward_directions, touching_views
+from polarguide.shading.visibility import outward_directions, touched_pixels
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
+from polarguide.training.metals import (
+    CONTRADICTED,
+    contradiction,
+    decide,
+    evidence,
+    light_gain,
+    metalness_share,
+)
 from polarguide.training.packing import (
     Entry,
     Packed,
@@ -81,6 +90,7 @@ class Trainer:
         state: where to go on from, on the backend's device; None: from the beginning.
         ranks: the processes that share the views of each step.
         store: keeps what is computed of the views; None: in memory.
+        warn: told what the user should know.
 
     Attributes:
         shading: the recipe's, for the run's refractive index.
@@ -98,16 +108,16 @@ class Trainer:
         state: TrainingState | None = None,
         ranks: Ranks = ALONE,
         store: ViewStore | None = None,
+        warn: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
         self.ranks, self._device = ranks, backend.device
+        self._warn = warn
         self.whole = True
         self.schedule = Schedule(recipe, settings.steps)
         self.shading = recipe.shading.bind(settings.refractive_index)
         self.black = is_black(scene, settings)
-        self.state = state or first_state(
-            scene, recipe, settings, backend.device, surroundings=not self.black
-        )
+        self.state = state or self._first_state()
         self.polarizers = Polarizers(scene, recipe, settings.steps, self.state.angles)
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
@@ -121,6 +131,25 @@ class Trainer:
         self._store = store or ViewStore()
         self._partial: dict[str, PartialView] = {}
 
+    def _first_state(self) -> TrainingState:
+        return first_state(self.scene, self.recipe, self.settings, self._device, surroundings=not self.black)
+
+    @property
+    def begins_again(self) -> bool:
+        """Whether the training begins, or has begun, again with the angles that it found."""
+        return self.settings.begin_again and self.polarizers.search > 0
+
+    @property
+    def total(self) -> int:
+        """Steps in all, with those in search of angles before it begins again."""
+        return self.settings.steps + (self.polarizers.search if self.begins_again else 0)
+
+    @property
+    def done(self) -> int:
+        """Those of them that are done."""
+        before = self.polarizers.search if self.begins_again and self.polarizers.settled else 0
+        return before + self.state.step
+
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
         """Train until the last step (or ``until``), reporting each step."""
         while self.state.step < (self.settings.steps if until is None else until):
@@ -128,11 +157,15 @@ class Trainer:
 
     def step(self) -> StepReport:
         """One optimizer step."""
+        if self.polarizers.due(self.state.step):
+            self.whole = False
+            self._fit_polarizers()
+            if self.polarizers.settled and self.begins_again:
+                self._begin_again()
+            self.whole = True
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
-        self.whole = not (position.actions or self.polarizers.due(state.step))
-        if self.polarizers.due(state.step):
-            self._fit_polarizers()
+        self.whole = not position.actions
         for action in position.actions:
             self._act(action)
         mine = self.ranks.slots(views)
@@ -142,7 +175,7 @@ class Trainer:
         self._join_gradients(idle=not mine)
         self._optimize()
         mean = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
-        report = StepReport(state.step, position.stage.name, len(state.gaussians), mean)
+        report = StepReport(state.step, position.stage.name, len(state.gaussians), mean, self.done + 1)
         state.step += 1
         if position.stage.densify and state.step % recipe.densification.every == 0:
             self.exchange_statistics()
@@ -157,7 +190,7 @@ class Trainer:
                 limit=self._limit,
                 generator=seeded(self.settings.seed, 2, state.step),
             )
-        if self.black and position.stage.densify and not self._densifies_next():
+        if position.stage.densify and not self._densifies_next():
             self._prune_untouched()
         self.whole = True
         return report
@@ -168,11 +201,21 @@ class Trainer:
         return step < self.settings.steps and self.schedule.at(step).stage.densify
 
     def _prune_untouched(self) -> None:
-        """Remove Gaussians that too few training views can tell anything about: in new views they are fog."""
-        state, views = self.state, self.scene.train_views
-        counts = touching_views(state.gaussians, [view.camera for view in views], self.backend.rasterize)
-        self.ranks.broadcast(counts)
-        kept = counts >= (2 if len(views) >= ENOUGH_VIEWS else 1)
+        """Remove Gaussians that show too little.
+
+        Before nothing, those that too few training views can tell anything about: in new views they are fog. And those
+        that are faint in all training views, where the recipe says how faint.
+        """
+        state, views, faint = self.state, self.scene.train_views, self.recipe.densification.faint_pixels
+        if not (self.black or faint):
+            return
+        cameras = [view.camera for view in views]
+        touched = touched_pixels(state.gaussians, cameras, self.backend.rasterize)
+        for values in touched:
+            self.ranks.broadcast(values)
+        kept = touched.most >= faint
+        if self.black:
+            kept &= touched.views >= (2 if len(views) >= ENOUGH_VIEWS else 1)
         if bool(kept.any()):
             state.gaussians.keep(kept)
             state.statistics.clear(len(state.gaussians))
@@ -282,6 +325,13 @@ class Trainer:
             for kind in ("shown", "unguided", "priors"):
                 self._store.drop(kind, name)
 
+    def _begin_again(self) -> None:
+        """Back to the first step, with what was found of the polarizers."""
+        angles = self.state.angles
+        self.state = self._first_state()
+        self.state.angles = angles
+        self._store.drop("priors")
+
     def _act(self, action: Action) -> None:
         if action == "reset_opacity":
             reset_opacity(self.state, self.shading)
@@ -295,8 +345,34 @@ class Trainer:
             self.ranks.broadcast(outward)
             gaussians.overwrite("outward", outward)
         else:
+            first, last = self.recipe.metals
+            sought = self.shading.knows_metals and self.settings.materials == "auto"
+            if sought and first <= self.state.step / self.settings.steps < last:
+                self._find_metals()
             self.state.frozen = self.state.gaussians.snapshot()
             self._store.drop("priors")
+
+    @torch.no_grad()
+    def _find_metals(self) -> None:
+        """Decide which Gaussians are metals, and begin with what was measured of those that are new."""
+        gaussians, views = self.state.gaussians, [v for v in self.scene.train_views if v.is_determined]
+        if not views:
+            return
+        rasterize, index = self.backend.rasterize, self.settings.refractive_index
+        found = evidence(gaussians, views, rasterize, index)
+        if (share := contradiction(found)) > CONTRADICTED:
+            self._warn(
+                f"materials/ contradicts itself on {100 * share:.0f} % of what it shows: dielectric in one view, metal "
+                "in another. The larger part counts; look at the files."
+            )
+        centers = torch.stack([view.camera.center for view in self.scene.train_views])
+        near = ~far_away(gaussians["means"].detach().cpu(), self.scene.points, centers)
+        was = gaussians["metalness"] > 0
+        metal, reflectance = decide(found, was, near.to(self._device)).float(), found.reflectance
+        for values in (metal, reflectance):
+            self.ranks.broadcast(values)
+        gain = partial(light_gain, gaussians, self.state.light, views, rasterize, self.shading)
+        self.shading.become_metal(gaussians, self.state.light, metal > 0, reflectance, gain)
 
     def _view_of(self, place: int) -> View:
         """The view at a place in the sequence of all views ever trained on.
@@ -344,6 +420,7 @@ class Trainer:
             guide = render(self.state.frozen, view.camera, self.backend.rasterize, sh_degree=0).normal
         assert guide is not None
         settings, index = self.recipe.priors, self.settings.refractive_index
+        metal = metalness_share(self.state.frozen, view.camera, self.backend.rasterize)
 
         def make() -> Entry:
             found = unguided(view.to(guide.device), settings, index)._asdict()
@@ -352,7 +429,7 @@ class Trainer:
         # It can be had again for a part of the work, so that it is not worth a file.
         kept = self._store.get("unguided", view.name, make, disposable=True)
         known = Unguided(**{name: part.codes for name, part in kept.items()})
-        return pack_priors(view_priors(view, guide, settings, index, known), fields)
+        return pack_priors(view_priors(view, guide, settings, index, known, metal), fields)
 
 
 @torch.no_grad()

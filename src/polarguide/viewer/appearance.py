@@ -14,7 +14,7 @@ from polarguide.presentation import Crop, Presentation, Vector, balanced
 from polarguide.rendering.picking import SurfacePoint, surface_at
 from polarguide.scene_frame import SceneFrame
 from polarguide.shading.result import RenderResult
-from polarguide.viewer.shown import Shown
+from polarguide.viewer.shown import Scenery
 from polarguide.viewer.viewport import letterbox
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
@@ -61,7 +61,7 @@ class Painter:
 
     def paint(
         self,
-        shown: Shown,
+        shown: Scenery,
         camera: Camera,
         appearance: Appearance,
         view: View | None = None,
@@ -94,7 +94,7 @@ class Painter:
 
     def point(
         self,
-        shown: Shown,
+        shown: Scenery,
         camera: Camera,
         appearance: Appearance,
         view: View | None,
@@ -107,7 +107,7 @@ class Painter:
         result = self._result(shown, camera, plain)
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
 
-    def _result(self, shown: Shown, camera: Camera, appearance: Appearance) -> RenderResult:
+    def _result(self, shown: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
         crop, turn = appearance.crop, None
         kept = None if crop is None else lambda means: crop.inside(means, self.around)
         if appearance.turn % 360:
@@ -132,7 +132,7 @@ class Painter:
             self._depths = depth_range(values, result.alpha > 0.5)
         return layer_picture(result, layer, camera, self._depths)
 
-    def _measured(self, shown: Shown, view: View, appearance: Appearance) -> Picture:
+    def _measured(self, shown: Scenery, view: View, appearance: Appearance) -> Picture:
         """A picture of the photograph's size."""
         brighter = 2.0**appearance.exposure
         if appearance.layer == "photograph":

@@ -136,10 +136,13 @@ def _camera(camera: _Camera, reach: float) -> dict[str, Any]:
     def pixels(value: float) -> int:
         return int(min(max(_finite(value), 1), LARGEST_WINDOW))
 
+    position, look_at = placed(camera.position), placed(camera.look_at)
+    if position == look_at:  # viser would ask for the direction
+        raise Refused("a camera that looks at itself")
     return {
         "wxyz": _unit(camera.wxyz),
-        "position": placed(camera.position),
-        "look_at": placed(camera.look_at),
+        "position": position,
+        "look_at": look_at,
         "up_direction": _unit(camera.up_direction),
         "fov": min(max(_finite(camera.fov), FIELD_OF_VIEW[0]), FIELD_OF_VIEW[1]),
         "near": min(max(_finite(camera.near), 1e-9), 1e9),

@@ -25,7 +25,7 @@ from polarguide.viewer.guard import guarded
 from polarguide.viewer.messages import Accepts, checked
 from polarguide.viewer.panel import NOTHING, PanelOptions
 from polarguide.viewer.session import Session
-from polarguide.viewer.shown import Shown
+from polarguide.viewer.shown import Scenery
 
 REFRESH = 1.0  # least seconds between two pictures of a training,
 SHARE = 10.0  # which are also at least this multiple of the time that the last one took
@@ -61,7 +61,7 @@ class Viewer:
 
     def __init__(
         self,
-        current: Callable[[], Shown],
+        current: Callable[[], Scenery],
         photographs: Mapping[str, Photograph],
         *,
         shading: ShadingModel,

@@ -21,7 +21,7 @@ from polarguide.viewer.keyframes import FRAMES_PER_SECOND, Keyframes
 from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
 from polarguide.viewer.pose import ViewPose, move_to_view
 from polarguide.viewer.presenting import Presenting
-from polarguide.viewer.shown import Shown
+from polarguide.viewer.shown import Scenery
 from polarguide.viewer.viewport import free_camera
 from polarguide.visualization.figures import Picture, png_bytes
 
@@ -252,7 +252,7 @@ class Session:
                 "sharp" if self._screenshot or self._presenting.waits else self.pacing.due(time.monotonic())
             )
 
-    def draw(self, shown: Shown, kind: str) -> None:
+    def draw(self, shown: Scenery, kind: str) -> None:
         """Render a picture and send it to the browser."""
         began = time.monotonic()
         with self._lock:

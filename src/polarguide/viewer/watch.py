@@ -18,14 +18,14 @@ from polarguide.presentation import (
     write_presentation,
 )
 from polarguide.progress import SILENT, Reporter
+from polarguide.runs.families import AnyTrainer
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
-from polarguide.training.trainer import Trainer
 from polarguide.viewer.frusta import photographs
 from polarguide.viewer.panel import NOTHING
 from polarguide.viewer.server import Viewer
-from polarguide.viewer.shown import Shown, shown_run, shown_training
+from polarguide.viewer.shown import Scenery, shown_run, shown_training
 
 PATIENCE = 0.2  # seconds between two looks at whether a paused training should end
 
@@ -86,7 +86,7 @@ def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
 
 @contextmanager
 def watched(
-    trainer: Trainer,
+    trainer: AnyTrainer,
     host: str,
     port: int,
     visitors: VisitorOptions = VisitorOptions(),
@@ -123,7 +123,7 @@ def watched(
 
 @contextmanager
 def _opened(
-    current: Callable[[], Shown],
+    current: Callable[[], Scenery],
     scene: Scene,
     shading: ShadingModel,
     name: str,

@@ -6,6 +6,7 @@ busy forever. Parsing the structure first gives a clear error.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -66,6 +67,8 @@ def _images(data: bytes) -> int:
     (count,) = struct.unpack_from("<Q", data)
     at = 8
     for _ in range(_at_most(count, len(data) // 73)):
+        if not all(map(math.isfinite, struct.unpack_from("<7d", data, at + 4))):
+            raise ValueError("an image whose pose is not finite")
         name = data.find(b"\0", at + 64, at + 64 + _LONGEST_NAME)
         if name < 0:
             raise ValueError("an image without the end of its name")

@@ -22,6 +22,11 @@ from polarguide.errors import PolarguideError
 
 FARTHEST = 1e9
 """The largest coordinate and focal length; single precision tells nothing apart beyond."""
+FARTHEST_CENTER = 1e4
+"""Of the principal point from the picture's corner, in sides of the picture, which may be a crop of a larger one."""
+SHORTEST_FOCAL = 1e-4
+"""In sides of the picture."""
+LENS = f"positive focal lengths and a principal point, at most {FARTHEST_CENTER:g} sides of the picture away"
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 # Perspective models that are a plain pinhole when all of their distortion parameters are zero.
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -118,7 +123,7 @@ def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: s
     """
     if (camera.width, camera.height) == (width, height):
         return camera
-    if camera.width * height != camera.height * width:
+    if camera.width * height != camera.height * width or not camera.width:
         raise PolarguideError(
             f"{folder} (camera of view {view})",
             expected=f"the size of the pictures, {width}x{height}",
@@ -229,6 +234,15 @@ def is_pinhole(camera: Any) -> bool:
     return camera.model_name in PINHOLES and all(camera.params[index] == 0 for index in extra)
 
 
+def is_lens(camera: Any) -> bool:
+    """Whether a camera of pycolmap's has numbers that a lens can have, in single precision, too; false for NaN."""
+    focal = camera.params[camera.focal_length_idxs()]
+    center = np.abs(camera.params[camera.principal_point_idxs()])
+    side = max(camera.width, camera.height, 1)  # that it has none is said where it meets its pictures
+    sound = (np.abs(camera.params) <= FARTHEST).all() and (center <= FARTHEST_CENTER * side).all()
+    return bool(sound and (focal >= SHORTEST_FOCAL * side).all())
+
+
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     where = f"{folder} (camera {camera.camera_id}, image {image.name})"
     if not is_pinhole(camera):
@@ -242,11 +256,11 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     rotation = np.asarray(placed.rotation.matrix(), dtype=np.float64)
     translation = np.asarray(placed.translation, dtype=np.float64)
     inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    sound = bool((np.abs([*translation, *inner]) <= FARTHEST).all()) and min(inner[:2]) > 1 / FARTHEST
+    sound = bool((np.abs(translation) <= FARTHEST).all()) and is_lens(camera)
     if not sound or abs(float(np.linalg.norm(placed.rotation.quat)) - 1.0) > 1e-6:
         raise PolarguideError(
             where,
-            expected=f"a unit quaternion, a translation up to {FARTHEST:g} and positive focal lengths",
+            expected=f"a unit quaternion, a translation up to {FARTHEST:g} and {LENS}",
             found=f"quaternion {placed.rotation.quat}, translation {translation}, intrinsics {inner}",
             remedy="Export the model again.",
         )

@@ -10,7 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.capture.colmap.model import FARTHEST, MODEL_FILES, find_model, load_model, posed_images
+from polarguide.capture.colmap.model import (
+    FARTHEST,
+    LENS,
+    MODEL_FILES,
+    find_model,
+    is_lens,
+    load_model,
+    posed_images,
+)
 from polarguide.capture.colmap.undistort import Geometry, Undistortion, camera_for_picture, undistortion
 from polarguide.capture.colmap.write import PosedCamera, write_cameras
 from polarguide.capture.view import listed
@@ -152,13 +160,12 @@ class Poses:
         pose = image.cam_from_world()
         quaternion, translation = np.asarray(pose.rotation.quat), np.asarray(pose.translation)
         camera = self._model.cameras[image.camera_id]
-        sound = bool((np.abs([*translation, *camera.params]) <= FARTHEST).all())  # false for NaN, too
-        least = min(float(camera.params[index]) for index in camera.focal_length_idxs())
+        sound = bool((np.abs(translation) <= FARTHEST).all()) and is_lens(camera)  # false for NaN, too
         turned = abs(float(np.linalg.norm(quaternion)) - 1) <= 1e-3
-        if not (sound and turned and least > 1 / FARTHEST):
+        if not (sound and turned):
             raise PolarguideError(
                 f"{self.folder} (image {image.name})",
-                expected=f"a pose and a lens of numbers up to {FARTHEST:g}, and positive focal lengths",
+                expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",
                 found=f"quaternion {quaternion}, translation {translation}, camera {camera.params}",
                 remedy="Export the model again, or leave the image out.",
             )

@@ -24,6 +24,8 @@ LARGEST_PIXELS = 150_000_000
 _DECODED = 16
 """Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on."""
 
+MOST_MATERIAL = 2
+
 
 def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
     """Decode a photograph.
@@ -38,7 +40,7 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
         [H, W, 3] uint8 or uint16, RGB, as stored. A gray picture becomes three equal channels.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, or of another kind.
+        PolarguideError: the file is damaged, cut short, of another kind, or transparent somewhere.
     """
     pixels = decode_stored(path, data)
     if pixels.dtype.kind == "f":
@@ -49,6 +51,14 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
             expected="a picture with 8 or 16 bits a channel",
             found=f"values of type {pixels.dtype}",
             remedy="Save it as 16-bit PNG with value 65535 for linear intensity 1.",
+        )
+    clear = 0.0 if pixels.shape[2:] != (4,) else float((pixels[..., 3] < np.iinfo(pixels.dtype).max).mean())
+    if clear:
+        raise PolarguideError(
+            path,
+            expected="an opaque picture",
+            found=f"{clear:.1%} of it transparent",
+            remedy="Save it without transparency; what is not to be looked at belongs into masks/ or invalid/.",
         )
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2)
@@ -89,6 +99,24 @@ def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_
     if any_value:
         return np.asarray(gray > 0)
     return np.asarray((gray > 0) & (2.0 * gray >= float(gray.max())))
+
+
+def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
+    """Decode a picture of materials into [H, W]: 0 unknown, 1 dielectric, 2 metal.
+
+    Raises:
+        PolarguideError: the file is damaged, cut short, of another kind, or has another value.
+    """
+    pixels = decode_stored(path, data)
+    gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
+    if int(gray.max(initial=0)) > MOST_MATERIAL:
+        raise PolarguideError(
+            path,
+            expected="the numbers 0 (unknown), 1 (dielectric) and 2 (metal)",
+            found=f"{int(gray.max())}",
+            remedy="Write these numbers themselves, not levels of gray.",
+        )
+    return np.asarray(gray, np.uint8)
 
 
 def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:

@@ -16,6 +16,7 @@ from polarguide.capture.formats.arrays import array_kind, read_array
 from polarguide.capture.formats.integrity import damaged
 from polarguide.capture.formats.pictures import LARGEST_PIXELS, read_file
 from polarguide.errors import PolarguideError, optional_import
+from polarguide.files import in_utf8
 
 _HDR_SIZE = re.compile(rb"[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
 _EXR_MAGIC, _EXR_PARTS = b"\x76\x2f\x31\x01", 0x1000
@@ -85,7 +86,8 @@ def _read_exr(path: Path, wanted: tuple[str, ...] | None = None) -> NDArray[Any]
     if data.startswith(_EXR_MAGIC):
         try:
             exr_size(data)
-            pixels = _exr_channels(path, openexr, wanted)
+            with in_utf8(path) as name:
+                pixels = _exr_channels(name, openexr, wanted)
         except Exception as error:  # the binding raises whatever C++ threw
             found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
     if pixels is None:

@@ -22,7 +22,7 @@ from polarguide.capture.sensor.analyzers import (
 )
 from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.errors import PolarguideError
-from polarguide.files import require_file, write_whole
+from polarguide.files import in_utf8, require_file, write_whole
 from polarguide.records import decode
 
 FORMAT, VERSION = "polarguide-analyzers", 1
@@ -92,7 +92,7 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
     """
     require_file(path, expected="a calibration of polarguide calibrate", remedy=_REMEDY)
     try:
-        with safe_open(path, framework="numpy") as file:
+        with in_utf8(path) as name, safe_open(name, framework="numpy") as file:
             entries, names = file.metadata() or {}, list(file.keys())
             vectors = file.get_tensor(_TENSOR) if names == [_TENSOR] else None
     except (SafetensorError, ValueError, OSError, RuntimeError, TypeError) as error:

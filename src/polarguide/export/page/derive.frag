@@ -1,5 +1,5 @@
 // One fragment per Gaussian: what depends on the eye but not on the pixel.
-layout(location = 0) out vec4 color;  // base color or albedo; strength or roughness
+layout(location = 0) out vec4 color;  // base color or albedo; strength or roughness; of metals see splat.frag
 layout(location = 1) out vec4 normal;  // world axes, toward the eye; opacity
 #if defined(LOCAL) || defined(DIRECTIONAL)
 layout(location = 2) out vec4 further; // light of its own, or features
@@ -57,6 +57,11 @@ void main() {
 #else
   vec3 base = 0.28209479177387814 * direct + harmonics(gaussian, 3, unpackHalf2x16(t1.w).y, ray) + 0.5;
   color = vec4(max(base, 0.0), shares.y);
+#endif
+#ifdef METAL
+  uvec4 t10 = texel(gaussian, 10);
+  vec4 metal = vec4(unpackHalf2x16(t10.x), unpackHalf2x16(t10.y));
+  if (metal.r > 0.0) color = vec4(metal.rgb, -1.0 - metal.a);
 #endif
 #ifdef LOCAL
   uvec4 t6 = texel(gaussian, 6);

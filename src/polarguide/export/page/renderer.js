@@ -11,11 +11,13 @@ class Renderer {
     if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float"))
       throw new Unable("This GPU cannot render to float textures.");
     this.gl = gl;
-    this.targetCount = { plain: 2, reflection: 3, local: 4, directional: 4 }[scene.kind];
-    this.further = this.targetCount > 3;
+    this.further = ["local", "directional"].includes(scene.kind);
+    this.targetCount = { plain: 2, reflection: 3, local: 4, directional: 4 }[scene.kind] + (scene.metal ? 1 : 0);
+    if (gl.getParameter(gl.MAX_DRAW_BUFFERS) < this.targetCount)
+      throw new Unable(`This GPU cannot render to ${this.targetCount} textures at once, which metals take.`);
     this.defines = `#define TEXELS ${scene.texels}\n#define WIDTH ${scene.width || 4}\n` +
-      [scene.kind.toUpperCase(), scene.kind !== "plain" && "LIT", scene.blend === "fresnel" && "FRESNEL"]
-        .filter(Boolean).map((name) => `#define ${name}\n`).join("");
+      [scene.kind.toUpperCase(), scene.kind !== "plain" && "LIT", scene.blend === "fresnel" && "FRESNEL",
+        scene.metal && "METAL"].filter(Boolean).map((name) => `#define ${name}\n`).join("");
     this.deriver = this.program(shaders.full, shaders.records + shaders.derive);
     this.splatter = this.program(shaders.records + shaders.splat_vert, shaders.splat_frag);
     this.shader = this.program(shaders.full, shaders.light + shaders.shade);
@@ -178,6 +180,7 @@ class Renderer {
       turn: ["mat3", turning(this.scene.up, -turn * Math.PI / 180)],
       layer: ["1i", layer], split: ["1f", split], gain: ["1f", gain], exposure: ["1f", exposure], white: ["3f", white],
       index: ["1f", this.scene.index], resolution: ["1i", this.scene.resolution], levels: ["1i", this.scene.levels],
+      mips: ["1i", this.scene.mips || 0],
     });
     gl.bindVertexArray(this.nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

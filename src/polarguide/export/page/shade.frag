@@ -1,10 +1,10 @@
 // From the blended layers to the picture: deferred reflection per pixel, as shading/render.py and directional.py.
-uniform sampler2D target0, target1, target2, target3;
+uniform sampler2D target0, target1, target2, target3, target4;
 uniform mat3 rotation; // world to camera
 uniform mat3 turn;     // of the environment, world to learned axes
 uniform vec4 lens;
 uniform vec2 size;
-uniform int layer;     // 0 final, 1 diffuse, 2 specular, 3 base, 4 strength, 5 normal
+uniform int layer;     // 0 final, 1 diffuse, 2 specular, 3 base, 4 strength, 5 normal, 6 metalness
 uniform float split;   // left of this column stands the diffuse layer
 uniform float gain;    // on the specular layer
 uniform float exposure;
@@ -58,6 +58,36 @@ vec3 radiance(vec3 direction, float roughness, vec4 feature) {
 }
 #endif
 
+#ifdef METAL
+const float METAL_BLUR = 4.0, LEAST_METAL = 0.01; // of shading/metal.py
+uniform int mips; // of the radiance, behind the raw texels
+
+// Radiance from a direction, blurred by so many levels; as mips.py.
+vec3 blurred(vec3 direction, float level) {
+  level = clamp(level, 0.0, float(mips - 1));
+  int lower = min(int(level), mips - 2), first = 6 * (resolution + 2) * (resolution + 2), n = resolution;
+  for (int k = 0; k < lower; ++k) {
+    first += 6 * (n + 2) * (n + 2);
+    n = max(n / 2, 1);
+  }
+  vec3 fine = lookUp(first, n, 1, 0, direction).rgb;
+  vec3 coarse = lookUp(first + 6 * (n + 2) * (n + 2), max(n / 2, 1), 1, 0, direction).rgb;
+  return mix(fine, coarse, level - float(lower));
+}
+
+// (Rs + Rp) / 2 of a conductor by its reflectance at normal incidence; as optics/conductor.py.
+vec3 conductor(float cosine, vec3 reflectance) {
+  vec3 r = clamp(reflectance, 0.1, 0.985), n = 2.1 - 1.9 * r;
+  vec3 k2 = ((n + 1.0) * (n + 1.0) * r - (n - 1.0) * (n - 1.0)) / (1.0 - r);
+  float c = clamp(cosine, 0.0, 1.0), sine2 = 1.0 - c * c;
+  vec3 real = n * n - k2 - sine2, squared = sqrt(real * real + 4.0 * n * n * k2);
+  vec3 larger = sqrt(0.5 * (squared + abs(real)));
+  vec3 across = 2.0 * c * mix(n * sqrt(k2) / larger, larger, greaterThanEqual(real, vec3(0.0)));
+  vec3 s = (squared + c * c - across) / (squared + c * c + across), x = c * c * squared + sine2 * sine2;
+  return 0.5 * s * (1.0 + (x - across * sine2) / (x + across * sine2));
+}
+#endif
+
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
   vec4 base = texelFetch(target0, at, 0);
@@ -90,6 +120,13 @@ void main() {
   float c = clamp(-dot(ray, facing), 0.0, 1.0), t = sqrt(index * index - 1.0 + c * c), p = index * index * c;
   float s2 = (c - t) / (c + t), p2 = (p - t) / (p + t);
   specular = strength * 0.5 * (s2 * s2 + p2 * p2) * lit;
+#ifdef METAL
+  float metal = further.y;
+  if (metal > LEAST_METAL) {
+    vec3 seen = max(blurred(direction, METAL_BLUR * further.z / metal) + texelFetch(target3, at, 0).rgb, 0.0);
+    specular += metal * conductor(c, texelFetch(target4, at, 0).rgb / metal) * seen;
+  }
+#endif
 #else
   specular = strength * lit;
   diffuse = (1.0 - strength) * base.rgb;
@@ -100,6 +137,10 @@ void main() {
   int which = pixel.x < split ? 1 : layer;
   vec3 seen = encode(which == 0 ? diffuse + specular : which == 1 ? diffuse : which == 2 ? specular : base.rgb);
   if (which == 4) seen = texelFetch(viridis, ivec2(int(clamp(strength, 0.0, 1.0) * 255.0 + 0.5), 0), 0).rgb;
+#ifdef METAL
+  if (which == 6)
+    seen = texelFetch(viridis, ivec2(int(clamp(further.y, 0.0, 1.0) * 255.0 + 0.5), 0), 0).rgb;
+#endif
   if (which == 5) {
     float size_ = sqrt(squared);
     seen = 0.5 * (size_ > 1e-8 ? rotation * normal * vec3(1.0, -1.0, -1.0) / size_ : vec3(0.0)) + 0.5;

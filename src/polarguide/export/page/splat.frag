@@ -12,6 +12,9 @@ layout(location = 2) out vec4 target2;
 #if defined(LOCAL) || defined(DIRECTIONAL)
 layout(location = 3) out vec4 target3;
 #endif
+#ifdef METAL
+layout(location = 4) out vec4 target4; // reflectance of metals
+#endif
 
 void main() {
   float alpha = min(0.99, normal.w * exp(-0.5 * dot(place, place)));
@@ -23,6 +26,13 @@ void main() {
   // Surroundings have no features, and no surface that reflects.
   float surface = dot(further, further) > 0.0 ? 1.0 : 0.0;
   target3 = vec4(alpha * vec3(further.zw, surface), alpha);
+#elif defined(METAL)
+  // A metal has no base color and no strength: its reflectance stands in place of the one, -1 - roughness of the other.
+  bool metal = color.a < 0.0;
+  if (metal) target0.rgb = vec3(0.0);
+  target2 = vec4(alpha * (metal ? vec3(0.0, 1.0, -1.0 - color.a) : vec3(color.a, 0.0, 0.0)), alpha);
+  target3 = vec4(alpha * further.rgb, alpha);
+  target4 = vec4(metal ? alpha * color.rgb : vec3(0.0), alpha);
 #elif defined(LOCAL)
   target2 = vec4(alpha * color.a, 0.0, 0.0, alpha);
   target3 = vec4(alpha * further.rgb, alpha);

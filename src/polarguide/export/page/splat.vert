@@ -11,7 +11,7 @@ flat out vec4 normal;
 flat out vec4 further;
 out vec2 place; // in standard deviations
 
-const float BLUR = 0.3, MARGIN = 0.15, NEAR = 0.01;
+const float BLUR = 0.1, MARGIN = 0.15, NEAR = 0.01;
 
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: nothing is drawn

@@ -1,0 +1,309 @@
+"""Captures with other pictures than four angles a view: what they are, and whether they agree with what is said.
+
+A short training that is told no angle finds that of every picture in closed form (``training.polarizers``). What it
+finds is compared with what the capture says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polarguide.capture import Scene
+from polarguide.capture.exposures import Exposure
+from polarguide.capture.view import View, listed
+from polarguide.inspection.capture import Capture
+from polarguide.inspection.short_run import short_run
+from polarguide.inspection.verdict import Check, Verdict
+from polarguide.raster import Backend
+from polarguide.recipes import recipe_named
+from polarguide.training.polarizers import LAST, Judgment, Polarizers
+from polarguide.training.recipe import Recipe
+from polarguide.training.trainer import StepReport
+
+RECIPE = "polarguide-stokes"
+CERTAIN = 0.7
+"""Certainty (``FittedAngle``), over the median of all pictures, from which one may be said to contradict its angle."""
+CONTRADICTS = 30.0
+"""Degrees from the angle that is said from which on a picture contradicts it, if that is also four times its spread and
+four standard deviations of all differences. The short training is 3 to 7 degrees off (median) on four scenes."""
+ALIKE = 0.8
+"""Length of the mean of (cos 2d, sin 2d), d being differences of angles, from which on they agree with each other."""
+FEWEST = 4
+"""Pictures that tell their angle from which on something is said of all."""
+SENSE_NEEDS = 0.95
+"""Said angles whose doubled directions have a mean longer than this are too much alike to tell a sense."""
+ZERO_OFF, ZERO_WRONG = 4.0, 8.0
+"""Degrees of a common offset, beyond four standard errors: for a warning, and for the verdict "wrong"."""
+FEW_ANGLES = 3
+"""Different angles from which on S1 and S2 can be told apart, over the capture."""
+
+
+@dataclass(frozen=True)
+class ShotFindings:
+    """What the short training found of the pictures' polarizers.
+
+    Attributes:
+        judgments: of each picture through a filter, as if nothing were known of it; empty without a training.
+        said: what the capture says of each of them.
+        why: why there was no training.
+    """
+
+    judgments: tuple[Judgment, ...] = ()
+    said: tuple[Exposure, ...] = ()
+    why: str = ""
+
+    @property
+    def telling(self) -> list[tuple[Judgment, float]]:
+        """Pictures that tell their angle, with the one that is said."""
+        rows = zip(self.judgments, self.said, strict=True)
+        return [(j, s.angle) for j, s in rows if s.angle is not None and not (j.vague or j.unfiltered)]
+
+    def record(self) -> dict[str, Any]:
+        """As plain JSON types."""
+        pictures = [
+            {
+                "view": judgment.view,
+                "picture": judgment.number,
+                "said_degrees": said.angle,
+                "found_degrees": judgment.angle,
+                "spread_degrees": judgment.spread,
+                "gain": judgment.gain,
+                "certainty": judgment.certainty,
+                "filtered": not judgment.unfiltered,
+                "tells": not (judgment.vague or judgment.unfiltered),
+            }
+            for judgment, said in zip(self.judgments, self.said, strict=True)
+        ]
+        return {"pictures": pictures, "why_not": self.why}
+
+
+def untold(scene: Scene) -> Scene:
+    """The scene as if no angle of a picture through a filter were known."""
+
+    def blank(view: View) -> View:
+        return view.with_exposures(tuple(replace(e, angle=None) if e.filtered else e for e in view.exposures))
+
+    return replace(scene, views=tuple(blank(view) for view in scene.views))
+
+
+def find_shots(
+    scene: Scene,
+    folder: Path,
+    *,
+    steps: int,
+    backend: Backend,
+    on_step: Callable[[StepReport], None],
+) -> ShotFindings:
+    """Train without any angle until all are found.
+
+    Args:
+        scene: at the size to train at, with views that are trained on. folder: where the state is kept.
+        steps: about how many to take. backend: device and rasterizer. on_step: called after every step.
+    """
+    if not any(exposure.filtered for view in scene.train_views for exposure in view.exposures):
+        return ShotFindings(why="No picture was taken through a filter.")
+    recipe = recipe_named(RECIPE)
+    assert isinstance(recipe, Recipe)
+    blind, total = untold(scene), math.ceil(steps / LAST)
+    until = Polarizers(blind, recipe, total).search + 1  # angles are fitted when a step begins
+    state = short_run(
+        blind, folder, steps=total, until=until, recipe=recipe, backend=backend, on_step=on_step
+    )
+    judgments = Polarizers(blind, recipe, total, state.angles).judgments()
+    said = {view.name: view.exposures for view in scene.train_views}
+    return ShotFindings(tuple(judgments), tuple(said[j.view][j.number] for j in judgments))
+
+
+def pictures_check(capture: Capture) -> Check:
+    """What pictures there are, and whether their angles differ enough."""
+    key, title = "pictures", "Pictures"
+    exposures = [exposure for view in capture.views for exposure in view.exposures]
+    angles = sorted({exposure.angle for exposure in exposures if exposure.angle is not None})
+    unknown = sum(not exposure.known for exposure in exposures)
+    plain = sum(not exposure.filtered for exposure in exposures)
+    known = len(exposures) - unknown - plain
+    gains = [exposure.gain for exposure in exposures]
+    figures = {"pictures": len(exposures), "angles": angles, "unknown": unknown, "plain": plain,
+               "gains": [min(gains), max(gains)]}  # fmt: skip
+    parts = []
+    if known:
+        parts.append(f"{known} at {len(angles)} known angles ({listed([f'{angle:g}' for angle in angles])})")
+    if unknown:
+        parts.append(f"{unknown} at unknown angles")
+    if plain:
+        parts.append(f"{plain} without a filter")
+    said = f"{len(exposures)} pictures of {len(capture.views)} views: {', '.join(parts)}; gains "
+    said += f"{min(gains):.2f} to {max(gains):.2f}."
+    if plain == len(exposures):
+        return Check(
+            key, title, "wrong", said, "Polarization takes pictures through a filter: photograph some views so.",
+            figures=figures,
+        )  # fmt: skip
+    if not unknown and len(angles) < FEW_ANGLES:
+        return Check(
+            key, title, "warning", said,
+            "Turn the filter between shots: with at least three angles, spread over half a turn, no direction of "
+            "the polarization stays unseen.", figures=figures,
+        )  # fmt: skip
+    return Check(key, title, "ok", said, figures=figures)
+
+
+def shot_checks(found: ShotFindings) -> list[Check]:
+    """Whether the pictures agree with what is said of them: filter, sense, zero, and each by itself."""
+    if found.why:
+        said = [("modulation", "Filter"), ("handedness", "Sense of the angles"),
+                ("zero_offset", "Zero of the angles"), ("angles", "Angles of the pictures")]  # fmt: skip
+        return [Check(key, title, "not verified", found.why) for key, title in said]
+    sense, offset, error = _common(found.telling)
+    return [
+        _modulation(found),
+        _sense(found, sense),
+        _zero(found, sense, offset, error),
+        _each(found, sense, offset),
+    ]
+
+
+def _common(telling: Sequence[tuple[Judgment, float]]) -> tuple[int | None, float, float]:
+    """Sense (1, or -1 for reversed; None where neither agrees), common offset in degrees, its standard error."""
+    if len(telling) < FEWEST:
+        return None, 0.0, math.inf
+    angles = np.radians([(j.angle, s) for j, s in telling])
+    turns = [np.exp(2j * (angles[:, 0] - sign * angles[:, 1])) for sign in (1, -1)]
+    lengths = [abs(turn.mean()) for turn in turns]
+    alike = abs(np.exp(2j * angles[:, 1]).mean()) > SENSE_NEEDS
+    sense = 1 if lengths[0] >= lengths[1] or alike else -1
+    turn = turns[0 if sense == 1 else 1]
+    if abs(turn.mean()) < ALIKE / 2:
+        return None, 0.0, math.inf
+    # The mean, then once more without those that contradict it.
+    near = turn[np.abs(np.angle(turn / turn.mean())) < math.radians(2 * CONTRADICTS)]
+    offset = float(np.degrees(np.angle(near.mean())) / 2)
+    apart = np.degrees(np.angle(near / near.mean())) / 2
+    return sense, offset, float(1.4826 * np.median(np.abs(apart)) / math.sqrt(len(near)) * 1.25)
+
+
+def _modulation(found: ShotFindings) -> Check:
+    key, title = "modulation", "Filter"
+    count = len(found.judgments)
+    plain = tuple(dict.fromkeys(j.view for j in found.judgments if j.unfiltered))
+    vague = sum(j.vague for j in found.judgments)
+    certainty = float(np.median([j.certainty for j in found.judgments]))
+    figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "certainty": certainty}
+    said = f"{count - len(plain) - vague} of {count} pictures tell the angle of their filter."
+    if 2 * len(plain) > count:
+        return Check(
+            key, title, "wrong",
+            f"No modulation: was the filter reversed, or missing? {len(plain)} of {count} pictures look as if taken "
+            "without one.",
+            "Hold the filter before an LCD screen and turn it: the side that is towards the screen when it goes dark "
+            "must face the scene. If the filter was right: photograph glossy surfaces obliquely (50 to 65 degrees).",
+            plain, figures,
+        )  # fmt: skip
+    if plain:
+        return Check(
+            key, title, "warning", f"{said} Taken without a filter, as it looks: {listed(list(plain))}.",
+            "If so, write none for them in angles.csv.", plain, figures,
+        )  # fmt: skip
+    if 2 * vague > count:
+        return Check(
+            key, title, "warning", f"{said} The others show too little polarization for that.",
+            "Photograph glossy surfaces obliquely (50 to 65 degrees); or train longer with --steps.",
+            figures=figures,
+        )  # fmt: skip
+    return Check(key, title, "ok", said, figures=figures)
+
+
+def _sense(found: ShotFindings, sense: int | None) -> Check:
+    key, title = "handedness", "Sense of the angles"
+    telling = found.telling
+    if len(telling) < FEWEST:
+        return Check(key, title, "n/a" if _all_unknown(found) else "not verified", _too_few(found))
+    said = np.radians([angle for _, angle in telling])
+    if abs(np.exp(2j * said).mean()) > SENSE_NEEDS or abs(np.exp(4j * said).mean()) > SENSE_NEEDS:
+        return Check(
+            key,
+            title,
+            "not verified",
+            "The angles that are said, modulo 90 degrees, differ too little to tell.",
+        )
+    if sense is None:
+        return Check(key, title, "warning", "The pictures agree with neither sense.", _remedy_of_chaos())
+    if sense == -1:
+        return Check(
+            key, title, "wrong", "Clockwise as displayed: the pictures agree only if the angles count the other way.",
+            "Repeat prepare with the other --sense and a new --out.", figures={"counter_clockwise": 0.0},
+        )  # fmt: skip
+    return Check(key, title, "ok", "Counter-clockwise as displayed.", figures={"counter_clockwise": 1.0})
+
+
+def _zero(found: ShotFindings, sense: int | None, offset: float, error: float) -> Check:
+    key, title = "zero_offset", "Zero of the angles"
+    if sense is None:
+        return Check(key, title, "n/a" if _all_unknown(found) else "not verified", _too_few(found))
+    figures = {"offset_degrees": offset, "error_degrees": error}
+    said = f"The zero of the filter lies at {offset:+.1f}° ± {error:.1f}° from where it is said to lie."
+    if abs(offset) <= max(ZERO_OFF, 4 * error):
+        return Check(key, title, "ok", said, figures=figures)
+    verdict: Verdict = "wrong" if abs(offset) > max(ZERO_WRONG, 4 * error) else "warning"
+    return Check(
+        key, title, verdict, said,
+        f"Repeat prepare with --zero changed by {offset:+.0f} degrees and a new --out; this training itself is good "
+        "to a few degrees.", figures=figures,
+    )  # fmt: skip
+
+
+def _each(found: ShotFindings, sense: int | None, offset: float) -> Check:
+    key, title = "angles", "Angles of the pictures"
+    unknown = sum(not said.known for said in found.said)
+    if sense is None:
+        chaos = len(found.telling) >= FEWEST
+        verdict: Verdict = "wrong" if chaos else "ok" if _all_unknown(found) else "not verified"
+        said = "The pictures contradict the angles that are said." if chaos else _too_few(found)
+        return Check(key, title, verdict, said, _remedy_of_chaos() if chaos else "")
+    rows = [(j, _apart(j.angle, sense * said + offset), said) for j, said in found.telling]
+    typical = float(np.median([abs(apart) for _, apart, _ in rows]))
+    certain = CERTAIN * float(np.median([j.certainty for j in found.judgments]))
+    off = [
+        (j, said)
+        for j, apart, said in rows
+        if abs(apart) > max(CONTRADICTS, 4 * j.spread, 4 * 1.4826 * typical) and j.certainty > certain
+    ]
+    figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}
+    said = f"{len(rows)} pictures lie {typical:.1f}° from the angles that are said (median)."
+    if not off:
+        return Check(key, title, "ok", said, figures=figures)
+    names = [
+        f"{j.view} ({angle:g}°, looks like {(sense * (j.angle - offset)) % 180:.0f}°)" for j, angle in off
+    ]
+    return Check(
+        key, title, "wrong" if 5 * len(off) > len(rows) else "warning",
+        f"{said} Contradicting: {listed(names)}.",
+        "Compare them with your notes; correct their lines of angles.csv, or write unknown.",
+        tuple(dict.fromkeys(j.view for j, _ in off)), figures,
+    )  # fmt: skip
+
+
+def _apart(first: float, second: float) -> float:
+    """Degrees between two angles modulo 180, in [-90, 90)."""
+    return (first - second + 90.0) % 180.0 - 90.0
+
+
+def _all_unknown(found: ShotFindings) -> bool:
+    return all(said.angle is None for said in found.said)
+
+
+def _too_few(found: ShotFindings) -> str:
+    if _all_unknown(found):
+        return "No angle is said: training finds them."
+    count = len(found.telling)
+    return f"Only {count} pictures tell their angle, and one is said: too few to compare."
+
+
+def _remedy_of_chaos() -> str:
+    return "Look for shifted lines in angles.csv, or prepare with --angles unknown: training then finds the angles."

@@ -1,0 +1,262 @@
+"""What differs between trainings of Gaussians and of fields, for whoever trains or opens a run."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from polarguide.capture import Scene
+from polarguide.errors import PolarguideError
+from polarguide.neural.model import FieldModel
+from polarguide.neural.recipe import NeuralRecipe
+from polarguide.neural.trainer import FieldTrainer
+from polarguide.options import SceneOptions
+from polarguide.progress import Reporter
+from polarguide.raster import Backend
+from polarguide.runs.angles import report_polarizers
+from polarguide.runs.defaults import most_gaussians, with_defaults
+from polarguide.runs.folder import CHECKPOINT, PLY, AnyState
+from polarguide.runs.forecast import Forecast, forecast
+from polarguide.runs.memory import MemoryPlan, plan_field_memory, plan_memory
+from polarguide.runs.model import GaussianModel, Model
+from polarguide.runs.point_cloud import write_run_ply
+from polarguide.shading.model import ShadingModel
+from polarguide.training.distributed import Ranks
+from polarguide.training.recipe import Method, Recipe
+from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.trainer import Trainer
+from polarguide.training.view_store import ViewStore
+
+
+class AnyTrainer(Protocol):
+    """What the loop of a training asks for; see ``training.trainer.Trainer``."""
+
+    scene: Scene
+    settings: TrainSettings
+    ranks: Ranks
+    whole: bool
+
+    @property
+    def shading(self) -> ShadingModel:
+        """Which layers there are, and what light is learned."""
+
+    @property
+    def total(self) -> int:
+        """Steps in all, with those before it begins again."""
+
+    @property
+    def done(self) -> int:
+        """Those of them that are done."""
+
+    @property
+    def state(self) -> AnyState:
+        """Between two steps."""
+
+    def step(self) -> StepReport:
+        """One optimizer step."""
+
+    def exchange_statistics(self) -> None:
+        """Before a checkpoint: let every rank know what all have seen."""
+
+
+class Family(ABC):
+    """A kind of recipes. ``method`` is always of this kind, and so are states and trainers."""
+
+    leaves: str
+    """The file that a finished training of this kind has written at last."""
+
+    @abstractmethod
+    def filled(
+        self, settings: TrainSettings, scene: Scene, method: Any, resumed: TrainSettings | None
+    ) -> TrainSettings:
+        """The settings with what nobody gave, or what the run to resume took.
+
+        Raises:
+            PolarguideError: a setting that means nothing here.
+        """
+
+    @abstractmethod
+    def plan(
+        self, pixels: Sequence[int], method: Any, asked: int, reading: SceneOptions, *, held: bool
+    ) -> MemoryPlan:
+        """How a training stays within its memory; ``asked``: most Gaussians, 0: by the pixels."""
+
+    def check(self, state: Any, settings: TrainSettings, out: Path) -> None:
+        """Refuse a checkpoint that does not belong to the settings of its run.
+
+        Raises:
+            PolarguideError: it does not.
+        """
+        if state.step > settings.steps:
+            raise PolarguideError(
+                out / CHECKPOINT,
+                expected=f"the state of a training of {settings.steps} steps",
+                found=f"one after step {state.step}",
+                remedy="Train again into a new folder.",
+            )
+
+    @abstractmethod
+    def trainer(
+        self,
+        scene: Scene,
+        method: Any,
+        settings: TrainSettings,
+        backend: Backend,
+        state: Any,
+        ranks: Ranks,
+        store: ViewStore,
+        reporter: Reporter,
+    ) -> AnyTrainer:
+        """What trains; it says what it takes for granted about the scene."""
+
+    def forecast(
+        self, scene: Scene, method: Any, settings: TrainSettings, backend: Backend, peak: int
+    ) -> Forecast | None:
+        """What the training will take; None: it is not estimated."""
+        return None
+
+    @abstractmethod
+    def model(self, state: Any, method: Any, settings: TrainSettings, backend: Backend) -> Model:
+        """What was learned, for whoever scores or shows it."""
+
+    @abstractmethod
+    def finish(self, out: Path, trainer: Any, model: Any, reporter: Reporter) -> None:
+        """Write what a finished training leaves beside its checkpoint."""
+
+
+class GaussianFamily(Family):
+    """Recipes of Gaussians."""
+
+    leaves = PLY
+
+    def filled(
+        self, settings: TrainSettings, scene: Scene, method: Recipe, resumed: TrainSettings | None
+    ) -> TrainSettings:
+        """See ``Family``."""
+        return with_defaults(settings, scene, method, resumed)
+
+    def plan(
+        self, pixels: Sequence[int], method: Recipe, asked: int, reading: SceneOptions, *, held: bool
+    ) -> MemoryPlan:
+        """See ``Family``."""
+        gaussians = asked or most_gaussians(sum(pixels), method)
+        return plan_memory(pixels, method, gaussians, limit=reading.memory, held=held)
+
+    def check(self, state: Any, settings: TrainSettings, out: Path) -> None:
+        """See ``Family``; refuses sums of the density control for other views a step, too."""
+        super().check(state, settings, out)
+        sums = state.statistics.gradient
+        found = sums.shape[0] if sums.ndim == 2 else 1
+        if found != settings.views_per_step:
+            raise PolarguideError(
+                out / CHECKPOINT,
+                expected=f"the state of a training with {settings.views_per_step} views a step",
+                found=f"one with {found}",
+                remedy="Train again into a new folder.",
+            )
+
+    def trainer(
+        self,
+        scene: Scene,
+        method: Recipe,
+        settings: TrainSettings,
+        backend: Backend,
+        state: Any,
+        ranks: Ranks,
+        store: ViewStore,
+        reporter: Reporter,
+    ) -> Trainer:
+        """See ``Family``."""
+        made = Trainer(scene, method, settings, backend, state, ranks, store, reporter.warn)
+        if made.black and settings.background == "auto":
+            reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
+        if made.polarizers.ignored:
+            reporter.warn(_ignored(method))
+        return made
+
+    def forecast(
+        self, scene: Scene, method: Recipe, settings: TrainSettings, backend: Backend, peak: int
+    ) -> Forecast | None:
+        """See ``Family``."""
+        return forecast(scene, method, settings, backend, peak)
+
+    def model(self, state: Any, method: Recipe, settings: TrainSettings, backend: Backend) -> GaussianModel:
+        """See ``Family``."""
+        return GaussianModel(state, method.shading.bind(settings.refractive_index), backend)
+
+    def finish(self, out: Path, trainer: Trainer, model: GaussianModel, reporter: Reporter) -> None:
+        """See ``Family``: what was found out of polarizers, and the PLY."""
+        report_polarizers(out, trainer.scene, trainer.polarizers, reporter)
+        centers = torch.stack([view.camera.center for view in trainer.scene.views])
+        write_run_ply(out / PLY, model.state, model.shading, centers)
+
+
+class FieldFamily(Family):
+    """Recipes of neural fields."""
+
+    leaves = CHECKPOINT
+
+    def filled(
+        self, settings: TrainSettings, scene: Scene, method: NeuralRecipe, resumed: TrainSettings | None
+    ) -> TrainSettings:
+        """See ``Family``."""
+        for name, found, least in (
+            ("gaussians", settings.gaussians, 0),
+            ("views_per_step", settings.views_per_step, 1),
+        ):
+            if found > least:
+                raise PolarguideError(
+                    name,
+                    expected=f"{least} with the recipe {method.name}, a field",
+                    found=str(found),
+                    remedy="Leave it out.",
+                )
+        steps = settings.steps or (resumed.steps if resumed is not None else method.steps)
+        return TrainSettings(**{**vars(settings), "steps": steps})
+
+    def plan(
+        self, pixels: Sequence[int], method: NeuralRecipe, asked: int, reading: SceneOptions, *, held: bool
+    ) -> MemoryPlan:
+        """See ``Family``."""
+        return plan_field_memory(pixels, method, limit=reading.memory, held=held)
+
+    def trainer(
+        self,
+        scene: Scene,
+        method: NeuralRecipe,
+        settings: TrainSettings,
+        backend: Backend,
+        state: Any,
+        ranks: Ranks,
+        store: ViewStore,
+        reporter: Reporter,
+    ) -> FieldTrainer:
+        """See ``Family``."""
+        if not all(view.is_determined for view in scene.train_views):
+            reporter.warn(_ignored(method))
+        return FieldTrainer(scene, method, settings, backend.device, state, store)
+
+    def model(
+        self, state: Any, method: NeuralRecipe, settings: TrainSettings, backend: Backend
+    ) -> FieldModel:
+        """See ``Family``."""
+        return FieldModel(state, method, backend.device)
+
+    def finish(self, out: Path, trainer: Any, model: Any, reporter: Reporter) -> None:
+        """See ``Family``: nothing."""
+
+
+def family_of(method: Method) -> Family:
+    """The family of a recipe."""
+    return FieldFamily() if isinstance(method, NeuralRecipe) else GaussianFamily()
+
+
+def _ignored(method: Method) -> str:
+    return (
+        f"the recipe {method.name} has no term for single pictures through a filter: it takes them for "
+        "photographs without one."
+    )

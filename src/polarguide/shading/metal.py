@@ -1,0 +1,162 @@
+"""Metals beside dielectrics in the deferred shading model.
+
+A Gaussian is a metal or none (``metalness`` 1 or 0, found by ``training.metals`` or said by masks, never learned). A
+metal has no body that light comes back from: its base color and its strength do not count. What it reflects is
+
+    specular = R(r, i) max(0, L(mirrored ray, roughness) + l)
+
+with R of a conductor (``optics.conductor``) of reflectance r at normal incidence per color, the light of the learned
+environment blurred by the roughness (its mips), and l the light of the Gaussians' own, as for dielectrics. Blended are
+``metalness``, and reflectance and roughness times ``metalness``; a pixel that metals share with others adds both.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.camera import Camera
+from polarguide.optics.conductor import LARGEST_REFLECTANCE
+from polarguide.shading.mips import box_mips, mip_lookup
+from polarguide.shading.native import conductor_native
+from polarguide.vectors import dot, unit
+
+# Of which a metal's reflectance is trained between these.
+LEAST = 0.2
+# Mip levels from a mirror to a roughness of 1.
+BLUR = 4.0
+FIRST_REFLECTANCE, FIRST_ROUGHNESS = 0.7, 0.3
+CHANNELS = 5
+# Pixels with less of a metal than this are shaded as dielectrics alone.
+MINIMUM_SHARE = 0.01
+
+_known: dict[int, tuple[weakref.ref[Tensor], int, bool]] = {}
+
+
+class MetalPixels(NamedTuple):
+    """What metals add to a picture of P pixels.
+
+    Attributes:
+        pixels: [K] int64, those that show metal, ascending.
+        share: [K] blended metalness in [0, 1].
+        specular: [K, 3] what metals reflect there.
+        slope: [K, 3] its degree of polarization over ``sin^2(zenith)``.
+    """
+
+    pixels: Tensor
+    share: Tensor
+    specular: Tensor
+    slope: Tensor
+
+
+def any_metal(metalness: Tensor) -> bool:
+    """Whether one Gaussian is a metal; False of a tensor without values. The device is asked once for each state of a
+    tensor: after a change of metals, and when Gaussians come or go.
+    """
+    if metalness.is_meta:
+        return False
+    kept = _known.get(id(metalness))
+    if kept is not None and kept[0]() is metalness and kept[1] == metalness._version:
+        return kept[2]
+    found = bool((metalness > 0).any())
+    key = id(metalness)
+    _known[key] = (weakref.ref(metalness, lambda _: _known.pop(key, None)), metalness._version, found)
+    return found
+
+
+def reflectance(logits: Tensor) -> Tensor:
+    """Reflectance at normal incidence of its parameter, within what metals have."""
+    return LEAST + (LARGEST_REFLECTANCE - LEAST) * torch.sigmoid(logits)
+
+
+def reflectance_logits(values: Tensor) -> Tensor:
+    """The inverse of ``reflectance``; values beyond its range, and the ends themselves, come a little inside."""
+    return torch.logit(((values - LEAST) / (LARGEST_REFLECTANCE - LEAST)).clamp(0.02, 0.98))
+
+
+def metal_channels(metalness: Tensor, reflectances: Tensor, roughness: Tensor) -> Tensor:
+    """What is blended of metals, [N, 5]: reflectance and roughness times metalness, and metalness between them."""
+    m = metalness[:, None]
+    return torch.cat((m * reflectances, m, m * roughness[:, None]), dim=1)
+
+
+def metal_mips(light: Tensor) -> list[Tensor]:
+    """Levels of radiance from afar [6, R, R, 3] that metals see, from a mirror's to a roughness of 1."""
+    return box_mips(light)[: math.ceil(BLUR) + 1]
+
+
+def metal_pixels(
+    features: Tensor, rays: Tensor, normal: Tensor, light: Tensor, local: Tensor | None
+) -> MetalPixels:
+    """Shade what shows metal.
+
+    Args:
+        features: [P, 5] blended ``metal_channels``. rays: [P, 3] unit, world. normal: [P, 3] blended, world.
+        light: [6, R, R, 3] radiance from afar. local: [P, 3] light of the Gaussians' own.
+    """
+    pixels = (features[:, 3].detach() > MINIMUM_SHARE).nonzero()[:, 0]
+    metal, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
+    share = metal[:, 3]
+    along = dot(rays, facing)[:, None]
+    inverse = 1 / share.clamp(min=MINIMUM_SHARE)
+    level = BLUR * metal[:, 4] * inverse
+    seen = mip_lookup(metal_mips(light), (rays - 2 * along * facing).contiguous(), level)
+    if local is not None:
+        seen = (seen + local[pixels]).clamp(min=0)
+    reflectances = metal[:, :3] * inverse[:, None]
+    if metal.device.type == "cpu" and metal.dtype == torch.float32:
+        mean, slope = conductor_native(-along[:, 0], reflectances)
+    else:
+        mean, slope = optics.conductor(-along, reflectances)
+    return MetalPixels(pixels, share, share[:, None] * mean * seen, slope)
+
+
+def with_metal(layers: Mapping[str, Tensor], metal: MetalPixels) -> dict[str, Tensor]:
+    """Layers of a picture [H, W, 3] and what metals add to them."""
+    return {**layers, **{name: add_metal(layers[name], metal) for name in ("final", "specular")}}
+
+
+def add_metal(layer: Tensor, metal: MetalPixels) -> Tensor:
+    """A picture [H, W, 3] and what metals reflect in it."""
+    return layer.flatten(0, 1).index_add(0, metal.pixels, metal.specular).view_as(layer)
+
+
+def metalness_picture(metal: MetalPixels | None, like: Tensor) -> Tensor:
+    """Blended metalness [H, W] of a picture with as many pixels as ``like`` [H, W, ...] has."""
+    empty = like.new_zeros(like.shape[0] * like.shape[1])
+    if metal is not None:
+        empty = empty.index_copy(0, metal.pixels, metal.share.detach())
+    return empty.view(like.shape[:2])
+
+
+def metal_stokes(
+    specular: Tensor,
+    diffuse: Tensor,
+    normal: Tensor,
+    metal: MetalPixels,
+    camera: Camera,
+    refractive_index: float,
+) -> Tensor:
+    """Stokes vectors [3, K, 3] of the pixels that show metal, from layers on the scale of S0/2.
+
+    What metals reflect has their degree of polarization, the rest that of a dielectric's lobes.
+
+    Args:
+        specular, diffuse, normal: [H, W, 3]. metal: with what it adds to ``specular``.
+    """
+    at = metal.pixels
+    rays = camera.rays(device=normal.device).flatten(0, 1)[at]
+    facing = unit(camera.to_camera(normal).flatten(0, 1)[at])
+    over, under = specular.flatten(0, 1)[at], diffuse.flatten(0, 1)[at]
+    stokes = optics.predicted_stokes(2 * (over - metal.specular), 2 * under, facing, rays, refractive_index)
+    x_ref, up_ref = optics.lens_frame(rays)
+    x, y = dot(facing, x_ref)[:, None], dot(facing, up_ref)[:, None]
+    polarized = 2 * metal.slope * metal.specular
+    added = torch.stack((2 * metal.specular, -polarized * (x * x - y * y), -polarized * (2 * x * y)))
+    return stokes + added

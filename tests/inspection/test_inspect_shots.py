@@ -1,0 +1,110 @@
+"""Inspection of single shots: what is said of their angles is compared with what the pictures tell."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from single_shots import single_shots
+
+import polarguide
+from polarguide.capture.exposures import Exposure
+from polarguide.errors import PolarguideError
+from polarguide.inspection.settings import InspectSettings
+from polarguide.inspection.shots import ShotFindings, shot_checks
+from polarguide.inspection.verdict import Check
+from polarguide.training.polarizers import Judgment
+
+TURNS = (0.0, 45.0, 90.0, 135.0)
+
+
+def judgment(view: int, angle: float, certainty: float = 0.9, spread: float = 3.0) -> Judgment:
+    unknown = Exposure()
+    return Judgment(f"v{view}", 0, unknown, unknown, angle % 180.0, 1.0, certainty, spread, 0.02)
+
+
+def findings(found: list[float], said: list[float | None], certainty: float = 0.9) -> ShotFindings:
+    judgments = tuple(judgment(k, angle, certainty) for k, angle in enumerate(found))
+    return ShotFindings(judgments, tuple(Exposure(angle) for angle in said))
+
+
+def checks(found: ShotFindings) -> dict[str, Check]:
+    return {check.key: check for check in shot_checks(found)}
+
+
+def scattered(count: int = 24) -> list[float]:
+    """Angles that a short training would find for ``TURNS`` in turn."""
+    return [TURNS[k % 4] + (-4, 3, 1, -2, 2)[k % 5] for k in range(count)]
+
+
+SAID = [TURNS[k % 4] for k in range(24)]
+
+
+def test_what_agrees_is_right() -> None:
+    found = checks(findings(scattered(), list(SAID)))
+    assert {key: check.verdict for key, check in found.items()} == dict.fromkeys(
+        ("modulation", "handedness", "zero_offset", "angles"), "ok"
+    )
+
+
+def test_the_other_sense() -> None:
+    said = [(-angle) % 180 for angle in SAID]
+    found = checks(findings(scattered(), said))
+    assert found["handedness"].verdict == "wrong"
+    assert "--sense" in found["handedness"].remedy
+    assert found["angles"].verdict == "ok"
+
+
+def test_the_sense_of_right_angles_alone_does_not_show() -> None:
+    said = [90.0 * (k % 2) for k in range(24)]
+    found = checks(findings([angle + 2 for angle in said], said))
+    assert found["handedness"].verdict == "not verified"
+    assert found["zero_offset"].verdict == "ok"
+
+
+def test_another_zero_and_a_wrong_line() -> None:
+    found = scattered()
+    said = [angle + 20 for angle in SAID]
+    said[7] = (said[7] + 90) % 180
+    told = checks(findings(found, said))
+    assert told["zero_offset"].verdict == "wrong"
+    assert "--zero changed by -20 degrees" in told["zero_offset"].remedy
+    assert told["angles"].verdict == "warning"
+    assert told["angles"].views == ("v7",)
+    assert "(65°, looks like 156°)" in told["angles"].finding
+
+
+def test_angles_that_have_nothing_to_do_with_the_pictures() -> None:
+    found = [37.0 * k % 180 for k in range(24)]
+    told = checks(findings(found, [53.0 * k % 180 for k in range(24)]))
+    assert told["angles"].verdict == "wrong"
+    assert "--angles unknown" in told["angles"].remedy
+
+
+def test_no_filter_and_unknown_angles() -> None:
+    told = checks(findings(scattered(), list(SAID), certainty=0.01))
+    assert told["modulation"].verdict == "wrong"
+    assert "reversed, or missing" in told["modulation"].finding
+    told = checks(findings(scattered(), [None] * 24))
+    assert [told[key].verdict for key in ("modulation", "handedness", "angles")] == ["ok", "n/a", "ok"]
+
+
+@pytest.mark.slow
+def test_a_folder_of_single_shots(demo_scene: Path, tmp_path: Path) -> None:
+    scene = single_shots(demo_scene, tmp_path / "shots", wrong=(11,))
+    polarguide.inspect(scene, tmp_path / "out", settings=InspectSettings(steps=400))
+    record = json.loads((tmp_path / "out" / "inspection.json").read_text())
+    verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
+    assert verdicts["modulation"] == verdicts["handedness"] == verdicts["zero_offset"] == "ok"
+    assert "v011" in next(check for check in record["checks"] if check["key"] == "angles")["views"]
+    assert len(record["angles"]["pictures"]) == len(record["views"]) == 50
+    assert record["views"][0]["dolp"] is None
+    assert "looks like" in (tmp_path / "out" / "inspection.html").read_text()
+
+
+def test_a_calibration_needs_four_pictures(demo_scene: Path, tmp_path: Path) -> None:
+    scene = single_shots(demo_scene, tmp_path / "shots")
+    settings = InspectSettings(calibration=tmp_path / "none.json")
+    with pytest.raises(PolarguideError, match="--calibration"):
+        polarguide.inspect(scene, tmp_path / "out", settings=settings)

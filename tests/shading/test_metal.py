@@ -1,0 +1,315 @@
+"""Metals in the deferred shading model: what they reflect, what they leave as it was, and their gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.camera import Camera
+from polarguide.gaussians.gaussians import Gaussians
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
+from polarguide.raster import rasterize_reference
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.shading.conversion import convert, mirror_base, scale_light, spread_directions
+from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.gbuffer import render
+from polarguide.shading.metal import any_metal, metal_pixels, reflectance, reflectance_logits
+from polarguide.shading.model import mirrored
+from polarguide.shading.native import conductor_native
+from polarguide.shading.result import RenderResult
+from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
+
+COUNT, RESOLUTION = 30, 8
+WITHOUT = DeferredShading("fresnel", local=True)
+SHADING = DeferredShading("fresnel", local=True, metal=True)
+
+
+def camera() -> Camera:
+    eye, back = torch.eye(3, dtype=torch.float64), torch.tensor([0.1, -0.2, 4.0], dtype=torch.float64)
+    return Camera(24, 20, 30.0, 30.0, 12.0, 10.0, eye, back)
+
+
+def gaussians(dtype: torch.dtype = torch.float32, *, metals: int = COUNT // 2) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    return {
+        "means": 0.7 * normal(COUNT, 3),
+        "quaternions": normal(COUNT, 4),
+        "log_scales": -1.5 + 0.5 * normal(COUNT, 3),
+        "opacity_logits": 1 + normal(COUNT),
+        "sh_dc": normal(COUNT, 3),
+        "sh_rest": 0.1 * normal(COUNT, 15, 3),
+        "strength_logits": normal(COUNT),
+        "local_dc": 0.3 * normal(COUNT, 3),
+        "local_rest": 0.1 * normal(COUNT, 15, 3),
+        "metalness": (torch.arange(COUNT) < metals).to(dtype),
+        "reflectance_logits": normal(COUNT, 3),
+        "roughness_logits": normal(COUNT),
+    }
+
+
+def light(dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    """A smooth one: between texels dielectrics read means of logarithms, metals means of radiance."""
+    generator = torch.Generator().manual_seed(1)
+    texels = 0.1 * torch.randn(6, RESOLUTION, RESOLUTION, 3, generator=generator, dtype=torch.float64)
+    return {"texels": texels.to(dtype)}
+
+
+def rendered(shading: DeferredShading, values: dict[str, Tensor], **options: bool) -> RenderResult:
+    native = values["means"].dtype == torch.float32
+    rasterize = rasterize_cpu if native else rasterize_reference
+    seen = light(values["means"].dtype)
+    return render(values, camera(), rasterize, shading=shading, light=seen, **options)
+
+
+def test_without_a_metal_every_bit_is_as_before() -> None:
+    values = gaussians(metals=0)
+    ours, before = rendered(SHADING, values, depth=True), rendered(WITHOUT, values, depth=True)
+    for name in ("final", "specular", "diffuse", "reflection", "strength", "normal", "depth", "alpha"):
+        assert torch.equal(getattr(ours, name), getattr(before, name))
+    assert ours.metal is None
+    assert ours.metalness is not None
+    assert not bool(ours.metalness.any())
+    assert before.metalness is None
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_layers_add_up_and_metals_have_no_body(depth: bool) -> None:
+    result = rendered(SHADING, gaussians(metals=COUNT), depth=depth)
+    assert result.metal is not None
+    assert result.metalness is not None
+    assert result.specular is not None
+    assert result.diffuse is not None
+    torch.testing.assert_close(result.final, result.specular + result.diffuse)
+    assert not bool(result.diffuse.any())
+    shown = result.alpha > 0.02
+    torch.testing.assert_close(result.metalness[shown], result.alpha[shown])
+    assert bool((result.specular[shown].amax(dim=-1) > 0).all())
+
+
+def test_a_smooth_metal_shows_its_reflectance_times_the_light() -> None:
+    values = gaussians(metals=COUNT)
+    values["roughness_logits"].fill_(-30)
+    values["reflectance_logits"][:] = torch.tensor([2.0, 0.0, -1.0])
+    result = rendered(SHADING, values)
+    assert result.metal is not None
+    assert result.normal is not None
+    assert result.specular is not None
+    assert result.reflection is not None
+    shown = result.alpha > 0.1
+    facing = torch.nn.functional.normalize(result.normal, dim=-1)
+    cosine = -(camera().world_rays() * facing).sum(-1, keepdim=True).clamp(-1, 0)
+    mean, _ = optics.conductor(cosine, reflectance(torch.tensor([2.0, 0.0, -1.0])))
+    expected = result.alpha[..., None] * mean * result.reflection
+    torch.testing.assert_close(result.specular[shown], expected[shown], rtol=4e-2, atol=1e-3)
+
+
+def test_rough_metals_read_a_blurred_light() -> None:
+    values = gaussians(metals=COUNT)
+    del values["local_dc"], values["local_rest"]
+    shading = DeferredShading("fresnel", metal=True)
+    spread = []
+    for logit in (-30.0, 30.0):
+        values["roughness_logits"].fill_(logit)
+        values["reflectance_logits"].fill_(0)
+        result = rendered(shading, values)
+        assert result.metal is not None
+        clear = result.metal.share > 0.5
+        spread.append(float((result.metal.specular / result.metal.share[:, None])[clear].std()))
+    assert spread[1] < 0.5 * spread[0]
+
+
+def test_polarization_of_a_metal_is_that_of_a_conductor() -> None:
+    result = rendered(SHADING, gaussians(metals=COUNT))
+    assert result.metal is not None
+    assert result.normal is not None
+    stokes = SHADING.predicted_stokes(result, camera()).flatten(1, 2)[:, result.metal.pixels]
+    degree = stokes[1:].square().sum(dim=0).sqrt() / stokes[0].clamp(min=1e-9)
+    facing = torch.nn.functional.normalize(result.normal, dim=-1)
+    cosine = -(camera().world_rays() * facing).sum(-1).flatten()[result.metal.pixels].clamp(-1, 0)
+    lit = (result.metal.specular > 1e-3) & (cosine > 0.02)[:, None]
+    expected = result.metal.slope * (1 - cosine**2)[:, None]
+    torch.testing.assert_close(degree[lit], expected[lit], rtol=2e-3, atol=1e-4)
+
+
+def finite_differences(loss: Callable[..., Tensor], tensors: list[Tensor]) -> None:
+    """Compare the gradient by each tensor, along a random direction, with a difference quotient."""
+    generator = torch.Generator().manual_seed(2)
+    inputs = [tensor.clone().requires_grad_() for tensor in tensors]
+    loss(*inputs).backward()
+    for place, tensor in enumerate(inputs):
+        assert tensor.grad is not None
+        along = torch.randn(tensor.shape, generator=generator, dtype=torch.float64)
+        ends = [
+            float(loss(*[t.detach() + (step * along if k == place else 0) for k, t in enumerate(inputs)]))
+            for step in (1e-6, -1e-6)
+        ]
+        slope = (ends[0] - ends[1]) / 2e-6
+        assert float((tensor.grad * along).sum()) == pytest.approx(slope, rel=1e-5, abs=1e-7)
+
+
+def test_gradients_of_gaussians_follow_finite_differences() -> None:
+    values = gaussians(torch.float64)
+    names = ("reflectance_logits", "roughness_logits", "local_dc", "local_rest", "sh_dc", "strength_logits")
+
+    def loss(*tensors: Tensor) -> Tensor:
+        result = rendered(SHADING, {**values, **dict(zip(names, tensors, strict=True))})
+        return SHADING.predicted_stokes(result, camera()).square().sum() + result.final.sum()
+
+    finite_differences(loss, [values[name] for name in names])
+
+
+def test_gradients_of_pixels_follow_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(3)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    rays = torch.nn.functional.normalize(uniform(40, 3) - 0.5, dim=1)
+    normals = 0.7 * torch.nn.functional.normalize(-rays + 0.8 * (uniform(40, 3) - 0.5), dim=1)
+    share = 0.2 + 0.8 * uniform(40, 1)
+    features = torch.cat((share * (0.3 + 0.6 * uniform(40, 3)), share, share * uniform(40, 1)), dim=1)
+
+    def loss(features: Tensor, normals: Tensor, light: Tensor, local: Tensor) -> Tensor:
+        metal = metal_pixels(features, rays, normals, light, local)
+        return metal.specular.sin().sum() + (metal.slope * metal.specular).sum()
+
+    finite_differences(loss, [features, normals, 0.5 + uniform(6, 8, 8, 3), uniform(40, 3)])
+
+
+def test_single_precision_agrees_with_the_reference() -> None:
+    for name in ("final", "specular", "diffuse", "metalness"):
+        ours, exact = (
+            getattr(rendered(SHADING, gaussians(dtype)), name) for dtype in (torch.float32, torch.float64)
+        )
+        torch.testing.assert_close(ours.double(), exact, rtol=1e-3, atol=1e-4)
+
+
+def test_held_layers_send_normals_nothing() -> None:
+    values = gaussians()
+    values["quaternions"].requires_grad_()
+    result = rendered(SHADING, values, held=True)
+    assert result.held is not None
+    specular, diffuse, metal = result.held
+    assert metal is not None
+    assert result.specular is not None
+    assert torch.equal(specular, result.specular)
+    (specular.sum() + diffuse.sum() + metal.specular.sum()).backward()
+    rotated = values["quaternions"].grad
+    values["quaternions"].grad = None
+    rendered(SHADING, values).final.sum().backward()
+    assert rotated is not None
+    assert values["quaternions"].grad is not None
+    assert not torch.allclose(rotated, values["quaternions"].grad)
+
+
+def test_whether_there_is_metal_follows_every_change() -> None:
+    metalness = torch.zeros(5)
+    assert not any_metal(metalness)
+    metalness[2] = 1
+    assert any_metal(metalness)
+    metalness.zero_()
+    assert not any_metal(metalness)
+    assert any_metal(torch.ones(5))
+
+
+def test_reflectances_come_back_from_their_parameter() -> None:
+    values = torch.tensor([0.3, 0.5, 0.9, 0.95])
+    torch.testing.assert_close(reflectance(reflectance_logits(values)), values)
+    ends = reflectance(reflectance_logits(torch.tensor([0.0, 1.0])))
+    assert 0.2 < float(ends[0]) < float(ends[1]) < 0.985
+
+
+def trained(metals: int) -> Gaussians:
+    return Gaussians(gaussians(metals=metals), {"sh_dc": 0.1})
+
+
+def test_what_becomes_a_metal_looks_as_before() -> None:
+    values, fresh = trained(0), torch.arange(COUNT) < 10
+    assert torch.equal(convert(values, fresh, torch.full((COUNT, 3), 0.8)), fresh)
+    texels = torch.full((6, RESOLUTION, RESOLUTION, 3), -1.0)
+    mirror_base(values, texels, fresh, torch.exp)
+    toward = spread_directions(40)
+    normals = shortest_axis_normals(
+        values["means"], values["quaternions"], values["log_scales"], torch.zeros(3), None
+    ).detach()
+    for k in (0, 7):
+        rays = mirrored(toward, normals[k].expand_as(toward))
+        base = sh_basis(rays, 3) @ torch.cat((values["sh_dc"][k][None], values["sh_rest"][k])) + 0.5
+        origin = torch.zeros(3)
+        own = evaluate_sh(
+            toward,
+            origin,
+            *(values[n][k].expand(40, *values[n][k].shape) for n in ("local_dc", "local_rest")),
+            3,
+        )
+        torch.testing.assert_close(0.8 * (own + math.exp(-1)), base, rtol=1e-4, atol=1e-4)
+    before = trained(0)
+    assert torch.equal(values["local_dc"][10:], before["local_dc"][10:])
+
+
+def test_brighter_light_leaves_dielectrics_as_they_were() -> None:
+    values, seen = trained(0), light()
+    before = render(values, camera(), rasterize_cpu, shading=SHADING, light=seen)
+    scale_light(values, seen["texels"], 1.3)
+    after = render(values, camera(), rasterize_cpu, shading=SHADING, light=seen)
+    torch.testing.assert_close(after.final, before.final, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(after.reflection, 1.3 * before.reflection, rtol=1e-3, atol=1e-4)
+
+
+def test_old_and_new_metals_are_told_apart() -> None:
+    values = trained(5)
+    logits = values["reflectance_logits"].detach().clone()
+    fresh = convert(values, torch.arange(COUNT) < 8, torch.full((COUNT, 3), 0.5))
+    assert fresh.nonzero()[:, 0].tolist() == [5, 6, 7]
+    assert torch.equal(values["reflectance_logits"][:5], logits[:5])
+    torch.testing.assert_close(reflectance(values["reflectance_logits"][5:8]), torch.full((3, 3), 0.5))
+    assert not bool(convert(values, torch.arange(COUNT) < 8, torch.full((COUNT, 3), 0.7)).any())
+
+
+def test_the_native_conductor_is_the_one_of_the_optics() -> None:
+    generator = torch.Generator().manual_seed(4)
+    cosine, values = torch.rand(200, generator=generator), torch.rand(200, 3, generator=generator)
+    weights = [torch.randn(200, 3, generator=generator) for _ in range(2)]
+    found = []
+    for conductor, dtype in ((conductor_native, torch.float32), (optics.conductor, torch.float64)):
+        c, r = (t.to(dtype).clone().requires_grad_() for t in (cosine, values))
+        mean, slope = conductor(c if dtype == torch.float32 else c[:, None], r)
+        (mean * weights[0] + slope * weights[1]).sum().backward()
+        assert c.grad is not None
+        assert r.grad is not None
+        found.append([t.detach().double() for t in (mean, slope, c.grad, r.grad)])
+    for ours, exact in zip(*found, strict=True):
+        torch.testing.assert_close(ours, exact, rtol=2e-3, atol=2e-3)
+
+
+def test_the_native_polarization_term_knows_metals() -> None:
+    generator = torch.Generator().manual_seed(5)
+    measured = 0.3 * torch.randn(2, 20, 24, 3, generator=generator)
+    weight = torch.rand(20, 24, generator=generator)
+    found = []
+    for native in (True, False):
+        values = gaussians()
+        names = ("reflectance_logits", "roughness_logits", "strength_logits", "sh_dc", "quaternions")
+        for name in names:
+            values[name].requires_grad_()
+        result = rendered(SHADING, values)
+        if native:
+            term = Polarization(measured, S1_AND_S2, weight, 0.7, SHADING.refractive_index)
+            loss = pixel_terms(result, camera(), Terms(term, [], None))
+        else:
+            predicted = SHADING.predicted_stokes(result, camera())[1:]
+            loss = 0.7 * (weight[..., None] * (predicted - measured).abs()).sum()
+        loss.backward()
+        found.append([loss.detach(), *(values[name].grad for name in names)])
+    for ours, reference in zip(*found, strict=True):
+        torch.testing.assert_close(ours, reference, rtol=2e-3, atol=2e-3)

@@ -1,0 +1,232 @@
+"""Metals are found by what all views measured, and by what the user says of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.capture import Scene, View
+from polarguide.polarizer import ANGLES
+from polarguide.raster import choose_backend
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.recipes import RECIPES
+from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.shading.conversion import spread_directions
+from polarguide.shading.metal import any_metal
+from polarguide.training.metals import Evidence, Seen, contradiction, decide, evidence, residuals
+from polarguide.training.trainer import Trainer, TrainSettings
+from tests.helpers.glossy_ball import ball, camera_at
+
+METALS = {"gold": (0.95, 0.78, 0.37), "aluminium": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
+BODIES = {"white": (0.6, 0.6, 0.6), "red": (0.5, 0.1, 0.05), "gray": (0.2, 0.2, 0.2)}
+RECIPE = RECIPES["polarguide-stokes"]
+
+
+def light(directions: Tensor) -> Tensor:
+    """Radiance [..., 3] of a room: a window, a dark floor and something between."""
+    x, _, z = directions.double().unbind(-1)
+    window = torch.sigmoid(12 * (x - 0.5)) * torch.sigmoid(12 * (z + 0.2))
+    gray = 0.15 + 0.35 * torch.sigmoid(4 * z) + 0.25 * torch.sin(5 * directions[..., 1].double())
+    return (gray.clamp(min=0.03) + 1.2 * window)[..., None].expand(*directions.shape[:-1], 3) / 2
+
+
+def measured(material: str, cosine: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
+    """S0 and polarization across the plane of incidence [..., 3] of a smooth surface under light [..., 3]."""
+    c = cosine[..., None]
+    sine2 = 1 - c * c
+    if material in METALS:
+        mean, slope = optics.conductor(c, torch.tensor(METALS[material], dtype=c.dtype))
+        return mean * light, slope * sine2 * mean * light
+    s, p = optics.reflectances_from_cosine(c)
+    specular, diffuse = (
+        0.5 * (s + p) * light,
+        torch.tensor(BODIES[material], dtype=c.dtype).expand_as(light) / 2,
+    )
+    over, under = (slope * sine2 for slope in optics.dolp_slopes(c))
+    return specular + diffuse, over * specular - under * diffuse
+
+
+@pytest.mark.parametrize("material", [*METALS, *BODIES])
+def test_the_right_explanation_leaves_less(material: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    cosine = 0.35 + 0.6 * torch.rand(24, 40, generator=generator)
+    seen = 0.1 + torch.rand(24, 40, 1, generator=generator).expand(24, 40, 3)
+    s0, across = measured(material, cosine, seen)
+    found = residuals(Seen(torch.ones(24, 40), s0, across, cosine), 1.5)
+    dielectric, metal, reflectance = found
+    if material in METALS:
+        assert bool((metal < 0.1 * dielectric).all())
+        assert float((reflectance - torch.tensor(METALS[material])).abs().max()) < 0.2
+    else:
+        assert float(dielectric.max()) < 1e-6
+        assert bool((metal > dielectric).all())
+
+
+def views_of(material: str) -> list[View]:
+    """A ball of one material in the room, from all around."""
+    found = []
+    for k in range(16):
+        camera = camera_at(2 * math.pi * k / 16, (0.15, 0.5, 0.75)[k % 3], 0.0)
+        normal, _, hit = ball(camera)
+        rays = camera.rays()
+        cosine = -(normal * rays).sum(dim=-1).clamp(-1, 0)
+        mirrored = camera.to_world(rays + 2 * cosine[..., None] * normal)
+        s0, across = measured(material, cosine.double(), light(mirrored))
+        x_ref, up_ref = optics.lens_frame(rays)
+        x, y = (normal * x_ref).sum(-1), (normal * up_ref).sum(-1)
+        sine2 = (x * x + y * y).clamp(min=1e-9)
+        s1, s2 = -across * ((x * x - y * y) / sine2)[..., None], -across * (2 * x * y / sine2)[..., None]
+        stokes = torch.stack((s0, s1, s2)) * hit[..., None]
+        codes = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in ANGLES])
+        codes = (codes.clamp(0, 1) * 65535).round().to(torch.uint16)
+        nowhere = torch.zeros(hit.shape, dtype=torch.bool)
+        found.append(View(f"v{k:02d}", camera, codes, ~hit, nowhere))
+    return found
+
+
+def gaussians_of_the_ball(count: int = 900) -> dict[str, Tensor]:
+    """Flat, opaque Gaussians on the unit ball."""
+    normals = spread_directions(count)
+    z = torch.tensor([0.0, 0.0, 1.0])
+    # The rotation that takes z to the normal.
+    quaternions = torch.cat((1 + normals[:, 2:], torch.linalg.cross(z.expand_as(normals), normals)), dim=1)
+    return {
+        "means": normals.clone(),
+        "quaternions": torch.nn.functional.normalize(quaternions, dim=1),
+        "log_scales": torch.tensor([0.07, 0.07, 0.003]).log().expand(count, 3).clone(),
+        "opacity_logits": torch.full((count,), 3.0),
+        "sh_dc": torch.zeros(count, 3),
+        "sh_rest": torch.zeros(count, 15, 3),
+    }
+
+
+@pytest.mark.parametrize(
+    ("material", "least", "most"), [(m, 0.8, 1.0) for m in METALS] + [(b, 0, 0) for b in BODIES]
+)
+def test_balls_of_metal_are_found_and_no_others(material: str, least: float, most: float) -> None:
+    views = views_of(material)
+    found = evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5)
+    nothing = torch.zeros(900, dtype=torch.bool)
+    metal = decide(found, nothing, ~nothing)
+    seen = gaussians_of_the_ball()["means"][:, 2] > 0.1  # enough cameras look from above
+    assert least <= float(metal[seen].float().mean()) <= most
+    assert not bool(decide(found, nothing, nothing).any())
+
+
+def said(count: int, **values: Tensor) -> Evidence:
+    """Evidence along a line of Gaussians that says nothing but what is given."""
+    near = (torch.arange(count)[:, None] + torch.tensor([0, 1, -1, 2, -2])).clamp(0, count - 1)
+    given = Evidence(
+        ratio=torch.zeros(count),
+        misfit=torch.full((count,), 0.1),
+        reflectance=torch.full((count, 3), 0.6),
+        near=near,
+        alike=torch.ones(count, 5),
+        support=torch.ones(count),
+        said=torch.zeros(count, 2),
+    )
+    return given._replace(**values)
+
+
+def test_metal_grows_where_it_is_likely_and_stays_where_it_was() -> None:
+    ratio = torch.zeros(80)
+    ratio[5:19], ratio[19:25], ratio[40:44], ratio[44:60], ratio[70] = 3.0, 1.0, 1.0, 3.0, 3.0
+    nothing, all_ = torch.zeros(80, dtype=torch.bool), torch.ones(80, dtype=torch.bool)
+    metal = decide(said(80, ratio=ratio), nothing, all_)
+    assert metal.nonzero()[:, 0].tolist() == [*range(5, 25), *range(40, 60)]  # one alone is none
+    ratio[30:40], was = 0.35, nothing.clone()
+    was[30:40] = True
+    again = decide(said(80, ratio=ratio), was, all_)
+    assert again.nonzero()[:, 0].tolist() == [*range(5, 25), *range(30, 60)]
+    other_way = torch.ones(80, 5)
+    other_way[19:, 1:] = 0
+    metal = decide(said(80, ratio=ratio, alike=other_way), nothing, all_)
+    assert metal.nonzero()[:, 0].tolist()[:14] == list(range(5, 19))
+    assert not bool(metal[19:25].any())
+
+
+def test_pieces_of_which_little_is_sure_are_none() -> None:
+    """As a plate in polarized light looks: a few Gaussians just beyond the limit, and many that are likely."""
+    ratio = torch.zeros(300)
+    ratio[10:22], ratio[22:100] = 2.3, 1.2
+    ratio[150:170], ratio[170:220] = 2.3, 1.2
+    ratio[250:256] = 4.0  # too few to be told
+    nothing, all_ = torch.zeros(300, dtype=torch.bool), torch.ones(300, dtype=torch.bool)
+    found, was = said(300, ratio=ratio), nothing.clone()
+    was[10:100] = was[150:220] = True
+    metal = decide(found, was, all_)
+    assert not bool(metal[:140].any())
+    assert bool(metal[150:170].all())
+    assert not bool(metal[240:].any())
+
+
+def test_what_the_user_says_counts() -> None:
+    ratio, words = torch.zeros(60), torch.zeros(60, 2)
+    ratio[5:35] = 3.0
+    words[18:60, 0] = 5.0
+    words[50:53] = torch.tensor([1.0, 5.0])
+    found = said(60, ratio=ratio, said=words)
+    nothing = torch.zeros(60, dtype=torch.bool)
+    assert decide(found, nothing, ~nothing).nonzero()[:, 0].tolist() == [*range(5, 18), 50, 51, 52]
+    assert contradiction(found) == pytest.approx(3 / float(words.sum()))
+    assert contradiction(said(4)) == 0
+
+
+def with_materials(scene: Scene, kind: int) -> Scene:
+    """The scene with everything of one material."""
+    views = tuple(
+        dataclasses.replace(view, materials=torch.full(view.invalid.shape, kind, dtype=torch.uint8))
+        for view in scene.views
+    )
+    return dataclasses.replace(scene, views=views)
+
+
+def trainer_of(scene: Scene, settings: TrainSettings, warn: list[str]) -> Trainer:
+    repeats = tuple(
+        dataclasses.replace(stage, repeats=tuple(dataclasses.replace(r, minimum=1) for r in stage.repeats))
+        for stage in RECIPE.stages
+    )
+    recipe = dataclasses.replace(RECIPE, stages=repeats)
+    return Trainer(scene, recipe, settings, choose_backend("cpu"), warn=warn.append)
+
+
+def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path: Path) -> None:
+    scene, heard = with_materials(tiny_scene, 2), []
+    settings = TrainSettings(60, 3)
+    whole = trainer_of(scene, settings, heard)
+    whole.run(lambda _: None, until=45)
+    assert any_metal(whole.state.gaussians["metalness"])
+    assert not heard
+    save_checkpoint(tmp_path, whole.state)
+    whole.run(lambda _: None)
+    state = load_checkpoint(tmp_path, RECIPE)
+    resumed = trainer_of(scene, settings, heard)
+    resumed.state = state
+    resumed.run(lambda _: None)
+    expected, found = whole.state.tensors(), resumed.state.tensors()
+    assert expected.keys() == found.keys()
+    assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
+
+
+def test_dielectric_turns_the_search_off(tiny_scene: Scene) -> None:
+    trainer = trainer_of(with_materials(tiny_scene, 2), TrainSettings(60, 3, materials="dielectric"), [])
+    trainer.run(lambda _: None)
+    assert not any_metal(trainer.state.gaussians["metalness"])
+
+
+def test_contradicting_words_are_told_of(tiny_scene: Scene) -> None:
+    dielectric, heard = with_materials(tiny_scene, 1), []
+    views = tuple(
+        a if k % 2 else b
+        for k, (a, b) in enumerate(zip(dielectric.views, with_materials(tiny_scene, 2).views, strict=True))
+    )
+    trainer = trainer_of(dataclasses.replace(tiny_scene, views=views), TrainSettings(60, 3), heard)
+    trainer.run(lambda _: None, until=30)
+    assert heard
+    assert "materials/ contradicts itself" in heard[0]
