@@ -5,12 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tiny_capture import HEIGHT, WIDTH, TinyCapture, encode_srgb
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import load_scene
+from polarguide.capture.smaller import smaller
 
 
 def slow_boxes(values: np.ndarray, factor: int) -> list[list[np.ndarray]]:
@@ -126,3 +128,24 @@ def test_normals_that_cancel_become_zero() -> None:
     normals = np.zeros((2, 2, 3), np.float32)
     normals[0], normals[1] = (0, 0, 1), (0, 0, -1)
     np.testing.assert_array_equal(boxes.unit_mean(normals, 2), np.zeros((1, 1, 3)))
+
+
+@pytest.mark.parametrize("hold", [True, False])
+def test_a_scene_is_made_smaller_as_if_it_had_been_read_so(capture: TinyCapture, hold: bool) -> None:
+    (capture.root / "invalid").mkdir()
+    flags = np.random.default_rng(2).random((HEIGHT, WIDTH)) < 0.1
+    cv2.imwrite(str(capture.root / "invalid" / "v001.png"), flags.astype(np.uint8) * 255)
+    full = load_scene(capture.root, hold=hold)
+    assert smaller(full, max(HEIGHT, WIDTH)) is full
+    made, read = smaller(full, max(HEIGHT, WIDTH) // 3), load_scene(capture.root, downscale=3)
+    assert [view.name for view in made.views] == [view.name for view in full.train_views]
+    for view in made.views:
+        other = read.view(view.name)
+        assert torch.equal(view.codes, other.codes)
+        assert torch.equal(view.invalid, other.invalid)
+        assert (view.exposures, view.mount) == (other.exposures, other.mount)
+        assert (view.camera.width, view.camera.fx, view.camera.cy) == (
+            other.camera.width, other.camera.fx, other.camera.cy,
+        )  # fmt: skip
+        # Saturation is told before the average here, and after it there, where a box at full scale is needed.
+        assert not bool((other.saturated & ~view.saturated).any())

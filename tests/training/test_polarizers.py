@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -149,6 +150,37 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
     assert alongside.total == STEPS
     alongside.run(lambda report: None)
     assert not torch.equal(alongside.state.gaussians["means"], trainer.state.gaussians["means"])
+
+
+def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("polarguide.training.polarizers.SEARCH_STEPS", 20)
+    monkeypatch.setattr("polarguide.training.trainer.SEARCH_SIZE", 16)
+    scene = captured_as(WHOLE, "unknown")
+    width = scene.views[0].camera.width
+    assert width > 16
+    trainer = Trainer(scene, STOKES, TrainSettings(steps=STEPS, background="scene"), CPU)
+    assert trainer.total == STEPS + 13
+    looked_at = set[int]()
+    fit = trainer.polarizers.fit
+
+    def seen(predict: Callable[[View], Tensor]) -> Tensor:
+        def watched(view: View) -> Tensor:
+            stokes = predict(view)
+            looked_at.add(stokes.shape[2])
+            return stokes
+
+        return fit(watched)
+
+    monkeypatch.setattr(trainer.polarizers, "fit", seen)
+    trainer.run(lambda report: None)
+    assert looked_at == {width // -(-width // 16)}
+    assert trainer.done == trainer.total
+    # What was found holds for the pictures in full size.
+    view = trainer.scene.train_views[0]
+    assert trainer.polarizers.believed(view).codes is view.codes
+    # On a schedule that tells nothing of a search, known angles are looked at after half of all steps.
+    known = Trainer(captured_as(WHOLE, "one"), STOKES, TrainSettings(steps=STEPS, background="scene"), CPU)
+    assert [step for step in range(STEPS) if known.polarizers.due(step)] == [STEPS // 2]
 
 
 @pytest.mark.parametrize("exposures", ["one", "four", "none"])

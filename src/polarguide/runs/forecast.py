@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -12,6 +12,7 @@ from polarguide.capture import Scene
 from polarguide.raster import Backend
 from polarguide.runs.memory import in_gigabytes
 from polarguide.system import MEBIBYTE, peak_memory_mib
+from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.training.recipe import Recipe
 from polarguide.training.schedule import Schedule
 from polarguide.training.settings import TrainSettings
@@ -65,17 +66,27 @@ def forecast(
     """
     if settings.steps < LEAST_STEPS:
         return None
-    trainer = Trainer(scene, recipe, settings, backend)
+    trainer = Trainer(scene, recipe, replace(settings, begin_again=False), backend)
     first = len(trainer.state.gaussians)
     most = max(first, min(GROWTH * first, settings.gaussians or GROWTH * first))
     seconds, priors = _measured(trainer)
     priors *= _priors_made(recipe, settings, len(scene.train_views))
-    again = trainer.total / settings.steps
+    again = 1 + _search_share(scene, recipe, settings)
     least = greatest = again * (seconds + priors)
     if most != first:
         _multiply(trainer, most)
         greatest = again * (_measured(trainer)[0] + priors)
     return Forecast(least, greatest, first, most, peak)
+
+
+def _search_share(scene: Scene, recipe: Recipe, settings: TrainSettings) -> float:
+    """What the search for unknown angles adds, over the time of all steps: as many as there are pixels."""
+    if not settings.begin_again:
+        return 0.0
+    steps = Polarizers(scene, recipe, settings.steps, search=search_steps(settings)).search
+    camera = scene.train_views[0].camera
+    shrunk = math.ceil(max(camera.width, camera.height) / SEARCH_SIZE)
+    return steps / settings.steps / shrunk**2
 
 
 def in_words(seconds: float) -> str:

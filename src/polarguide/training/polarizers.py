@@ -16,11 +16,18 @@ from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
 from polarguide.training.angle_fit import fit_angle
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 
 FIRST, EVERY, LAST = 0.5, 0.05, 0.65
 """Shares of all steps at which angles are fitted: earlier, what is believed of them would confirm itself, and later,
 what the model has made of them meanwhile does. Their mean holds.
 """
+SEARCH_STEPS = 900
+"""Steps of the schedule by which unknown angles are sought, where the training begins again after it. Longer is not
+better: what is flat and mirrors, such as water, bends to explain its reflections without polarization.
+"""
+SEARCH_SIZE = 160
+"""Pixels of the longer side of the pictures to seek them in, at most."""
 WEAK = 0.22
 """Certainty under which an angle is not relied on. Predictions that are wrong in places take some of it away, so that a
 picture through a filter seldom has all of it; half of it is usual when angles are first fitted.
@@ -90,14 +97,17 @@ class Polarizers:
     Pictures of a polarization camera are not; nor is anything where the recipe has no use for it.
 
     Args:
-        scene: the capture. recipe: the method. steps: of the training.
+        scene: the capture. recipe: the method. steps: of the training. search: of the schedule by which unknown
+            angles are sought; 0: steps.
         table: what was found before, [F, P, 6] float64: what each ``fit`` gave; None: nothing.
 
     Raises:
         ValueError: the table has another number of rows.
     """
 
-    def __init__(self, scene: Scene, recipe: Recipe, steps: int, table: Tensor | None = None) -> None:
+    def __init__(
+        self, scene: Scene, recipe: Recipe, steps: int, table: Tensor | None = None, search: int = 0
+    ) -> None:
         uses = recipe.shading.reflects and any(stage.weights.stokes for stage in recipe.stages)
         self._views = [view for view in scene.train_views if uses and not view.is_four]
         self._places = [
@@ -110,7 +120,8 @@ class Polarizers:
         times = [FIRST]
         while self._unknown and times[-1] + EVERY <= LAST + 1e-9:
             times.append(times[-1] + EVERY)
-        self._times = sorted({round(share * steps) for share in times}) if self._places else []
+        length = search if search and self._unknown else steps
+        self._times = sorted({round(share * length) for share in times}) if self._places else []
         if table is not None and table.shape[1] != len(self._places):
             raise ValueError(f"angles of {table.shape[1]} pictures, not {len(self._places)}")
         self.table = table
@@ -200,6 +211,11 @@ class Polarizers:
             exposures = believed.setdefault(judgment.view, list(views[judgment.view].exposures))
             exposures[judgment.number] = judgment.believed
         return {name: tuple(exposures) for name, exposures in believed.items()}
+
+
+def search_steps(settings: TrainSettings) -> int:
+    """Steps of the schedule by which unknown angles are sought."""
+    return min(SEARCH_STEPS, settings.steps) if settings.begin_again else settings.steps
 
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:

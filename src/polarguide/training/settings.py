@@ -39,8 +39,8 @@ class TrainSettings:
             views, 400,000 at most (or what the run to resume took).
         exposures: Which pictures of a scene with four to train on, as if no others had been taken: captured, all that
             there are. See compare.
-        begin_again: Where angles are unknown, begin again once they have been found, after two thirds of the steps:
-            normals follow polarization best where they know its angles from the start.
+        begin_again: Where angles are unknown, seek them in a short training on small pictures, and begin again with
+            them; otherwise they are fitted in the course of the training itself.
         materials: What surfaces are made of: auto looks for metals, and heeds materials/ where the scene has it;
             dielectric takes it that there is no metal.
     """

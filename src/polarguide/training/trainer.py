@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.capture.background import empty_pixels, has_black_background
+from polarguide.capture.background import has_black_background
+from polarguide.capture.smaller import smaller
 from polarguide.color import srgb_encode
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
@@ -26,28 +26,11 @@ from polarguide.shading.model import PLAIN
 from polarguide.shading.visibility import outward_directions, touched_pixels
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
+from polarguide.training.feed import Feed
 from polarguide.training.losses import step_loss
-from polarguide.training.metals import (
-    CONTRADICTED,
-    contradiction,
-    decide,
-    evidence,
-    light_gain,
-    metalness_share,
-)
-from polarguide.training.packing import (
-    Entry,
-    Packed,
-    fields_read,
-    holds,
-    pack_priors,
-    packed,
-    unpack_priors,
-    unpacked,
-)
-from polarguide.training.partial import PartialView
-from polarguide.training.polarizers import Polarizers
-from polarguide.training.priors import Unguided, ViewPriors, unguided, view_priors
+from polarguide.training.metals import CONTRADICTED, contradiction, decide, evidence, light_gain
+from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
+from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Action, Recipe, Stage
 from polarguide.training.schedule import Schedule
 from polarguide.training.settings import StepReport, TrainSettings
@@ -56,18 +39,6 @@ from polarguide.training.view_store import ViewStore
 
 # From so many training views on, what only one of them sees goes where nothing is behind the subject.
 ENOUGH_VIEWS = 12
-
-
-class _Shown(NamedTuple):
-    """A training view's photograph [H, W, 3] as shown, 1 where it counts [H, W] (None: everywhere), and 1 where it
-    shows nothing [H, W] (None: where that is not known). And what was measured
-    where that does not determine the Stokes vector.
-    """
-
-    picture: Tensor
-    valid: Tensor | None
-    empty: Tensor | None
-    partial: PartialView | None
 
 
 def is_black(scene: Scene, settings: TrainSettings) -> bool:
@@ -114,22 +85,34 @@ class Trainer:
         self.ranks, self._device = ranks, backend.device
         self._warn = warn
         self.whole = True
-        self.schedule = Schedule(recipe, settings.steps)
         self.shading = recipe.shading.bind(settings.refractive_index)
         self.black = is_black(scene, settings)
         self.state = state or self._first_state()
-        self.polarizers = Polarizers(scene, recipe, settings.steps, self.state.angles)
         self._rate = math.sqrt(settings.views_per_step)
-        self._use_batch_rates()
         centers = torch.stack([view.camera.center for view in scene.train_views])
         self._extent = scene_extent(centers)
         self._middle = centers.mean(dim=0).float().to(self._device)
-        pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
-        self._limit = settings.gaussians or int(pixels / recipe.densification.pixels_each)
         empty = free_space(scene.points, [view.camera for view in scene.train_views])
         self._empty = empty.to(self._device)
         self._store = store or ViewStore()
-        self._partial: dict[str, PartialView] = {}
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """What depends on the pictures and the number of steps: those of the search for angles, or of the training."""
+        recipe, settings = self.recipe, self.settings
+        scene, steps, search = self.scene, settings.steps, search_steps(settings)
+        self.polarizers = Polarizers(scene, recipe, steps, self.state.angles, search)
+        self._searches = self.begins_again and not self.polarizers.settled
+        if self._searches:
+            scene, steps = smaller(scene, SEARCH_SIZE), search
+            self.polarizers = Polarizers(scene, recipe, steps, self.state.angles, search)
+        self._views, self._steps, self.schedule = scene.train_views, steps, Schedule(recipe, steps)
+        pixels = sum(view.camera.width * view.camera.height for view in self._views)
+        self._limit = settings.gaussians or int(pixels / recipe.densification.pixels_each)
+        store = ViewStore() if self._searches else self._store
+        index = settings.refractive_index
+        self._feed = Feed(self.backend, recipe.priors, index, store, black=self.black)
+        self._use_batch_rates()
 
     def _first_state(self) -> TrainingState:
         return first_state(self.scene, self.recipe, self.settings, self._device, surroundings=not self.black)
@@ -185,7 +168,7 @@ class Trainer:
                 recipe.densification,
                 extent=self._extent,
                 middle=self._middle,
-                prune_large=recipe.densification.prunes_large(state.step, self.settings.steps),
+                prune_large=recipe.densification.prunes_large(state.step, self._steps),
                 empty=self._empty,
                 limit=self._limit,
                 generator=seeded(self.settings.seed, 2, state.step),
@@ -198,7 +181,7 @@ class Trainer:
     def _densifies_next(self) -> bool:
         """Whether the next step belongs to a stage with density control."""
         step = self.state.step
-        return step < self.settings.steps and self.schedule.at(step).stage.densify
+        return step < self._steps and self.schedule.at(step).stage.densify
 
     def _prune_untouched(self) -> None:
         """Remove Gaussians that show too little.
@@ -206,7 +189,7 @@ class Trainer:
         Before nothing, those that too few training views can tell anything about: in new views they are fog. And those
         that are faint in all training views, where the recipe says how faint.
         """
-        state, views, faint = self.state, self.scene.train_views, self.recipe.densification.faint_pixels
+        state, views, faint = self.state, self._views, self.recipe.densification.faint_pixels
         if not (self.black or faint):
             return
         cameras = [view.camera for view in views]
@@ -244,7 +227,7 @@ class Trainer:
             held=stage.reflection and recipe.hold_normals and stage.weights.layers,
             statistic=statistic,
         )
-        shown = self._shown_photograph(view)
+        shown = self._feed.shown(view)
         loss, photometric = step_loss(
             result,
             shown.picture,
@@ -320,42 +303,39 @@ class Trainer:
         self.ranks.broadcast(table)
         earlier = [] if state.angles is None else [*state.angles]
         state.angles = torch.stack([*earlier, table.cpu()])
-        for name in self.polarizers.take(state.angles):
-            self._partial.pop(name, None)
-            for kind in ("shown", "unguided", "priors"):
-                self._store.drop(kind, name)
+        self._feed.forget(self.polarizers.take(state.angles))
 
     def _begin_again(self) -> None:
         """Back to the first step, with what was found of the polarizers."""
         angles = self.state.angles
         self.state = self._first_state()
         self.state.angles = angles
-        self._store.drop("priors")
+        self._set_up()
 
     def _act(self, action: Action) -> None:
         if action == "reset_opacity":
             reset_opacity(self.state, self.shading)
         elif action == "propagate_normals":
             generator = seeded(self.settings.seed, 3, self.state.step)
-            rest = min(OPACITY_REST, self.settings.steps // 50)
+            rest = min(OPACITY_REST, self._steps // 50)
             propagate_normals(self.state, self.shading, self.recipe.propagation, generator, rest)
         elif action == "orient_normals":
             gaussians, rasterize = self.state.gaussians, self.backend.rasterize
-            outward = outward_directions(gaussians, self.scene.train_views, rasterize)
+            outward = outward_directions(gaussians, self._views, rasterize)
             self.ranks.broadcast(outward)
             gaussians.overwrite("outward", outward)
         else:
             first, last = self.recipe.metals
             sought = self.shading.knows_metals and self.settings.materials == "auto"
-            if sought and first <= self.state.step / self.settings.steps < last:
+            if sought and first <= self.state.step / self._steps < last:
                 self._find_metals()
             self.state.frozen = self.state.gaussians.snapshot()
-            self._store.drop("priors")
+            self._feed.refresh_priors()
 
     @torch.no_grad()
     def _find_metals(self) -> None:
         """Decide which Gaussians are metals, and begin with what was measured of those that are new."""
-        gaussians, views = self.state.gaussians, [v for v in self.scene.train_views if v.is_determined]
+        gaussians, views = self.state.gaussians, [v for v in self._views if v.is_determined]
         if not views:
             return
         rasterize, index = self.backend.rasterize, self.settings.refractive_index
@@ -379,57 +359,18 @@ class Trainer:
 
         Every epoch visits every training view once, in an order of its own.
         """
-        views = self.scene.train_views
+        views = self._views
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
         return self.polarizers.believed(views[int(order[place])])
-
-    def _shown_photograph(self, view: View) -> _Shown:
-        def make() -> Entry:
-            entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(self._device))}
-            if bool(view.invalid.any()):
-                entry["valid"] = Packed((~view.invalid).to(self._device))
-            if self.black:
-                entry["empty"] = Packed(empty_pixels(view).to(self._device))
-            return entry
-
-        kept = self._store.get("shown", view.name, make)
-        valid, empty = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
-        if view.is_determined:
-            return _Shown(unpacked(kept["picture"]), valid, empty, None)
-        if view.name not in self._partial:
-            self._partial[view.name] = PartialView.of(view, self._device)
-        partial = self._partial[view.name]
-        return _Shown(partial.shown, valid, empty, partial)
 
     def _priors_of(self, view: View, stage: Stage) -> ViewPriors | None:
         if not stage.weights.priors or not view.is_determined:
             return None
         if self.state.frozen is None:
             self._act("refresh_priors")
-        fields = fields_read(stage.weights)
-        entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields))
-        if not holds(entry, fields):  # the stage reads more than the one before
-            self._store.drop("priors", view.name)
-            entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields))
-        return unpack_priors(entry, view.camera, self.recipe.priors)
-
-    def _new_priors(self, view: View, fields: frozenset[str]) -> Entry:
         assert self.state.frozen is not None
-        with torch.no_grad():
-            guide = render(self.state.frozen, view.camera, self.backend.rasterize, sh_degree=0).normal
-        assert guide is not None
-        settings, index = self.recipe.priors, self.settings.refractive_index
-        metal = metalness_share(self.state.frozen, view.camera, self.backend.rasterize)
-
-        def make() -> Entry:
-            found = unguided(view.to(guide.device), settings, index)._asdict()
-            return {name: Packed(values) for name, values in found.items() if values is not None}
-
-        # It can be had again for a part of the work, so that it is not worth a file.
-        kept = self._store.get("unguided", view.name, make, disposable=True)
-        known = Unguided(**{name: part.codes for name, part in kept.items()})
-        return pack_priors(view_priors(view, guide, settings, index, known, metal), fields)
+        return self._feed.priors(view, stage, self.state.frozen)
 
 
 @torch.no_grad()

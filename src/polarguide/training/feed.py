@@ -1,0 +1,119 @@
+"""What a step reads of the views: photographs as shown, and priors, on the backend's device and kept between steps."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.capture.background import empty_pixels
+from polarguide.color import srgb_encode
+from polarguide.raster import Backend
+from polarguide.shading.gbuffer import render
+from polarguide.training.metals import metalness_share
+from polarguide.training.packing import (
+    Entry,
+    Packed,
+    fields_read,
+    holds,
+    pack_priors,
+    packed,
+    unpack_priors,
+    unpacked,
+)
+from polarguide.training.partial import PartialView
+from polarguide.training.priors import Unguided, ViewPriors, unguided, view_priors
+from polarguide.training.recipe import Priors, Stage
+from polarguide.training.view_store import ViewStore
+
+
+class Shown(NamedTuple):
+    """A training view's photograph [H, W, 3] as shown, 1 where it counts [H, W] (None: everywhere), and 1 where it
+    shows nothing [H, W] (None: where that is not known). And what was measured
+    where that does not determine the Stokes vector.
+    """
+
+    picture: Tensor
+    valid: Tensor | None
+    empty: Tensor | None
+    partial: PartialView | None
+
+
+class Feed:
+    """Photographs and priors of the views that a training asks for.
+
+    Args:
+        backend: device and rasterizer. priors: the recipe's. index: of refraction.
+        black: whether nothing is behind the subject.
+        store: keeps what is computed of the views.
+    """
+
+    def __init__(
+        self, backend: Backend, priors: Priors, index: float, store: ViewStore, *, black: bool
+    ) -> None:
+        self._backend, self._settings, self._index, self._black = backend, priors, index, black
+        self._store = store
+        self._partial: dict[str, PartialView] = {}
+
+    def forget(self, names: Collection[str]) -> None:
+        """What is believed of these views has changed."""
+        for name in names:
+            self._partial.pop(name, None)
+            for kind in ("shown", "unguided", "priors"):
+                self._store.drop(kind, name)
+
+    def refresh_priors(self) -> None:
+        """There is another guide."""
+        self._store.drop("priors")
+
+    def shown(self, view: View) -> Shown:
+        """The photograph of a view."""
+
+        def make() -> Entry:
+            device = self._backend.device
+            entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
+            if bool(view.invalid.any()):
+                entry["valid"] = Packed((~view.invalid).to(device))
+            if self._black:
+                entry["empty"] = Packed(empty_pixels(view).to(device))
+            return entry
+
+        kept = self._store.get("shown", view.name, make)
+        valid, empty = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
+        if view.is_determined:
+            return Shown(unpacked(kept["picture"]), valid, empty, None)
+        if view.name not in self._partial:
+            self._partial[view.name] = PartialView.of(view, self._backend.device)
+        partial = self._partial[view.name]
+        return Shown(partial.shown, valid, empty, partial)
+
+    def priors(self, view: View, stage: Stage, guide: Mapping[str, Tensor]) -> ViewPriors:
+        """The priors of a view that determines its Stokes vectors.
+
+        Args:
+            guide: Gaussians whose normals resolve what polarization leaves open.
+        """
+        fields = fields_read(stage.weights)
+        entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields, guide))
+        if not holds(entry, fields):  # the stage reads more than the one before
+            self._store.drop("priors", view.name)
+            entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields, guide))
+        return unpack_priors(entry, view.camera, self._settings)
+
+    def _new_priors(self, view: View, fields: frozenset[str], frozen: Mapping[str, Tensor]) -> Entry:
+        with torch.no_grad():
+            guide = render(frozen, view.camera, self._backend.rasterize, sh_degree=0).normal
+        assert guide is not None
+        metal = metalness_share(frozen, view.camera, self._backend.rasterize)
+
+        def make() -> Entry:
+            found = unguided(view.to(guide.device), self._settings, self._index)._asdict()
+            return {name: Packed(values) for name, values in found.items() if values is not None}
+
+        # It can be had again for a part of the work, so that it is not worth a file.
+        kept = self._store.get("unguided", view.name, make, disposable=True)
+        known = Unguided(**{name: part.codes for name, part in kept.items()})
+        return pack_priors(view_priors(view, guide, self._settings, self._index, known, metal), fields)
