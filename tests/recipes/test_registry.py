@@ -11,6 +11,7 @@ from plugins import install
 
 from polarguide.errors import PolarguideError
 from polarguide.recipes import ABLATIONS, RECIPES, ablations_of, recipe_named
+from polarguide.training.recipe import Recipe, Stage
 
 MODULE = """
 from dataclasses import replace
@@ -78,3 +79,19 @@ def test_two_plug_ins_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch, t
         module(monkeypatch, tmp_path, part, "ONE", entry="shared")
     with pytest.raises(PolarguideError, match=r"plug_\w+:ONE and plug_\w+:ONE"):
         recipe_named("shared")
+
+
+def layer_stages(name: str) -> list[Stage]:
+    recipe = recipe_named(name)
+    assert isinstance(recipe, Recipe)
+    return [stage for stage in recipe.stages if stage.weights.layers]
+
+
+@pytest.mark.parametrize("name", ["polarguide", "polarguide-stokes"])
+def test_ours_hold_normals_while_the_density_control_runs(name: str) -> None:
+    held = [stage.hold_normals for stage in layer_stages(name)]
+    assert held == [stage.densify for stage in layer_stages(name)]
+    assert held[0]
+    assert not held[-1]
+    assert not any(stage.hold_normals for stage in layer_stages(f"{name}:layers-turn-normals"))
+    assert all(stage.hold_normals for stage in layer_stages(f"{name}:layers-hold-normals"))

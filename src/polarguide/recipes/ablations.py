@@ -111,8 +111,13 @@ _COMMON = (
     ),
     (
         "layers-turn-normals",
-        "The terms on the layers reach the normals through what the layers mirror, too.",
-        lambda recipe: replace(recipe, hold_normals=False),
+        "The terms on the layers reach the normals through what the layers mirror, too, from the beginning.",
+        staged(lambda stage: replace(stage, hold_normals=False)),
+    ),
+    (
+        "layers-hold-normals",
+        "The terms on the layers reach the normals through Fresnel's equations alone, to the end.",
+        staged(lambda stage: replace(stage, hold_normals=True)),
     ),
     (
         "few-pixels-pull",

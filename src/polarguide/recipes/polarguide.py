@@ -23,6 +23,7 @@ def _stages(
     *,
     final_rates: Mapping[str, float] | None = None,
     oriented: bool = False,
+    hold_normals: bool = True,
 ) -> tuple[Stage, ...]:
     """The three stages of PolarGuide-GSDR; the guided one first with, then without density control."""
     enter: tuple[Action, ...] = ("refresh_priors",)
@@ -37,6 +38,8 @@ def _stages(
             densify=True,
             repeats=(REFRESH,),
             on_enter=enter,
+            # While the geometry forms; later what the layers mirror tells more of the normals than it misleads.
+            hold_normals=hold_normals,
         ),
         Stage("guided", 0.35, reflection=True, weights=guided, repeats=(REFRESH,)),
         Stage(
@@ -66,7 +69,6 @@ RECIPE_POLARGUIDE: Recipe = replace(
         _FINAL,
         final_rates=_SLOW,
     ),
-    hold_normals=True,
     densification=replace(RECIPE_3DGS_DR.densification, faint_pixels=0.1),
     priors=Priors(
         # An ideal sensor measures the azimuth down to a DoLP of a percent; noise has its own mask.
@@ -101,8 +103,7 @@ RECIPE_POLARGUIDE_PAPER: Recipe = replace(
     RECIPE_POLARGUIDE,
     name="polarguide-paper",
     about="PolarGuide-GSDR to the letter: its four candidates and its separation cue; its kind reading is :kind.",
-    stages=_stages(Weights(specular=0.5, diffuse=0.2, normal=0.2), Weights(normal=0.2)),
-    hold_normals=False,
+    stages=_stages(Weights(specular=0.5, diffuse=0.2, normal=0.2), Weights(normal=0.2), hold_normals=False),
     densification=RECIPE_3DGS_DR.densification,
     priors=Priors(candidates="paper", separation="paper", azimuth_weight=0.0),
 )

@@ -123,6 +123,9 @@ class Stage:
         rounds: what happens in turns in it.
         on_enter: what happens at its first step.
         rate_factors: on the recipe's learning rates while it lasts, by name; 1 where not named.
+        hold_normals: whether the terms on the layers reach the normals through Fresnel's equations alone, and not
+            through what the layers mirror at them: the separated pictures are made with the normals of before, so that
+            normals which follow them confirm their own errors.
     """
 
     name: str
@@ -134,6 +137,7 @@ class Stage:
     rounds: Rounds | None = None
     on_enter: tuple[Action, ...] = ()
     rate_factors: Mapping[str, float] = field(default_factory=dict)
+    hold_normals: bool = False
 
 
 @dataclass(frozen=True)
@@ -222,9 +226,6 @@ class Recipe(Method):
         rates: learning rates of what every recipe trains; that of the means is times the scene's extent.
         shading: how Gaussians and learned light make the picture in stages with reflection.
         means_decay: factor on the means' rate at the last step (exponential in between).
-        hold_normals: whether the terms on the layers reach the normals through Fresnel's equations alone, and not
-            through what the layers mirror at them: the separated pictures are made with the normals of before, so that
-            normals which follow them confirm their own errors.
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         metals: share of all steps between which refreshes look for metals, where the shading knows them.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
@@ -240,7 +241,6 @@ class Recipe(Method):
     rates: Mapping[str, float]
     shading: ShadingModel = PLAIN
     means_decay: float = 0.01
-    hold_normals: bool = False
     oriented: bool = False
     metals: tuple[float, float] = (0.4, 0.72)
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)

@@ -224,7 +224,7 @@ class Trainer:
             light=state.light,
             normals=stage.weights.normals,
             depth=stage.weights.depth,
-            held=stage.reflection and recipe.hold_normals and stage.weights.layers,
+            held=stage.reflection and stage.hold_normals and stage.weights.layers,
             statistic=statistic,
         )
         shown = self._feed.shown(view)
