@@ -72,3 +72,5 @@ def test_the_figure_has_a_point_for_each_row() -> None:
     titles = [title.text or "" for title in root.iter("{http://www.w3.org/2000/svg}title")]
     assert len(titles) == 8
     assert any("cup, four, 252 pictures" in title for title in titles)
+    words = [text.text for text in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert words.index("one") < words.index("63") < words.index("four") < words.index("252")

@@ -115,19 +115,23 @@ def ticks(low: float, high: float, about: int = 6) -> list[float]:
 
 
 def grid(
-    place: Callable[[float, float], tuple[float, float]], x_ticks: Sequence[float], y_ticks: Sequence[float]
+    place: Callable[[float, float], tuple[float, float]],
+    x_ticks: Sequence[float],
+    y_ticks: Sequence[float],
+    *,
+    numbered: bool = True,
 ) -> list[str]:
     """SVG elements of horizontal lines at ``y_ticks``, and the numbers at both axes.
 
     Args:
-        place: where a point lies in the picture.
+        place: where a point lies in the picture. numbered: whether ``x_ticks`` are printed, too.
     """
     parts = []
     for tick in y_ticks:
         (x1, y), (x2, _) = place(x_ticks[0], tick), place(x_ticks[-1], tick)
         parts.append(f'<line class="grid" x1="{x1:.1f}" x2="{x2:.1f}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text text-anchor="end" x="{x1 - 6:.1f}" y="{y + 4:.1f}">{tick:g}</text>')
-    for tick in x_ticks:
+    for tick in x_ticks if numbered else ():
         x, y = place(tick, y_ticks[0])
         parts.append(f'<text text-anchor="middle" x="{x:.1f}" y="{y + 16:.1f}">{tick:g}</text>')
     return parts

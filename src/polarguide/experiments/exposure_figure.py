@@ -1,9 +1,10 @@
-"""``exposures.svg``: scores over the number of pictures taken, of ``compare --exposures``."""
+"""``exposures.svg``: scores over the pictures taken of each view, of ``compare --exposures``."""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from polarguide.capture.variants import count_of
 from polarguide.evaluation.table import COLUMNS
@@ -16,10 +17,17 @@ from polarguide.files import write_text
 FIGURE = "exposures.svg"
 KEYS = ("psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
 DRAWN = tuple(metric for key in KEYS for metric in COLUMNS if metric.key == key)
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM, LINE = 400, 300, 46, 64, 26, 42, 18
+WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM, LINE = 400, 300, 46, 12, 26, 58, 18
+APART = 9.0
+"""Between the points of two scenes in one column, at most."""
 
-Point = tuple[float, float, str]
-"""Pictures taken, score, and the row of the tables."""
+
+class Point(NamedTuple):
+    """A row of a scene's table: how many pictures were taken, and the score."""
+
+    row: str
+    pictures: int
+    score: float
 
 
 def write_exposure_figure(comparison: Comparison, results: Results) -> None:
@@ -37,7 +45,9 @@ def write_exposure_figure(comparison: Comparison, results: Results) -> None:
 
 
 def exposure_svg(results: Results, counts: dict[tuple[str, str], int]) -> str | None:
-    """The scores of every row of the tables over the pictures it took, a panel for each metric, a color for each scene.
+    """The scores of all rows of the tables, a panel for each metric, a column for each row, a color for each scene.
+
+    Rows come in the order of the pictures they took, and of the tables where these are as many.
 
     Args:
         results: the record of a comparison. counts: by scene and row, the pictures taken.
@@ -46,12 +56,15 @@ def exposure_svg(results: Results, counts: dict[tuple[str, str], int]) -> str | 
         None where there is nothing to draw.
     """
     scenes = [scene["name"] for scene in results["scenes"]]
+    rows = dict.fromkeys(row["recipe"] for row in results["table"])
+    taken = {row: [counts[scene, row] for scene in scenes if (scene, row) in counts] for row in rows}
+    columns = {row: numbers for row, numbers in sorted(taken.items(), key=lambda item: max(item[1]))}
     panels: list[str] = []
     for metric in DRAWN:
         points = {scene: _points(results, scene, metric.key, counts) for scene in scenes}
         if any(points.values()):
             left, top = len(panels) % 2 * WIDTH, len(panels) // 2 * HEIGHT
-            panels.append(_panel(points, metric.heading, left, top))
+            panels.append(_panel(points, columns, metric.heading, left, top))
     if not panels:
         return None
     bottom = (len(panels) + 1) // 2 * HEIGHT
@@ -61,55 +74,52 @@ def exposure_svg(results: Results, counts: dict[tuple[str, str], int]) -> str | 
         for number, scene in enumerate(scenes)
     ]
     size = f"0 0 {WIDTH * min(2, len(panels))} {bottom + LINE * len(scenes) + 8}"
-    style = "text{font:12px sans-serif}.name{font-size:11px}.grid{stroke:#8884}.frame{fill:#fff}"
+    style = "text{font:12px sans-serif}.grid{stroke:#8884}.frame{fill:#fff}.count{fill:#666;font-size:11px}"
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{size}"><style>{style}</style>'
     return "".join([head, '<rect class="frame" width="100%" height="100%"/>', *panels, *legend, "</svg>\n"])
 
 
 def _points(results: Results, scene: str, key: str, counts: dict[tuple[str, str], int]) -> list[Point]:
-    found = [
-        (float(counts[scene, row["recipe"]]), float(mean), row["recipe"])
+    return [
+        Point(row["recipe"], counts[scene, row["recipe"]], float(mean))
         for row in results["table"]
         if row["scene"] == scene and (mean := row["cells"][key]["mean"]) is not None
     ]
-    return sorted(found)
 
 
-def _panel(points: dict[str, list[Point]], title: str, left: int, top: int) -> str:
-    every = [point for of_scene in points.values() for point in of_scene]
-    x_ticks = ticks(0.0, max(x for x, _, _ in every))
-    y_ticks = ticks(min(y for _, y, _ in every), max(y for _, y, _ in every))
+def _panel(
+    points: dict[str, list[Point]], columns: Mapping[str, Sequence[int]], title: str, left: int, top: int
+) -> str:
+    scores = [point.score for of_scene in points.values() for point in of_scene]
+    y_ticks = ticks(min(scores), max(scores))
+    width = (WIDTH - LEFT - RIGHT) / len(columns)
+    middles = {row: left + LEFT + width * (number + 0.5) for number, row in enumerate(columns)}
+    floor = top + HEIGHT - BOTTOM
+
+    def height(score: float) -> float:
+        return floor - (HEIGHT - TOP - BOTTOM) * (score - y_ticks[0]) / (y_ticks[-1] - y_ticks[0])
 
     def place(x: float, y: float) -> tuple[float, float]:
-        across = (x - x_ticks[0]) / (x_ticks[-1] - x_ticks[0])
-        up = (y - y_ticks[0]) / (y_ticks[-1] - y_ticks[0])
-        return (
-            left + LEFT + (WIDTH - LEFT - RIGHT) * across,
-            top + HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * up,
-        )
+        return left + LEFT + (WIDTH - LEFT - RIGHT) * x, height(y)
 
     parts = [f'<text x="{left + LEFT}" y="{top + 16}">{html.escape(title)}</text>']
-    parts += grid(place, x_ticks, y_ticks)
-    middle = left + (LEFT + WIDTH - RIGHT) / 2
-    parts.append(f'<text text-anchor="middle" x="{middle:.1f}" y="{top + HEIGHT - 8}">pictures taken</text>')
+    parts += grid(place, (0.0, 1.0), y_ticks, numbered=False)
+    for row, numbers in columns.items():
+        spread = f"{min(numbers)}" if min(numbers) == max(numbers) else f"{min(numbers)} to {max(numbers)}"
+        at = f'text-anchor="middle" x="{middles[row]:.1f}"'
+        parts.append(f'<text {at} y="{floor + 18}">{html.escape(row)}</text>')
+        parts.append(f'<text class="count" {at} y="{floor + 33}">{spread}</text>')
+    center = left + (LEFT + WIDTH - RIGHT) / 2
+    parts.append(
+        f'<text class="count" text-anchor="middle" x="{center:.1f}" y="{floor + 50}">training pictures</text>'
+    )
+    apart = min(APART, width / (len(points) + 1))
     for number, (scene, of_scene) in enumerate(points.items()):
-        color = PALETTE[number % len(PALETTE)]
-        labels = _label_heights([place(x, y) for x, y, _ in of_scene])
-        for (x, y, name), label in zip(of_scene, labels, strict=True):
-            cx, cy = place(x, y)
-            said = f"{html.escape(scene)}, {html.escape(name)}, {x:g} pictures: {y:.2f}"
+        color, aside = PALETTE[number % len(PALETTE)], (number - (len(points) - 1) / 2) * apart
+        for row, pictures, score in of_scene:
+            said = f"{html.escape(scene)}, {html.escape(row)}, {pictures} pictures: {score:.2f}"
             parts.append(
-                f'<circle cx="{cx:.1f}" cy="{cy:.1f}" r="3.5" fill="{color}"><title>{said}</title></circle>'
-                f'<text class="name" x="{cx + 6:.1f}" y="{label + 4:.1f}" fill="{color}">{html.escape(name)}</text>'
+                f'<circle cx="{middles[row] + aside:.1f}" cy="{height(score):.1f}" r="3.5" fill="{color}">'
+                f"<title>{said}</title></circle>"
             )
     return "".join(parts)
-
-
-def _label_heights(places: Sequence[tuple[float, float]], apart: float = 11.0) -> list[float]:
-    """Heights of the labels of points, moved down where those of one column would lie on each other."""
-    heights: dict[int, float] = {}
-    for index in sorted(range(len(places)), key=lambda index: places[index][1]):
-        x, y = places[index]
-        taken = [heights[other] for other in heights if abs(places[other][0] - x) < 60]
-        heights[index] = max([y, *(height + apart for height in taken if height + apart > y)])
-    return [heights[index] for index in range(len(places))]
