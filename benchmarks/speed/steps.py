@@ -26,6 +26,7 @@ from polarguide.raster import choose_backend, use_threads
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CONFIGURATION, load_checkpoint
 from polarguide.system import keep_freed_memory
+from polarguide.training.feed import Feed
 from polarguide.training.trainer import Trainer, TrainSettings
 
 DEMO = Path(__file__).resolve().parents[2] / "src/polarguide/data/demo"
@@ -73,8 +74,8 @@ class Clock:
                 of = getattr(_native, holder) if holder else _native
                 setattr(of, attribute, self.timed(part, getattr(of, attribute)))
         Trained.step = self.timed("Adam", Trained.step)  # type: ignore[method-assign]
-        for name in ("_priors_of", "_shown_photograph"):
-            setattr(Trainer, name, self.timed("targets", getattr(Trainer, name)))
+        for name in ("priors", "shown"):
+            setattr(Feed, name, self.timed("targets", getattr(Feed, name)))
 
     def take(self) -> dict[str, float]:
         """What has been added up; then it starts again."""
