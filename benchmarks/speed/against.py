@@ -4,8 +4,8 @@
 
 Each checkout works in a process of its own with its own code (``CHECKOUT/src``, with its native module built there) and
 its own recipe of that name, and they take turns, so that none runs while another is timed. Steps are those of the
-longest stage, after every view has been looked at once: priors, which are computed when the guide is refreshed, are not
-in them. Printed are the median milliseconds and the median over the turns of the ratio. Run it alone.
+longest stage, each made twice and the second timed: priors, which are computed when the guide is refreshed, are not in
+them. Printed are the median milliseconds and the median over the turns of the ratio. Run it alone.
 """
 
 from __future__ import annotations
@@ -25,41 +25,47 @@ WORKER = """
 import sys, time
 sys.path[:] = [path for path in sys.path if path]
 import numpy as np, torch
-import polarguide.system as system
 from polarguide.capture import load_scene
-from polarguide.raster import choose_backend, use_threads
+try:
+    from polarguide.system import keep_freed_memory
+except ImportError:
+    keep_freed_memory = lambda: None
+from polarguide.raster import choose_backend
+try:
+    from polarguide.raster import use_threads
+except ImportError:
+    use_threads = torch.set_num_threads
 from polarguide.recipes import RECIPES
 from polarguide.training.trainer import Trainer, TrainSettings
 
 scene, downscale, recipe, gaussians, threads = sys.argv[1:]
-getattr(system, "keep_freed_memory", lambda: None)()
+keep_freed_memory()
 use_threads(int(threads))
 scene = load_scene(scene, downscale=int(downscale))
 trainer = Trainer(scene, RECIPES[recipe], TrainSettings(5000, 0), choose_backend("cpu"))
-kept, trained = np.load(gaussians), trainer.state.gaussians
+kept, trained = np.load(gaussians), getattr(trainer.state, "gaussians", None) or trainer.state.rows
 count = len(kept["means"])
 trained.keep(torch.arange(count) % len(trained))
 for name in trained.names:
     if name in kept:
         trained.overwrite(name, torch.from_numpy(kept[name]))
+trainer.state.statistics.clear(count)
 longest = max(trainer.recipe.stages, key=lambda stage: stage.fraction)
 every = trainer.recipe.densification.every
 calm = [
     step for step in range(1, 4999)
     if trainer.schedule.at(step).stage is longest and not trainer.schedule.at(step).actions and (step + 1) % every
 ]
-views, place = len(scene.train_views), 0
+place = 0
 
 def step(number):
-    trainer.state.step = calm[number % len(calm)]
-    begin = time.perf_counter()
-    trainer.step().measured.tolist()
+    for _ in range(2):  # the first computes the priors of the view
+        trainer.state.step = calm[number % len(calm)]
+        begin = time.perf_counter()
+        trainer.step()
     return 1000 * (time.perf_counter() - begin)
 
-for place in range(len(calm) // 2):  # every view is looked at
-    step(place)
-    if place > 3 * views:
-        break
+step(0)
 print("ready", len(trained), flush=True)
 for line in sys.stdin:
     found = [step(place + number) for number in range(int(line))]
@@ -95,6 +101,7 @@ def main() -> None:
                 **os.environ,
                 "PYTHONPATH": str(checkout.resolve() / "src"),
                 "OMP_WAIT_POLICY": "PASSIVE",
+                "POLARGUIDE_THREADS": str(options.threads),
             }
             words = (
                 run.scene.root,
