@@ -97,7 +97,8 @@ def test_a_folder_of_single_shots(demo_scene: Path, tmp_path: Path) -> None:
     record = json.loads((tmp_path / "out" / "inspection.json").read_text())
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
     assert verdicts["modulation"] == verdicts["handedness"] == verdicts["zero_offset"] == "ok"
-    assert "v011" in next(check for check in record["checks"] if check["key"] == "angles")["views"]
+    # The twelfth view; the demo has every second or third of its capture.
+    assert "v016" in next(check for check in record["checks"] if check["key"] == "angles")["views"]
     assert len(record["angles"]["pictures"]) == len(record["views"]) == 50
     assert record["views"][0]["dolp"] is None
     assert "looks like" in (tmp_path / "out" / "inspection.html").read_text()
