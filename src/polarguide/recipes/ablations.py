@@ -110,6 +110,11 @@ _COMMON = (
         priors(bright=0.0),
     ),
     (
+        "without-planes",
+        "Large flat surfaces are not looked for.",
+        priors(flat=False),
+    ),
+    (
         "layers-turn-normals",
         "The terms on the layers reach the normals through what the layers mirror, too, from the beginning.",
         staged(lambda stage: replace(stage, hold_normals=False)),

@@ -80,6 +80,7 @@ RECIPE_POLARGUIDE: Recipe = replace(
         azimuth_share=0.5,
         chromatic_share=0.1,
         bright=0.1,
+        flat=True,
     ),
 )
 

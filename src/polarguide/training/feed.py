@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,6 +13,7 @@ from polarguide.capture.background import empty_pixels
 from polarguide.color import srgb_encode
 from polarguide.raster import Backend
 from polarguide.shading.gbuffer import render
+from polarguide.training.flat import Flat, flat_surfaces
 from polarguide.training.metals import metalness_share
 from polarguide.training.packing import (
     Entry,
@@ -48,14 +49,22 @@ class Feed:
     Args:
         backend: device and rasterizer. priors: the recipe's. index: of refraction.
         black: whether nothing is behind the subject.
-        store: keeps what is computed of the views.
+        store: keeps what is computed of the views. views: that are trained on.
     """
 
     def __init__(
-        self, backend: Backend, priors: Priors, index: float, store: ViewStore, *, black: bool
+        self,
+        backend: Backend,
+        priors: Priors,
+        index: float,
+        store: ViewStore,
+        views: Sequence[View],
+        *,
+        black: bool,
     ) -> None:
         self._backend, self._settings, self._index, self._black = backend, priors, index, black
-        self._store = store
+        self._store, self._views = store, views
+        self._flat: dict[str, Flat] | None = None
         self._partial: dict[str, PartialView] = {}
 
     def forget(self, names: Collection[str]) -> None:
@@ -116,4 +125,12 @@ class Feed:
         # It can be had again for a part of the work, so that it is not worth a file.
         kept = self._store.get("unguided", view.name, make, disposable=True)
         known = Unguided(**{name: part.codes for name, part in kept.items()})
-        return pack_priors(view_priors(view, guide, self._settings, self._index, known, metal), fields)
+        flat = self._flat_surfaces().get(view.name)
+        return pack_priors(view_priors(view, guide, self._settings, self._index, known, metal, flat), fields)
+
+    def _flat_surfaces(self) -> dict[str, Flat]:
+        """Flat surfaces of all views, found when the first priors are asked for."""
+        if self._flat is None:
+            views = self._views if self._settings.flat else ()
+            self._flat = flat_surfaces(views, self._index, self._backend.device)
+        return self._flat

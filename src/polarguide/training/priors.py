@@ -18,6 +18,7 @@ from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.capture.exposures import FOUR
 from polarguide.color import srgb_encode
+from polarguide.training.flat import Flat
 from polarguide.training.recipe import Candidates, Priors
 from polarguide.vectors import dot, unit
 
@@ -42,7 +43,7 @@ class ViewPriors:
         candidates: [H, W, K, 3] what each step chooses from in place of ``normal``, world axes; None: nothing.
         plane: [H, W, 3] world normal of the plane of incidence that the AoLP gives.
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
-        chromatic: [H, W, 3] normal from the polarization of color differences, world axes.
+        chromatic: [H, W, 3] normal from the polarization of color differences, world axes, or of a flat surface.
         chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
         camera: of the view.
         stokes: [3, H, W, 3] as measured.
@@ -167,6 +168,7 @@ def view_priors(
     refractive_index: float,
     known: Unguided | None = None,
     metal: Tensor | None = None,
+    flat: Flat | None = None,
 ) -> ViewPriors:
     """Compute the priors of one view.
 
@@ -178,6 +180,7 @@ def view_priors(
         known: ``unguided`` of the view, where it is at hand.
         metal: [H, W] share of metals: where there are some, what holds for dielectrics alone does not count. None: no
             metal.
+        flat: a flat surface whose normal takes the place of the guide's and of the color differences'; None: none.
     """
     view = view.to(normal.device)
     rays = view.camera.rays(device=normal.device)
@@ -185,10 +188,17 @@ def view_priors(
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide, shown = guide_normals(view.camera.to_camera(normal), rays)
+    on_plane = None
+    if flat is not None:
+        on_plane = view.camera.to_camera(flat.normal.to(guide)).expand_as(guide)
+        guide, shown = torch.where(flat.where[..., None], on_plane, guide), shown | flat.where
     nearest_to = guide
     zenith, azimuth, certainty = found
     if zenith is not None and azimuth is not None and certainty is not None:
         chromatic, chromatic_weight = facing(zenith, azimuth, guide, rays), certainty * shown
+        if flat is not None and on_plane is not None:
+            chromatic = torch.where(flat.where[..., None], on_plane, chromatic)
+            chromatic_weight = torch.maximum(chromatic_weight, flat.where.to(chromatic_weight))
         nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
     chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal

@@ -159,6 +159,7 @@ class Priors:
             a view whose few pixels are polarized does not pull as hard as one that is polarized all over.
         bright: S0/2 from which on consistency counts fully whatever the DoLP, and below in proportion: where a surface
             shows something, its depth is known. 0: by the DoLP alone.
+        flat: whether large flat surfaces are looked for, whose normal one view tells.
     """
 
     candidates: Candidates = "physical"
@@ -172,6 +173,7 @@ class Priors:
     azimuth_share: float = 0.0
     chromatic_share: float = 0.0
     bright: float = 0.0
+    flat: bool = False
 
 
 @dataclass(frozen=True)

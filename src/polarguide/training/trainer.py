@@ -111,7 +111,7 @@ class Trainer:
         self._limit = settings.gaussians or int(pixels / recipe.densification.pixels_each)
         store = ViewStore() if self._searches else self._store
         index = settings.refractive_index
-        self._feed = Feed(self.backend, recipe.priors, index, store, black=self.black)
+        self._feed = Feed(self.backend, recipe.priors, index, store, self._views, black=self.black)
         self._use_batch_rates()
 
     def _first_state(self) -> TrainingState:

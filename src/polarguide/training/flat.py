@@ -1,0 +1,131 @@
+"""Flat surfaces that mirror: where one normal explains the polarization of a large part of a view.
+
+Light that a dielectric or a metal mirrors is polarized across the plane of incidence, so a pixel's AoLP gives a
+direction that its normal is perpendicular to, whatever is mirrored and however deep that seems to lie. On a plane all
+pixels have one normal, and the directions of many of them leave one line for it, whose side faces the camera: neither
+of the ambiguities of pi and pi/2 is left. Still water, which shows the depth of what it mirrors, has no other anchor.
+
+The planes of incidence of a sphere meet in one line, too, the ray through its center. There Fresnel's equations allow
+next to no polarization, so that what is measured contradicts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.capture import View
+from polarguide.vectors import dot, unit
+
+TRIES = 400
+"""Pairs of pixels that propose a normal."""
+SAMPLES = 12_000
+"""Pixels that judge them, about."""
+CLOSE = 0.03
+"""Sine of the angle between a pixel's plane of incidence and the normal, up to which they agree."""
+APART = 0.03
+"""Sine of the angle between the directions of two pixels under which they propose nothing."""
+LEAST = 0.25
+"""Share of a view that a flat surface covers at least: of curved things one normal explains up to a sixth by chance."""
+FAINT = 0.05
+"""DoLP from which on a pixel has a say."""
+SLACK = 1.1, 0.02
+"""DoLP over Fresnel's, as a factor and beyond it, that is still no contradiction."""
+GRAZING = 0.05
+"""Cosine between normal and ray under which a surface is not seen."""
+NEAR, MOST = 9, 0.7
+"""Side of a square of pixels, and the share of it that has to agree around a pixel that counts."""
+ALIKE, FEWEST, SHARE = 5.0, 3, 1 / 3
+"""Degrees within which flat surfaces of different views are one, and how many views and which share of them have to
+show it.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Flat:
+    """A flat surface in a view.
+
+    Attributes:
+        normal: [3] unit, world axes, towards the camera.
+        where: [H, W] bool, the pixels that it explains.
+    """
+
+    normal: Tensor
+    where: Tensor
+
+
+@torch.no_grad()
+def flat_surface(view: View, refractive_index: float) -> Flat | None:
+    """The flat surface that explains most of a view whose pictures determine the Stokes vector; None: there is none.
+
+    Random pairs of pixels propose normals, the one that most pixels agree with is refined on them by least squares.
+    """
+    luminance, rays = optics.luminance(view.stokes()), view.camera.rays(device=view.codes.device)
+    degree = optics.dolp(luminance)
+    good = (degree > FAINT) & ~view.invalid & ~view.saturated
+    x_ref, up_ref = optics.lens_frame(rays)
+    angle = 0.5 * torch.atan2(luminance[2], luminance[1])[..., None]
+    across = x_ref * angle.cos() + up_ref * angle.sin()
+
+    pixels = good.numel()
+    step = max(1, round((pixels / SAMPLES) ** 0.5))
+    some = torch.zeros_like(good)
+    some[::step, ::step] = good[::step, ::step]
+    e, d, dolp = across[some], rays[some], degree[some]
+    least = LEAST * pixels / step**2
+    if len(e) < max(2.0, least):
+        return None
+    pairs = torch.randint(len(e), (2, TRIES), generator=torch.Generator().manual_seed(0)).to(e.device)
+    proposed = torch.linalg.cross(e[pairs[0]], e[pairs[1]])
+    proposed = unit(proposed[proposed.norm(dim=-1) > APART])
+    if not len(proposed):
+        return None
+    proposed = torch.cat((proposed, -proposed))
+    fits = _agrees(proposed @ e.T, -(proposed @ d.T), dolp, refractive_index)
+    best = fits.sum(dim=1).argmax()
+    normal, inside = proposed[best], fits[best]
+    for _ in range(3):
+        _, vectors = torch.linalg.eigh(e[inside].T @ e[inside])
+        normal = vectors[:, 0] * torch.sign(vectors[:, 0] @ normal)
+        inside = _agrees(e @ normal, -(d @ normal), dolp, refractive_index)
+    if float(inside.sum()) < least:
+        return None
+    everywhere = normal.expand_as(rays)
+    where = good & _agrees(dot(across, everywhere), -dot(rays, everywhere), degree, refractive_index)
+    around = torch.nn.functional.avg_pool2d(where[None].float(), NEAR, 1, NEAR // 2)[0]
+    return Flat(view.camera.to_world(normal), where & (around > MOST))
+
+
+def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float) -> Tensor:
+    """Whether pixels agree with normals: ``off`` the cosine to their directions, ``cosine`` that to their rays."""
+    allowed = optics.specular_dolp(cosine.clamp(0, 1).acos(), refractive_index) * SLACK[0] + SLACK[1]
+    return (off.abs() < CLOSE) & (cosine > GRAZING) & (dolp < allowed)
+
+
+def flat_surfaces(
+    views: Iterable[View], refractive_index: float, device: torch.device | None = None
+) -> dict[str, Flat]:
+    """Flat surfaces by the name of the view, where enough views have one that is turned alike; each has their mean.
+
+    Args:
+        views: of a capture; those that do not determine the Stokes vector are left out. device: what does the work.
+    """
+    views, found = [view for view in views if view.is_determined], dict[str, Flat]()
+    for view in views:
+        flat = flat_surface(view if device is None else view.to(device), refractive_index)
+        if flat is not None:
+            found[view.name] = flat
+    if not found:
+        return {}
+    normals = torch.stack([flat.normal for flat in found.values()])
+    sizes = torch.stack([flat.where.sum() for flat in found.values()]).to(normals)
+    alike = normals @ normals.T > torch.cos(torch.deg2rad(normals.new_tensor(ALIKE)))
+    enough, agreed = max(FEWEST, SHARE * len(views)), {}
+    for (name, flat), others in zip(found.items(), alike, strict=True):
+        if int(others.sum()) >= enough:
+            agreed[name] = replace(flat, normal=unit((normals * (others * sizes)[:, None]).sum(dim=0)))
+    return agreed
