@@ -57,6 +57,10 @@ class Flat:
     normal: Tensor
     where: Tensor
 
+    def to(self, device: torch.device) -> Flat:
+        """The same on a device."""
+        return Flat(self.normal.to(device), self.where.to(device))
+
 
 @torch.no_grad()
 def flat_surface(view: View, refractive_index: float) -> Flat | None:
@@ -64,7 +68,7 @@ def flat_surface(view: View, refractive_index: float) -> Flat | None:
 
     Random pairs of pixels propose normals, the one that most pixels agree with is refined on them by least squares.
     """
-    luminance, rays = optics.luminance(view.stokes()), view.camera.rays(device=view.codes.device)
+    luminance, rays = optics.luminance(view.stokes()), view.camera.rays()
     degree = optics.dolp(luminance)
     good = (degree > FAINT) & ~view.invalid & ~view.saturated
     x_ref, up_ref = optics.lens_frame(rays)
@@ -79,7 +83,7 @@ def flat_surface(view: View, refractive_index: float) -> Flat | None:
     least = LEAST * pixels / step**2
     if len(e) < max(2.0, least):
         return None
-    pairs = torch.randint(len(e), (2, TRIES), generator=torch.Generator().manual_seed(0)).to(e.device)
+    pairs = torch.randint(len(e), (2, TRIES), generator=torch.Generator().manual_seed(0))
     proposed = torch.linalg.cross(e[pairs[0]], e[pairs[1]])
     proposed = unit(proposed[proposed.norm(dim=-1) > APART])
     if not len(proposed):
@@ -106,19 +110,13 @@ def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float) 
     return (off.abs() < CLOSE) & (cosine > GRAZING) & (dolp < allowed)
 
 
-def flat_surfaces(
-    views: Iterable[View], refractive_index: float, device: torch.device | None = None
-) -> dict[str, Flat]:
+def flat_surfaces(views: Iterable[View], refractive_index: float) -> dict[str, Flat]:
     """Flat surfaces by the name of the view, where enough views have one that is turned alike; each has their mean.
 
-    Args:
-        views: of a capture; those that do not determine the Stokes vector are left out. device: what does the work.
+    Views that do not determine the Stokes vector are left out.
     """
-    views, found = [view for view in views if view.is_determined], dict[str, Flat]()
-    for view in views:
-        flat = flat_surface(view if device is None else view.to(device), refractive_index)
-        if flat is not None:
-            found[view.name] = flat
+    views = [view for view in views if view.is_determined]
+    found = {view.name: flat for view in views if (flat := flat_surface(view, refractive_index)) is not None}
     if not found:
         return {}
     normals = torch.stack([flat.normal for flat in found.values()])

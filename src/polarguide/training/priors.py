@@ -190,7 +190,7 @@ def view_priors(
     guide, shown = guide_normals(view.camera.to_camera(normal), rays)
     on_plane = None
     if flat is not None:
-        on_plane = view.camera.to_camera(flat.normal.to(guide)).expand_as(guide)
+        on_plane = view.camera.to_camera(flat.normal).expand_as(guide)
         guide, shown = torch.where(flat.where[..., None], on_plane, guide), shown | flat.where
     nearest_to = guide
     zenith, azimuth, certainty = found
