@@ -6,6 +6,7 @@ polarization normals and the separation, and what comes out supervises the Gauss
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -28,6 +29,8 @@ MINIMUM_NORMAL = 0.3
 FULL_CERTAINTY = 3.0
 # Below this degree of polarization their plane takes the place of the AoLP's.
 CHROMATIC_PLANE_DOLP = 0.03
+# Cosine between a guide and the normal of a flat surface, under which the guide is wrong; it may know of ripples.
+ASTRAY = math.cos(math.radians(10))
 # Shares of metals between which a pixel goes over from a dielectric to a metal.
 METAL = (0.25, 0.75)
 
@@ -180,7 +183,8 @@ def view_priors(
         known: ``unguided`` of the view, where it is at hand.
         metal: [H, W] share of metals: where there are some, what holds for dielectrics alone does not count. None: no
             metal.
-        flat: a flat surface whose normal takes the place of the guide's and of the color differences'; None: none.
+        flat: a flat surface, whose normal takes the place of the guide's and of the color differences' where the guide
+            is far from it; None: none.
     """
     view = view.to(normal.device)
     rays = view.camera.rays(device=normal.device)
@@ -188,17 +192,18 @@ def view_priors(
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide, shown = guide_normals(view.camera.to_camera(normal), rays)
-    on_plane = None
+    on_plane = astray = None
     if flat is not None:
         on_plane = view.camera.to_camera(flat.normal).expand_as(guide)
-        guide, shown = torch.where(flat.where[..., None], on_plane, guide), shown | flat.where
+        astray = flat.where & ~(shown & (dot(guide, on_plane) > ASTRAY))
+        guide, shown = torch.where(astray[..., None], on_plane, guide), shown | flat.where
     nearest_to = guide
     zenith, azimuth, certainty = found
     if zenith is not None and azimuth is not None and certainty is not None:
         chromatic, chromatic_weight = facing(zenith, azimuth, guide, rays), certainty * shown
-        if flat is not None and on_plane is not None:
-            chromatic = torch.where(flat.where[..., None], on_plane, chromatic)
-            chromatic_weight = torch.maximum(chromatic_weight, flat.where.to(chromatic_weight))
+        if on_plane is not None and astray is not None:
+            chromatic = torch.where(astray[..., None], on_plane, chromatic)
+            chromatic_weight = torch.maximum(chromatic_weight, astray.to(chromatic_weight))
         nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
     chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal
