@@ -14,10 +14,9 @@ from camera_files import behind, smooth_light, write_model, write_mosaic, write_
 from camera_files import mosaic as seen_through
 from damage import EVERYWHERE, colmap_binary, duplicate, patched
 from dataset_files import write_gnerp, write_neisf, write_nersp, write_pandora, write_pisr
+from refused_preparations import refused as refused_preparation
 
 from polarguide import files
-from polarguide.capture import load_scene
-from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -88,15 +87,8 @@ CELLS = [
 
 
 def refused(source: Path, out: Path, settings: PrepareSettings) -> str:
-    """The message of a refusal, after which nothing looks like a scene."""
-    with pytest.raises(PolarguideError) as error:
-        prepare_scene(source, out, settings)
-    assert not (out / "scene.json").exists()
-    assert not (out / "sparse").exists()
-    if (out / "polar").exists():
-        with pytest.raises(PolarguideError):
-            load_scene(out)
-    text = str(error.value)
+    """The message of a refusal, which has all of its parts, and after which nothing looks like a scene."""
+    text = refused_preparation(source, out, settings)
     assert re.fullmatch(r"[^\n]+: expected [^\n]+, found [^\n]+\. [^\n]+", text), text
     return text
 

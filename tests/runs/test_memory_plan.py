@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import pytest
 from textured_ball import cameras
@@ -18,6 +19,7 @@ from polarguide.runs import forecast as forecasts
 from polarguide.runs import memory
 from polarguide.runs.defaults import MOST_GAUSSIANS, STEPS, with_defaults
 from polarguide.runs.memory import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
+from polarguide.training.flat import Flat
 from polarguide.training.settings import TrainSettings
 
 STOKES = RECIPES["polarguide-stokes"]
@@ -106,6 +108,24 @@ def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Sc
         "1 h 30 min",
         "2 h 01 min",
     ]
+
+
+def test_what_is_found_once_of_all_views_is_not_forecast_for_each(
+    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = 0.0
+
+    def slow(views: object, index: float) -> dict[str, Flat]:
+        nonlocal clock
+        clock += 1000.0
+        return {}
+
+    monkeypatch.setattr("polarguide.training.feed.flat_surfaces", slow)
+    monkeypatch.setattr(forecasts, "time", SimpleNamespace(perf_counter=lambda: clock))
+    found = forecasts.forecast(tiny_scene, STOKES, TrainSettings(600), choose_backend("cpu"), 10**9)
+    assert found is not None
+    assert clock >= 1000.0
+    assert found.seconds == 0.0
 
 
 def test_options_take_a_limit() -> None:

@@ -110,8 +110,8 @@ def _measured(trainer: Trainer) -> tuple[float, float]:
             continue
         if (step + 1) % trainer.recipe.densification.every == 0:
             continue
-        if not found:
-            _timed(trainer, step)  # what is loaded and made for the first time
+        if not found or (position.stage.weights.priors and not priors):
+            _timed(trainer, step + 1)  # what is loaded and made once; of another view, whose priors are not timed
         fresh, found[kind] = _timed(trainer, step), _timed(trainer, step)
         if position.stage.weights.priors:
             priors = max(priors, fresh - found[kind])

@@ -33,8 +33,8 @@ from polarguide.training.view_store import ViewStore
 
 class Shown(NamedTuple):
     """A training view's photograph [H, W, 3] as shown, 1 where it counts [H, W] (None: everywhere), and 1 where it
-    shows nothing [H, W] (None: where that is not known). And what was measured
-    where that does not determine the Stokes vector.
+    shows nothing [H, W] (None: where that is not known). And what was measured where that does not determine the
+    Stokes vector.
     """
 
     picture: Tensor

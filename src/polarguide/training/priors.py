@@ -192,7 +192,7 @@ def view_priors(
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide, shown = guide_normals(view.camera.to_camera(normal), rays)
-    on_plane = astray = None
+    on_plane, astray = guide, torch.zeros_like(shown)
     if flat is not None:
         on_plane = view.camera.to_camera(flat.normal).expand_as(guide)
         astray = flat.where & ~(shown & (dot(guide, on_plane) > ASTRAY))
@@ -201,9 +201,8 @@ def view_priors(
     zenith, azimuth, certainty = found
     if zenith is not None and azimuth is not None and certainty is not None:
         chromatic, chromatic_weight = facing(zenith, azimuth, guide, rays), certainty * shown
-        if on_plane is not None and astray is not None:
-            chromatic = torch.where(astray[..., None], on_plane, chromatic)
-            chromatic_weight = torch.maximum(chromatic_weight, astray.to(chromatic_weight))
+        chromatic = torch.where(astray[..., None], on_plane, chromatic)
+        chromatic_weight = torch.maximum(chromatic_weight, astray.to(chromatic_weight))
         nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
     chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal
