@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.angles import report_polarizers
 from polarguide.training.checked import refuse_foreign
-from polarguide.training.polarizers import Polarizers
+from polarguide.training.polarizers import AGAIN, DISAGREE, Polarizers, mean_angle
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer
@@ -84,6 +85,40 @@ def test_recipes_without_the_term_ignore_angles() -> None:
     assert not Polarizers(scene, STOKES, STEPS).ignored
 
 
+def test_the_mean_of_fits_goes_by_what_each_is_sure_of() -> None:
+    assert mean_angle([10.0, 20.0], [5.0, 5.0]) == pytest.approx((15.0, 5.0), abs=0.1)
+    mean, scatter = mean_angle([175.0, 5.0, 0.0], [2.0, 2.0, 2.0])
+    assert (mean + 90) % 180 == pytest.approx(90.0)
+    assert scatter == pytest.approx(5 * math.sqrt(2 / 3), abs=0.1)
+    # Three vague fits that are across, and a sure one later.
+    mean, scatter = mean_angle([130.0, 130.0, 130.0, 40.0], [12.0, 12.0, 12.0, 1.5])
+    assert mean == pytest.approx(40.0)
+    assert scatter > DISAGREE
+    # Surer than a degree is as sure as a degree.
+    assert mean_angle([0.0, 20.0], [1.0, 0.01])[0] == pytest.approx(10.0)
+
+
+def test_pictures_whose_fits_do_not_agree_are_named(tmp_path: Path) -> None:
+    scene = captured_as(WHOLE, "unknown")
+    polarizers = Polarizers(scene, STOKES, STEPS)
+    fits = polarizers.fit(predicted).repeat(4, 1, 1)
+    fits[:, :, 3] = 2.0
+    polarizers.take(fits)
+    assert not any(judgment.unsettled for judgment in polarizers.judgments())
+    turned, seldom = 1, 3
+    fits[:2, turned, 0] = (fits[:2, turned, 0] + 40.0) % 180.0
+    fits[:3, seldom, 2:4] = torch.tensor([0.1, 60.0], dtype=fits.dtype)
+    polarizers.take(fits)
+    unsettled = [k for k, judgment in enumerate(polarizers.judgments()) if judgment.unsettled]
+    assert unsettled == [turned, seldom]
+    heard = Heard()
+    report_polarizers(tmp_path, scene, polarizers, heard)
+    warned = [text for text in heard.said if "do not agree" in text]
+    names = [scene.train_views[k].name for k in unsettled]
+    assert len(warned) == 1
+    assert all(name in warned[0] for name in names)
+
+
 def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
     ones = captured_as(WHOLE, "one")
     plain = {view.name: view for view in captured_as(WHOLE, "none").views}
@@ -136,12 +171,12 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
     assert [report.done for report in reports] == [*range(1, STEPS + search + 1)]
     assert trainer.done == trainer.total
     assert trainer.polarizers.table is not None
-    assert len(trainer.polarizers.table) == 4
+    assert len(trainer.polarizers.table) == 4 + len(AGAIN)
 
     # From there on it is a training that has been told these angles.
-    told = Trainer(scene, STOKES, settings, CPU)
-    told.state.angles = trainer.polarizers.table
-    told.polarizers.take(trainer.polarizers.table)
+    state = Trainer(scene, STOKES, settings, CPU).state
+    state.angles = trainer.polarizers.table[:4]
+    told = Trainer(scene, STOKES, settings, CPU, state)
     told.run(lambda report: None)
     ours, theirs = trainer.state.tensors(), told.state.tensors()
     assert all(torch.equal(values, theirs[name]) for name, values in ours.items())

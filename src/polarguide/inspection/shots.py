@@ -27,7 +27,7 @@ from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import StepReport
 
 RECIPE = "polarguide-stokes"
-CERTAIN = 0.7
+CERTAIN = 0.6
 """Certainty (``FittedAngle``), over the median of all pictures, from which one may be said to contradict its angle."""
 CONTRADICTS = 30.0
 """Degrees from the angle that is said from which on a picture contradicts it, if that is also four times its spread and

@@ -51,6 +51,10 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         )
     if vague := [judgment for judgment in sought if judgment.vague]:
         reporter.warn(f"{named(vague)} do not tell their angle and are taken for photographs.")
+    if unsettled := [judgment for judgment in sought if judgment.unsettled]:
+        reporter.warn(
+            f"{named(unsettled)} may be at another angle: the fits of the training do not agree on it."
+        )
     if plain := [judgment for judgment in judgments if judgment.unfiltered]:
         reporter.warn(
             f"{named(plain)} look as if taken without a filter, or through a circular one mounted the wrong way round."

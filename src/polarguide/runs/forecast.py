@@ -111,7 +111,8 @@ def _measured(trainer: Trainer) -> tuple[float, float]:
         if (step + 1) % trainer.recipe.densification.every == 0:
             continue
         if not found or (position.stage.weights.priors and not priors):
-            _timed(trainer, step + 1)  # what is loaded and made once; of another view, whose priors are not timed
+            # What is loaded and made once, on another view: this one shall have no priors yet.
+            _timed(trainer, step + 1)
         fresh, found[kind] = _timed(trainer, step), _timed(trainer, step)
         if position.stage.weights.priors:
             priors = max(priors, fresh - found[kind])

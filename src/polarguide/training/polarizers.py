@@ -28,12 +28,21 @@ better: what is flat and mirrors, such as water, bends to explain its reflection
 """
 SEARCH_SIZE = 160
 """Pixels of the longer side of the pictures to seek them in, at most."""
+AGAIN = (0.2, 0.35, 0.5, 0.65)
+"""Shares of the steps of a training that began again at which angles that were sought are fitted once more: most were
+right, so that the model has learned from them, and what it predicts for the others is better than what they were
+fitted to.
+"""
+LEAST_SPREAD = 1.0
+"""Degrees of spread under which a fit counts no more for having less."""
 WEAK = 0.22
 """Certainty under which an angle is not relied on. Predictions that are wrong in places take some of it away, so that a
 picture through a filter seldom has all of it; half of it is usual when angles are first fitted.
 """
 VAGUE = 15.0
 """Spread (degrees) from which on a fitted angle is not relied on."""
+DISAGREE = 10.0
+"""Scatter (degrees) of the fits of one picture from which on they do not agree."""
 CONTRADICTS = 20.0
 """Degrees between the angle that is said and the fitted one from which on they contradict each other, if that is three
 times the spread."""
@@ -57,6 +66,7 @@ class Judgment:
         said: what the capture says. believed: what the training goes by.
         angle: the mean of the fits that tell one, degrees. gain, certainty, spread, doubt: of the last of these, see
             ``FittedAngle``.
+        scatter: of the angles about their mean, degrees; 90 where less than half of the fits tell one.
     """
 
     view: str
@@ -68,6 +78,7 @@ class Judgment:
     certainty: float
     spread: float
     doubt: float
+    scatter: float = 0.0
 
     @property
     def unfiltered(self) -> bool:
@@ -80,6 +91,16 @@ class Judgment:
         return (self.spread > VAGUE or self.certainty < WEAK) and not self.unfiltered
 
     @property
+    def tells(self) -> bool:
+        """Whether the picture tells its angle."""
+        return not self.vague and not self.unfiltered
+
+    @property
+    def unsettled(self) -> bool:
+        """Whether it tells an angle, and the fits do not agree on which."""
+        return self.tells and self.scatter > DISAGREE
+
+    @property
     def off(self) -> float:
         """Degrees from what is said to what was fitted, in [-90, 90); 0 where nothing is said."""
         return 0.0 if self.said.angle is None else (self.angle - self.said.angle + 90.0) % 180.0 - 90.0
@@ -88,13 +109,15 @@ class Judgment:
     def contradicts(self) -> bool:
         """Whether the picture contradicts what is said."""
         limit = max(CONTRADICTS, 3 * self.spread)
-        return not self.vague and not self.unfiltered and abs(self.off) > limit
+        return self.tells and abs(self.off) > limit
 
 
 class Polarizers:
     """The pictures behind polarizers that are to be fitted, and what has been found.
 
-    Pictures of a polarization camera are not; nor is anything where the recipe has no use for it.
+    Pictures of a polarization camera are not; nor is anything where the recipe has no use for it. Angles are sought in
+    the second half of a schedule. A training that then begins again with what was found fits them again on its way (one
+    that does not is past the first of these times by then).
 
     Args:
         scene: the capture. recipe: the method. steps: of the training. search: of the schedule by which unknown
@@ -120,8 +143,10 @@ class Polarizers:
         times = [FIRST]
         while self._unknown and times[-1] + EVERY <= LAST + 1e-9:
             times.append(times[-1] + EVERY)
-        length = search if search and self._unknown else steps
+        sought = bool(search) and self._unknown
+        length = search if sought else steps
         self._times = sorted({round(share * length) for share in times}) if self._places else []
+        self._later = sorted({round(share * steps) for share in AGAIN}) if sought else []
         if table is not None and table.shape[1] != len(self._places):
             raise ValueError(f"angles of {table.shape[1]} pictures, not {len(self._places)}")
         self.table = table
@@ -130,11 +155,15 @@ class Polarizers:
 
     def due(self, step: int) -> bool:
         """Whether angles are to be fitted before a step; none is once all fits have been made."""
-        return not self.settled and step in self._times
+        if not self.settled:
+            return step in self._times
+        assert self.table is not None
+        made = len(self.table) - len(self._times)
+        return made < len(self._later) and step == self._later[made]
 
     @property
     def settled(self) -> bool:
-        """Whether all fits have been made."""
+        """Whether the fits of the search, or of a training that does not begin again, have been made."""
         return self.table is not None and len(self.table) >= len(self._times)
 
     @property
@@ -185,10 +214,13 @@ class Polarizers:
         for (view, k), fits in zip(self._places, self.table.unbind(1), strict=True):
             said = view.exposures[k]
             rows = [Judgment(view.name, k, said, said, *row[:5]) for row in fits.tolist()]
-            telling = [row for row in rows if not row.vague and not row.unfiltered]
+            telling = [row for row in rows if row.tells]
             judgment = (telling or rows)[-1]
             if telling:
-                judgment = replace(judgment, angle=mean_angle([row.angle for row in telling]))
+                angles, spreads = [row.angle for row in telling], [row.spread for row in telling]
+                angle, scatter = mean_angle(angles, spreads)
+                few = len(telling) < len(rows) / 2
+                judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)
             found.append(judgment if said.known else replace(judgment, believed=_belief(judgment, common)))
         return found
 
@@ -229,7 +261,16 @@ def _belief(judgment: Judgment, common: float | None) -> Exposure:
     return found_exposure(said, judgment.angle, gain)
 
 
-def mean_angle(angles: Sequence[float]) -> float:
-    """Mean of angles in degrees that count modulo 180."""
+def mean_angle(angles: Sequence[float], spreads: Sequence[float]) -> tuple[float, float]:
+    """Mean of angles in degrees that count modulo 180, each by one over its spread in degrees, and their scatter.
+
+    The scatter is half the circular standard deviation of the doubled angles, sqrt(-2 log R) with R the length of their
+    mean (Mardia and Jupp, Directional Statistics, 2.3), in degrees.
+    """
+    weights = [1 / max(spread, LEAST_SPREAD) for spread in spreads]
     doubled = [math.radians(2 * angle) for angle in angles]
-    return math.degrees(math.atan2(sum(map(math.sin, doubled)), sum(map(math.cos, doubled))) / 2) % 180.0
+    sine = sum(weight * math.sin(angle) for weight, angle in zip(weights, doubled, strict=True))
+    cosine = sum(weight * math.cos(angle) for weight, angle in zip(weights, doubled, strict=True))
+    length = min(max(math.hypot(sine, cosine) / sum(weights), 1e-6), 1.0)
+    mean = math.degrees(math.atan2(sine, cosine) / 2) % 180.0
+    return mean, min(math.degrees(math.sqrt(-2 * math.log(length))) / 2, 90.0)

@@ -143,7 +143,7 @@ class Trainer:
         if self.polarizers.due(self.state.step):
             self.whole = False
             self._fit_polarizers()
-            if self.polarizers.settled and self.begins_again:
+            if self._searches and self.polarizers.settled:
                 self._begin_again()
             self.whole = True
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
