@@ -48,6 +48,11 @@ def test_a_field_is_compared_with_gaussians(
     record = json.loads((out / "results.json").read_text())
     validate_results(record)
     assert [r["about"].endswith("; 4 steps.") for r in record["recipes"]] == [False, True]
+    assert [r.get("steps") for r in record["recipes"]] == [None, 4]
+    rows = [
+        line.split("|")[1].strip() for line in (out / "results.md").read_text().splitlines() if "|" in line
+    ]
+    assert rows[2:4] == ["`3dgs`", "`gnerp` (4 steps)"]
     steps = {
         r["recipe"]: json.loads((out / r["folder"] / "metrics.json").read_text())["steps"]
         for r in record["runs"]

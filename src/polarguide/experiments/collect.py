@@ -13,7 +13,14 @@ from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.aggregate import PartScores, RunRecord, aggregate
 from polarguide.experiments.forms import csv_text, differences_csv, latex, markdown, parts_csv
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
-from polarguide.experiments.results import FORMAT, Results, differences_of, validate_results, write_results
+from polarguide.experiments.results import (
+    FORMAT,
+    RecipeRecord,
+    Results,
+    differences_of,
+    validate_results,
+    write_results,
+)
 from polarguide.files import write_text
 
 BESIDE_OTHERS = "beside_others.txt"
@@ -68,7 +75,10 @@ def collect(
             for s in scenes
         ],
         recipes=[
-            {"name": row.name, "about": row.about, "data": row.recipe.data()} for row in comparison.rows
+            RecipeRecord(name=row.name, about=row.about, data=row.recipe.data())
+            if row.steps is None
+            else RecipeRecord(name=row.name, about=row.about, data=row.recipe.data(), steps=row.steps)
+            for row in comparison.rows
         ],
         runs=runs,
         table=aggregate(runs, [scene.name for scene in scenes], recipes),

@@ -215,7 +215,7 @@ def _summary(results: Results) -> str:
             plural(counts["scenes"], "scene"),
             " or ".join(plural(count, "seed") for count in seed_counts(results)),
             f"{settings['steps']:,} steps a run unless a row says otherwise"
-            if any(" steps." in recipe["about"] for recipe in results["recipes"])
+            if any("steps" in recipe for recipe in results["recipes"])
             else f"{settings['steps']:,} steps a run",
         )
     )

@@ -62,12 +62,16 @@ class SceneRecord(TypedDict):
     black_share: float | None
 
 
-class RecipeRecord(TypedDict):
-    """A recipe with all its values."""
-
+class _Recipe(TypedDict):
     name: str
     about: str
     data: dict[str, Any]
+
+
+class RecipeRecord(_Recipe, total=False):
+    """A recipe with all its values; ``steps`` only where it takes another number of them than ``Settings`` say."""
+
+    steps: Annotated[int, msgspec.Meta(ge=1)]
 
 
 class Results(TypedDict):

@@ -37,13 +37,14 @@ def scores_section(results: Results) -> Section:
     """The table by scenes, formatted, with the leaders of every column marked."""
     columns = shown_columns(results)
     titles: dict[str | None, str] = {row["scene"]: row["scene"] or MEAN_TITLE for row in results["table"]}
+    steps = {recipe["name"]: recipe["steps"] for recipe in results["recipes"] if "steps" in recipe}
     made = []
     for scene, title in titles.items():
         rows = [row for row in results["table"] if row["scene"] == scene]
         bold = [leading_rows(rows, column, results) for column in columns]
         shown = tuple(
             ShownRow(
-                (Label(row["recipe"], code=True, remark=_remark(row, results)),),
+                (Label(row["recipe"], code=True, remark=_remark(row, results, steps)),),
                 tuple(
                     _cell(row, column, index in leaders, results["table"])
                     for column, leaders in zip(columns, bold, strict=True)
@@ -164,7 +165,13 @@ def seed_counts(results: Results) -> list[int]:
     return sorted(set(Counter((run["scene"], run["recipe"]) for run in results["runs"]).values()))
 
 
-def _remark(row: Row, results: Results) -> str:
+def _remark(row: Row, results: Results, steps: Mapping[str, int]) -> str:
+    """Its number of steps where that is not the others' number, and what is missing of a row."""
+    own = f"{steps[row['recipe']]:,} steps" if row["recipe"] in steps else ""
+    return ", ".join(filter(None, (own, _missing(row, results))))
+
+
+def _missing(row: Row, results: Results) -> str:
     """What is missing of a row; else how many seeds it has, where rows differ in that."""
     planned = [
         run
