@@ -12,7 +12,7 @@ from polarguide.evaluation.sources import commit, scoring_digest
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.aggregate import PartScores, RunRecord, aggregate
 from polarguide.experiments.forms import csv_text, differences_csv, latex, markdown, parts_csv
-from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
+from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, TableRow
 from polarguide.experiments.results import (
     FORMAT,
     RecipeRecord,
@@ -74,18 +74,20 @@ def collect(
             }
             for s in scenes
         ],
-        recipes=[
-            RecipeRecord(name=row.name, about=row.about, data=row.recipe.data())
-            if row.steps is None
-            else RecipeRecord(name=row.name, about=row.about, data=row.recipe.data(), steps=row.steps)
-            for row in comparison.rows
-        ],
+        recipes=[_recipe_record(row) for row in comparison.rows],
         runs=runs,
         table=aggregate(runs, [scene.name for scene in scenes], recipes),
         differences=[],
     )
     record["differences"] = differences_of(record)
     return validate_results(record)
+
+
+def _recipe_record(row: TableRow) -> RecipeRecord:
+    record = RecipeRecord(name=row.name, about=row.about, data=row.recipe.data())
+    if row.steps is not None:
+        record["steps"] = row.steps
+    return record
 
 
 def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) -> RunRecord:

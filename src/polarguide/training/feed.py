@@ -132,8 +132,7 @@ class Feed:
         """Flat surfaces of all views, found when the first priors are asked for."""
         if self._flat is None:
             views = self._views if self._settings.flat else ()
-            found = flat_surfaces(
-                views, self._index
-            )  # on the CPU, so that it is the same wherever one trains
+            # On the CPU, so that it is the same wherever one trains.
+            found = flat_surfaces(views, self._index)
             self._flat = {name: flat.to(self._backend.device) for name, flat in found.items()}
         return self._flat
