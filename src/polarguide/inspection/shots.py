@@ -28,8 +28,9 @@ from polarguide.training.trainer import StepReport
 
 RECIPE = "polarguide-stokes"
 CERTAIN = 0.6
-"""Certainty (``FittedAngle``), over the median of all pictures, from which one may be said to contradict its angle. At 0.7 a
-wrong line of the demo (0.67) went unnamed; still water with right angles has 5 false alarms in 189 pictures, 3 at 0.7.
+"""Certainty (``FittedAngle``), over the median of all pictures, from which one may be said to contradict its angle. At
+0.7 a wrong line of the demo (0.67) went unnamed; still water with right angles has 5 false alarms in 189 pictures, 3 at
+0.7.
 """
 CONTRADICTS = 30.0
 """Degrees from the angle that is said from which on a picture contradicts it, if that is also four times its spread and
