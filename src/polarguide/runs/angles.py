@@ -49,8 +49,11 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
             f"angles found for {len(fitted)} of {len(sought)} pictures (median certainty {middle:.2f}, 1 is a filter, "
             f"0 none): {out / TABLE}"
         )
-    if vague := [judgment for judgment in sought if judgment.vague]:
-        reporter.warn(f"{named(vague)} do not tell their angle and are taken for photographs.")
+    vague = [judgment for judgment in sought if judgment.vague]
+    if guessed := [judgment for judgment in vague if judgment.guesses]:
+        reporter.warn(f"{named(guessed)} hardly tell their angle: the likeliest one is taken.")
+    if lost := [judgment for judgment in vague if not judgment.guesses]:
+        reporter.warn(f"{named(lost)} do not tell their angle and are taken for photographs.")
     if unsettled := [judgment for judgment in sought if judgment.unsettled]:
         reporter.warn(
             f"{named(unsettled)} may be at another angle: the fits of the training do not agree on it."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,10 +29,9 @@ better: what is flat and mirrors, such as water, bends to explain its reflection
 """
 SEARCH_SIZE = 160
 """Pixels of the longer side of the pictures to seek them in, at most."""
-AGAIN = (0.2, 0.35, 0.5, 0.65)
-"""Shares of the steps of a training that began again at which angles that were sought are fitted once more: most were
-right, so that the model has learned from them, and what it predicts for the others is better than what they were
-fitted to.
+AGAIN = (0.5, 0.65, 0.8, 0.95)
+"""Shares of the same schedule at which they are fitted in a second search, which goes by what the first one found: most
+was right, so that the model learns from it, and predicts better for the others than what they were fitted to first.
 """
 LEAST_SPREAD = 1.0
 """Degrees of spread under which a fit counts no more for having less."""
@@ -40,7 +40,11 @@ WEAK = 0.22
 picture through a filter seldom has all of it; half of it is usual when angles are first fitted.
 """
 VAGUE = 15.0
-"""Spread (degrees) from which on a fitted angle is not relied on."""
+"""Spread (degrees) from which on a picture does not tell its angle."""
+LOST = 45.0
+"""Spread (degrees) from which on a fitted angle is not even the best guess. Up to 30 degrees of error such a guess is
+nearer to the picture than a photograph without a filter would be, and errors are a third of the spread, mostly.
+"""
 DISAGREE = 10.0
 """Scatter (degrees) of the fits of one picture from which on they do not agree."""
 CONTRADICTS = 20.0
@@ -64,9 +68,9 @@ class Judgment:
     Attributes:
         view, number: the view, and the place of the picture among its exposures.
         said: what the capture says. believed: what the training goes by.
-        angle: the mean of the fits that tell one, degrees. gain, certainty, spread, doubt: of the last of these, see
-            ``FittedAngle``.
-        scatter: of the angles about their mean, degrees; 90 where less than half of the fits tell one.
+        angle: the mean of the fits that tell one, or else of those that guess one, degrees.
+        gain, certainty, spread, doubt: of the last of these, see ``FittedAngle``.
+        scatter: of the angles about their mean, degrees; 90 where less than half of the fits have one.
     """
 
     view: str
@@ -96,6 +100,11 @@ class Judgment:
         return not self.vague and not self.unfiltered
 
     @property
+    def guesses(self) -> bool:
+        """Whether its angle is worth believing where nothing else is known."""
+        return self.spread <= LOST and self.certainty >= WEAK
+
+    @property
     def unsettled(self) -> bool:
         """Whether it tells an angle, and the fits do not agree on which."""
         return self.tells and self.scatter > DISAGREE
@@ -116,12 +125,12 @@ class Polarizers:
     """The pictures behind polarizers that are to be fitted, and what has been found.
 
     Pictures of a polarization camera are not; nor is anything where the recipe has no use for it. Angles are sought in
-    the second half of a schedule. A training that then begins again with what was found fits them again on its way (one
-    that does not is past the first of these times by then).
+    the second half of a schedule. Where the training begins again with what was found, they are sought twice, the
+    second time by what the first has found.
 
     Args:
         scene: the capture. recipe: the method. steps: of the training. search: of the schedule by which unknown
-            angles are sought; 0: steps.
+            angles are sought where the training begins again after it; 0: it does not.
         table: what was found before, [F, P, 6] float64: what each ``fit`` gave; None: nothing.
 
     Raises:
@@ -143,10 +152,11 @@ class Polarizers:
         times = [FIRST]
         while self._unknown and times[-1] + EVERY <= LAST + 1e-9:
             times.append(times[-1] + EVERY)
-        sought = bool(search) and self._unknown
-        length = search if sought else steps
-        self._times = sorted({round(share * length) for share in times}) if self._places else []
-        self._later = sorted({round(share * steps) for share in AGAIN}) if sought else []
+        length = search if search and self._unknown else steps
+        rounds = (times, AGAIN) if search and self._unknown else (times,)
+        self._rounds = [
+            sorted({round(share * length) for share in shares}) for shares in rounds if self._places
+        ]
         if table is not None and table.shape[1] != len(self._places):
             raise ValueError(f"angles of {table.shape[1]} pictures, not {len(self._places)}")
         self.table = table
@@ -155,21 +165,28 @@ class Polarizers:
 
     def due(self, step: int) -> bool:
         """Whether angles are to be fitted before a step; none is once all fits have been made."""
-        if not self.settled:
-            return step in self._times
-        assert self.table is not None
-        made = len(self.table) - len(self._times)
-        return made < len(self._later) and step == self._later[made]
+        return not self.settled and step in self._rounds[self.ended]
+
+    @property
+    def ended(self) -> int:
+        """Searches of which all fits have been made."""
+        made = 0 if self.table is None else len(self.table)
+        return sum(made >= end for end in itertools.accumulate(map(len, self._rounds)))
 
     @property
     def settled(self) -> bool:
-        """Whether the fits of the search, or of a training that does not begin again, have been made."""
-        return self.table is not None and len(self.table) >= len(self._times)
+        """Whether all fits have been made."""
+        return self.ended == len(self._rounds)
 
     @property
     def search(self) -> int:
         """Steps until unknown angles are found; 0 where there are none."""
-        return self._times[-1] if self._unknown else 0
+        return sum(times[-1] for times in self._rounds) if self._unknown else 0
+
+    @property
+    def searched(self) -> int:
+        """Those of them that belong to searches that have ended."""
+        return sum(times[-1] for times in self._rounds[: self.ended]) if self._unknown else 0
 
     def believed(self, view: View) -> View:
         """A view with what is believed of its exposures."""
@@ -214,7 +231,7 @@ class Polarizers:
         for (view, k), fits in zip(self._places, self.table.unbind(1), strict=True):
             said = view.exposures[k]
             rows = [Judgment(view.name, k, said, said, *row[:5]) for row in fits.tolist()]
-            telling = [row for row in rows if row.tells]
+            telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
             judgment = (telling or rows)[-1]
             if telling:
                 angles, spreads = [row.angle for row in telling], [row.spread for row in telling]
@@ -246,17 +263,17 @@ class Polarizers:
 
 
 def search_steps(settings: TrainSettings) -> int:
-    """Steps of the schedule by which unknown angles are sought."""
-    return min(SEARCH_STEPS, settings.steps) if settings.begin_again else settings.steps
+    """Steps of the schedule by which unknown angles are sought before a training begins; 0: it does not begin again."""
+    return min(SEARCH_STEPS, settings.steps) if settings.begin_again else 0
 
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
-    """What is believed of a picture of which nothing is said: a photograph where it does not tell its angle."""
+    """What is believed of a picture of which nothing is said: a photograph where there is no angle to believe."""
     said = judgment.said
-    if judgment.vague:
-        return said
     if judgment.unfiltered:
         return replace(said, filtered=False)
+    if not judgment.guesses:
+        return said
     gain = said.gain if common is None else said.gain * judgment.gain / common
     return found_exposure(said, judgment.angle, gain)
 

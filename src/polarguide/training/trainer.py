@@ -130,7 +130,7 @@ class Trainer:
     @property
     def done(self) -> int:
         """Those of them that are done."""
-        before = self.polarizers.search if self.begins_again and self.polarizers.settled else 0
+        before = self.polarizers.searched if self.begins_again else 0
         return before + self.state.step
 
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
@@ -142,8 +142,9 @@ class Trainer:
         """One optimizer step."""
         if self.polarizers.due(self.state.step):
             self.whole = False
+            ended = self.polarizers.ended
             self._fit_polarizers()
-            if self._searches and self.polarizers.settled:
+            if self._searches and self.polarizers.ended > ended:
                 self._begin_again()
             self.whole = True
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
