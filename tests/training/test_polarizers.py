@@ -282,3 +282,18 @@ def test_four_pictures_train_as_ever() -> None:
     again = trained(dataclasses.replace(WHOLE, views=tuple(listed)), STEPS).state.tensors()
     assert ours.keys() == again.keys()
     assert all(torch.equal(values, again[name]) for name, values in ours.items())
+
+
+def test_the_fits_of_the_latest_search_hold() -> None:
+    scene = captured_as(WHOLE, "unknown")
+    polarizers = Polarizers(scene, STOKES, STEPS, search=STEPS)
+    fit = polarizers.fit(predicted)
+    fit[:, 3] = 2.0
+    first, second = fit.clone(), fit.clone()
+    first[:, 0], second[:, 0] = 10.0, 30.0
+    polarizers.take(first.repeat(4, 1, 1))
+    assert (polarizers.ended, polarizers.settled) == (1, False)
+    assert [judgment.angle for judgment in polarizers.judgments()] == pytest.approx([10.0] * len(fit))
+    polarizers.take(torch.cat((first.repeat(4, 1, 1), second.repeat(len(AGAIN), 1, 1))))
+    assert polarizers.settled
+    assert [judgment.angle for judgment in polarizers.judgments()] == pytest.approx([30.0] * len(fit))

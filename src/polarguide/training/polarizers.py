@@ -31,7 +31,8 @@ SEARCH_SIZE = 160
 """Pixels of the longer side of the pictures to seek them in, at most."""
 AGAIN = (0.5, 0.65, 0.8, 0.95)
 """Shares of the same schedule at which they are fitted in a second search, which goes by what the first one found: most
-was right, so that the model learns from it, and predicts better for the others than what they were fitted to first.
+was right, so that the model learns from it, and predicts better for the others than what they were fitted to first. A
+third search found nothing more on two scenes.
 """
 LEAST_SPREAD = 1.0
 """Degrees of spread under which a fit counts no more for having less."""
@@ -228,7 +229,7 @@ class Polarizers:
             return []
         common = self._common_gain()
         found = []
-        for (view, k), fits in zip(self._places, self.table.unbind(1), strict=True):
+        for (view, k), fits in zip(self._places, self._latest().unbind(1), strict=True):
             said = view.exposures[k]
             rows = [Judgment(view.name, k, said, said, *row[:5]) for row in fits.tolist()]
             telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
@@ -240,6 +241,12 @@ class Polarizers:
                 judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)
             found.append(judgment if said.known else replace(judgment, believed=_belief(judgment, common)))
         return found
+
+    def _latest(self) -> Tensor:
+        """The fits of the latest search that has any; those of earlier ones are worse."""
+        assert self.table is not None
+        ends = itertools.accumulate(map(len, self._rounds), initial=0)
+        return self.table[max(end for end in ends if end < len(self.table)) :]
 
     def _common_gain(self) -> float | None:
         """What gains are relative to; None where they differ no more than those of locked exposures, as fitted."""
