@@ -22,6 +22,7 @@ from polarguide.cli.console import say, warnings_printed
 from polarguide.errors import PolarguideError
 from polarguide.options import gibibytes
 from polarguide.system import interrupts
+from polarguide.variables import check_variables
 
 VERBS = {
     "demo": "demo",
@@ -164,6 +165,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
         return 0
     if verb is not None:
         _require_place()
+        check_variables()
         _refuse_empty_paths(verb, arguments[1:])
         words = _sizes_as_numbers(arguments[1:])
         found = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=words)
