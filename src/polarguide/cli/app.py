@@ -265,6 +265,6 @@ def _near(word: str) -> str:
 def _as_flag(error: PolarguideError, verb: str | None) -> str:
     """The message; a parameter that is at fault is called as on the command line."""
     text = str(error)
-    if verb is not None and error.where in options_of(function_of(verb)):
+    if verb is not None and not error.is_path and error.where in options_of(function_of(verb)):
         return f"{_flag(error.where)}{text.removeprefix(error.where)}"
     return text
