@@ -91,6 +91,7 @@ def option_cases() -> Iterator[MadeCase]:
         ("a pattern of hosts", [*view, "--allow-host", "*"], "--allow-host: expected a name"),
         ("two hosts in one", [*view, "--allow-host", "a b"], "--allow-host: expected a name"),
         ("an address that is none", [*view, "--viewer-host", "no.such.host.invalid"], "viewer's host"),
+        ("an order of a hundred thousand angles", [*SHOTS, "--order", "0" + ",0" * 100_000], r"\A.{,1000}\Z"),
         ("white of 1_0", ["present", "run", "--white-balance", "1_0,1,1"], ""),
         ("a length of other digits", ["present", "run", "--white-balance", "\uff11,1,1"], ""),
     ):

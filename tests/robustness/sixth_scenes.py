@@ -39,6 +39,8 @@ def record_cases() -> Iterator[MadeCase]:
         "sixth calibration of a key that there is not, which begins like a file of analyzers",
         of_bytes("calibration.json", b'{"gain":{"0": 1.0}}'), WITH_CALIBRATION, says="expected only gains, order",
     )  # fmt: skip
+    long = text("run/run.json", lambda given: given.replace('"version": "', '"version": "' + "v" * 1_000_000))
+    yield made_case("sixth run.json with a version of a million letters", long, RENDER, says=r"\A.{,2000}\Z")
     yield made_case(
         "sixth scene.json: as many objects as there may be", _many_objects, EVAL, "a scene may have them",
         says="the 100 largest of 65,535 objects",

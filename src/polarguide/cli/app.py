@@ -8,6 +8,7 @@ import difflib
 import importlib
 import io
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -127,7 +128,7 @@ def _failed(text: str) -> int:
     """Print an error, if anybody can be told; returns the exit status."""
     with contextlib.suppress(OSError):
         _errors().print("[bold red]error:[/] ", end="")
-        say(text, to=_errors())
+        say(_LONG_WORD.sub(lambda word: word[0][:200] + "...", text), to=_errors())
     return 2
 
 
@@ -152,6 +153,7 @@ def _while_loading(error: Exception) -> bool:
     return any(name.startswith("<frozen importlib") for name in frames[ours[-1] + 1 :]) if ours else False
 
 
+_LONG_WORD = re.compile(r"\S{1000,}")  # of a file or the command line: megabytes of it hide what is wrong
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
 _HOME = str(Path(__file__).parents[1]) + os.sep
 _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
