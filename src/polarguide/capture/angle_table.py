@@ -120,14 +120,14 @@ def _is_path(name: str) -> bool:
 def _number(where: str, name: str, text: str, least: float = -math.inf) -> float:
     words = f", {UNKNOWN} or {NONE}" if name == "angle" else ""
     expected = "a positive number" if math.isfinite(least) else "a number of degrees"
-    bound = f", {least:g} or more" if math.isfinite(least) else ""
     try:
         value = decimal(text)
     except ValueError:
         value = math.nan
+    small = f"{value:g}, less than {least:g}" if 0 < value < least else ""
     if not math.isfinite(value) or value < least or abs(value) > 1e6:
         raise PolarguideError(
-            where, expected=f"{expected}{words} as {name}{bound}", found=repr(text), remedy=_REMEDY
+            where, expected=f"{expected}{words} as {name}", found=small or repr(text), remedy=_REMEDY
         )
     return value
 
