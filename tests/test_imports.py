@@ -14,7 +14,9 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / PACKAGE
 # From the top down. A room may import from itself and from every room before it.
 ROOMS = (
     "errors",
+    "numerals",
     "options",
+    "variables",
     "files",
     "records",
     "spreadsheet",

@@ -125,3 +125,8 @@ def test_names_that_are_no_unicode_come_back(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(to_json(content))
     assert read_record(tmp_path / "a.json", dict[str, str]) == content
     assert "\u00e9".encode() in to_json({"text": "\u00e9"})
+
+
+def test_a_key_that_stands_twice_is_named() -> None:
+    with pytest.raises(PolarguideError, match='"b" stands there twice'):
+        decode(b'{"a": {"b": 1, "c": 2, "b": 1}}', dict[str, Any], "f.json")

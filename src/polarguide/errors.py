@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 from typing import Any
 
 EXPORT_EXTRA = "'polarguide[export]'"
@@ -25,6 +26,7 @@ class PolarguideError(Exception):
     def __init__(self, where: object, *, expected: str, found: str, remedy: str) -> None:
         super().__init__(f"{where}: expected {expected}, found {found}. {remedy}")
         self.where = str(where)
+        self.is_path = isinstance(where, os.PathLike)  # one may be called like an option
         self.expected = expected
         self.found = found
         self.remedy = remedy

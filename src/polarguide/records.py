@@ -43,8 +43,8 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:
     """A record from JSON.
 
-    Numbers have to be finite, and true and false are no numbers. Keys that a type does not have are passed over,
-    unless it forbids them.
+    Numbers have to be finite, true and false are no numbers, and no key may stand twice. Keys that a type does not
+    have are passed over, unless it forbids them.
 
     Args:
         data: JSON text as bytes, or what JSON text has been parsed to.
@@ -55,7 +55,7 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         PolarguideError: it is not JSON, or not of this type; the message names the field and the value.
     """
     try:
-        value = json.loads(data) if isinstance(data, bytes) else data
+        value = json.loads(data, object_pairs_hook=_each_once) if isinstance(data, bytes) else data
         _require_shallow(value)
         record = msgspec.convert(value, kind)
     except PolarguideError as error:  # of a type's own check
@@ -71,6 +71,21 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
             where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
         ) from None
     _require_finite(msgspec.to_builtins(record, enc_hook=str), where, remedy)
+    return record
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; JSON leaves open which of two values of one key holds, and programs differ.
+
+    Raises:
+        ValueError: a key stands there twice.
+    """
+    record = dict(pairs)
+    if len(record) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(
+            f"{shortened(next(key for key in record if keys.count(key) > 1))} stands there twice"
+        )
     return record
 
 

@@ -33,6 +33,7 @@ HUGE, SMALL = 30_000, (24, 20)
         (".tif", lambda path: made.deflated_tiff(path, HUGE), "more than any camera takes"),
         (".png", lambda path: made.png(path, 64, 64, first=[(b"tEXt", b"\0\0\0\x18\0\0\0\x14\x10\0\0\0\0")]),
          "does not begin with its size"),
+        (".png", lambda path: made.png(path, 64, 64, before=[(b"acTL", bytes(8))]), "an animated PNG file"),
         (".jpg", lambda path: made.two_sizes_jpeg(path, HUGE), "more than any camera takes"),
         (".jpg", lambda path: made.scans_jpeg(path, 64, 4000), "4000 scans"),
     ],

@@ -239,3 +239,11 @@ def test_no_table_among_the_shots(folder: Path, reading: ShotOptions) -> None:
     with pytest.raises(PolarguideError, match="found that of the shots"):
         measure_shots([folder], folder, MeasureOptions(), reading)
     assert not (folder / LINES).exists()
+
+
+def test_a_table_of_somebody_else_is_kept(tmp_path: Path) -> None:
+    (tmp_path / CSV).write_text("mine")
+    with pytest.raises(PolarguideError, match="found a file of this name alone"):
+        Table(tmp_path, SETTINGS)
+    assert (tmp_path / CSV).read_text() == "mine"
+    Table(tmp_path, SETTINGS, overwrite=True).close()

@@ -23,6 +23,7 @@ from forked import Case
 from fourth import fourth_cases
 from further import further_cases
 from options import option_cases
+from sixth import sixth_cases
 
 BYTES = ("cut", "empty", "garbage", "flip", "fill", "insert", "append", "twice")
 PLACES = ("folder", "pipe", "device", "loop", "dangling", "outside")
@@ -45,6 +46,7 @@ def corpus(first_seed: int = 0, times: int = 1) -> Iterator[Case]:
     yield from further_cases(every=times > 1)
     yield from fourth_cases(every=times > 1)
     yield from fifth_cases(every=times > 1)
+    yield from sixth_cases()
 
 
 def case(

@@ -143,6 +143,10 @@ def _child(case: Case, base: Path, folder: Path) -> int:
     os.dup2(said, 2)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     shutil.copytree(base, folder / "case", symlinks=True)
+    for record in (folder / "case").glob(
+        "*/run.json"
+    ):  # else the base's own scene would be read, which is whole
+        record.write_text(record.read_text().replace(f'"{base}/', f'"{folder / "case"}/'))
     os.chdir(folder / "case")
     arguments = case.make(folder / "case", random.Random(f"{case.name} {case.seed}"))
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS + 5))

@@ -222,3 +222,13 @@ def test_intrinsics_are_those_of_the_picture(tmp_path: Path) -> None:
     for text in ("1e308,1e308,0,0", "50,50,1e9,0", "50,50,32,-481", "0,50,32,24"):
         with pytest.raises(PolarguideError, match="--intrinsics"):
             parse_intrinsics(text, (64, 48))
+
+
+def test_maps_are_not_written_through_a_link_that_leads_out(tmp_path: Path) -> None:
+    write_mosaic(tmp_path / "in.png", "IMX250MZR")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "in").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(PolarguideError, match=r"expected a place in .*out, found a link to"):
+        write_shots([tmp_path / "in.png"], tmp_path / "out", MONO, formats=("npy",))
+    assert not list((tmp_path / "elsewhere").iterdir())

@@ -56,3 +56,9 @@ def test_a_name_that_is_none_is_refused() -> None:
     for given in ({"hosts": ["a/b"]}, {"origins": ["ftp://x"]}, {"hosts": [""]}):
         with pytest.raises(PolarguideError, match="a name such as"):
             Gate("127.0.0.1", **given)
+
+
+@pytest.mark.parametrize("name", ["*", "*.example.org", "a b", "a,b", "tunnel..org", "<b>"])
+def test_a_pattern_is_no_name(name: str) -> None:
+    with pytest.raises(PolarguideError, match="expected a name such as"):
+        Gate("127.0.0.1", [name])

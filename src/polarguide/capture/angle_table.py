@@ -11,6 +11,7 @@ from pathlib import Path
 from polarguide.capture.exposures import Exposure, normalized
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
+from polarguide.numerals import decimal
 from polarguide.spreadsheet import csv_lines
 
 TABLE = "angles.csv"
@@ -19,6 +20,8 @@ _COLUMNS = ("file", "view", "angle")
 _MORE = ("gain", "certainty", "note")
 """Further columns; the last two are what a training says of its pictures, and are passed over."""
 _LARGEST = 1 << 26
+_LEAST_GAIN = 1e-6
+"""A camera exposes over some thirty stops; less leaves no numbers in single precision."""
 _REMEDY = f"Correct the line: file,view,angle[,gain] with the angle in degrees, {UNKNOWN} or {NONE}."
 
 
@@ -102,7 +105,7 @@ def _listed(where: str, line: int, row: list[str], columns: list[str]) -> Listed
             expected = "the name of a picture inside polar/" if name == "file" else "the name of a view"
             raise PolarguideError(where, expected=expected, found=repr(cells.get(name, "")), remedy=_REMEDY)
     angle = cells.get("angle", "")
-    gain = _number(where, "gain", cells.get("gain") or "1", least=0.0)
+    gain = _number(where, "gain", cells.get("gain") or "1", least=_LEAST_GAIN)
     if angle.lower() in (UNKNOWN, NONE):
         exposure = Exposure(filtered=angle.lower() == UNKNOWN, gain=gain)
     else:
@@ -118,12 +121,13 @@ def _number(where: str, name: str, text: str, least: float = -math.inf) -> float
     words = f", {UNKNOWN} or {NONE}" if name == "angle" else ""
     expected = "a positive number" if math.isfinite(least) else "a number of degrees"
     try:
-        value = float(text)
+        value = decimal(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or value <= least or abs(value) > 1e6:
+    small = f"{value:g}, less than {least:g}" if 0 < value < least else ""
+    if not math.isfinite(value) or value < least or abs(value) > 1e6:
         raise PolarguideError(
-            where, expected=f"{expected}{words} as {name}", found=repr(text), remedy=_REMEDY
+            where, expected=f"{expected}{words} as {name}", found=small or repr(text), remedy=_REMEDY
         )
     return value
 

@@ -17,6 +17,8 @@ from polarguide.errors import PolarguideError
 
 _CHANNELS = {"normal": 3, "depth": 0, "mask": 0, "specular": 3, "diffuse": 3, "objid": 0}
 
+_NOT_NEGATIVE = ("depth", "specular", "diffuse")
+_ROUNDING = 1e-3  # of differences of what was rendered
 _LARGEST_NUMBER = 16  # bytes
 _LARGEST = 1e18  # its square still is a number in single precision
 
@@ -86,6 +88,15 @@ def _check(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) ->
             expected=f"whole numbers from 0 to {LARGEST_ID}, those of scene.json's objects",
             found=f"{array.dtype} from {array.min()} to {array.max()}",
             remedy="Write the numbers of the objects, and 0 where there is none.",
+        )
+    if array.dtype.kind not in "if":
+        return
+    if name in _NOT_NEGATIVE and bool((array < -_ROUNDING).any()):
+        raise PolarguideError(
+            f"{path} ({name})",
+            expected="numbers of 0 or more",
+            found=f"down to {array.min():g}",
+            remedy="Depth counts along the camera's z axis, away from it; light is never negative.",
         )
     if array.dtype.kind != "f":
         return

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from polarguide.capture.calibration import Calibration
+from polarguide.numerals import decimal
 
 Angle = float | Literal["unknown", "none"]
 """Degrees counter-clockwise from the picture's horizontal, modulo 180; or a word."""
@@ -22,7 +23,7 @@ def parse_angle(text: str) -> Angle | None:
     if word == "none":
         return "none"
     try:
-        number = float(word)
+        number = decimal(word)
     except ValueError:
         return None
     return number if math.isfinite(number) and abs(number) <= LARGEST else None

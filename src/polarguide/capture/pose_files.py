@@ -16,6 +16,7 @@ from polarguide.capture.datasets.cameras import checked_pose, pinhole_camera, re
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.capture.formats.pictures import read_file
 from polarguide.errors import PolarguideError
+from polarguide.numerals import decimal
 from polarguide.records import read_record
 
 SUFFIXES = (".json", ".xml", ".npz")
@@ -223,7 +224,7 @@ def _numbers(text: str) -> list[float]:
 def _one(text: str | None) -> float:
     """A number; 0 where there is none, NaN where it is none."""
     try:
-        return 0.0 if text is None else float(text)
+        return 0.0 if text is None else decimal(text)
     except ValueError:
         return float("nan")
 

@@ -25,6 +25,7 @@ from polarguide.capture.metadata import held_out, mount_of, refractive_index_of
 from polarguide.capture.objects import objects_of
 from polarguide.capture.split import chosen_views, far_from_training
 from polarguide.capture.stored_view import StoredView, ViewFiles
+from polarguide.capture.unseen_points import unseen_points
 from polarguide.capture.view import GroundTruth, Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, read_view
 from polarguide.errors import PolarguideError
@@ -142,6 +143,8 @@ def load_scene(
         *stray,
         *_untold(untold, len(stored.data)),
         *_alike(layout, stored.data),
+        *_copied(layout, stored.data),
+        *unseen_points(model.points, [camera for camera in stored.cameras if camera is not None]),
         *_pose_warnings(model, layout.names, stored.data),
     ]
     return Scene(
@@ -345,6 +348,20 @@ def _alike(layout: Layout, data: Sequence[ViewData]) -> list[str]:
         f"The pictures at all angles are the same file in {len(names)} of {len(data)} views ({listed(names)})"
     )
     return [f"{listing}: they look unpolarized. Copy those of the other angles."]
+
+
+def _copied(layout: Layout, data: Sequence[ViewData]) -> list[str]:
+    """The warning about views whose pictures are the same files: two places never look alike to the last bit."""
+    views: dict[tuple[str, ...], list[str]] = {}
+    for item in data:
+        if item.peak.any():
+            digests = tuple(item.digests[path] for path in layout.files(item.name))
+            views.setdefault(digests, []).append(item.name)
+    copies = [names for names in views.values() if len(names) > 1]
+    if not copies:
+        return []
+    listing = "; ".join(listed(names) for names in copies[:3])
+    return [f"Views have the same pictures ({listing}). Copy those of the other views, or leave them out."]
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:

@@ -8,6 +8,7 @@ import difflib
 import importlib
 import io
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +23,7 @@ from polarguide.cli.console import say, warnings_printed
 from polarguide.errors import PolarguideError
 from polarguide.options import gibibytes
 from polarguide.system import interrupts
+from polarguide.variables import check_variables
 
 VERBS = {
     "demo": "demo",
@@ -126,7 +128,7 @@ def _failed(text: str) -> int:
     """Print an error, if anybody can be told; returns the exit status."""
     with contextlib.suppress(OSError):
         _errors().print("[bold red]error:[/] ", end="")
-        say(text, to=_errors())
+        say(_LONG_WORD.sub(lambda word: word[0][:200] + "...", text), to=_errors())
     return 2
 
 
@@ -151,6 +153,7 @@ def _while_loading(error: Exception) -> bool:
     return any(name.startswith("<frozen importlib") for name in frames[ours[-1] + 1 :]) if ours else False
 
 
+_LONG_WORD = re.compile(r"\S{1000,}")  # of a file or the command line: megabytes of it hide what is wrong
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
 _HOME = str(Path(__file__).parents[1]) + os.sep
 _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
@@ -164,6 +167,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
         return 0
     if verb is not None:
         _require_place()
+        check_variables()
         _refuse_empty_paths(verb, arguments[1:])
         words = _sizes_as_numbers(arguments[1:])
         found = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=words)
@@ -263,6 +267,6 @@ def _near(word: str) -> str:
 def _as_flag(error: PolarguideError, verb: str | None) -> str:
     """The message; a parameter that is at fault is called as on the command line."""
     text = str(error)
-    if verb is not None and error.where in options_of(function_of(verb)):
+    if verb is not None and not error.is_path and error.where in options_of(function_of(verb)):
         return f"{_flag(error.where)}{text.removeprefix(error.where)}"
     return text

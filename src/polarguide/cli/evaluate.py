@@ -13,6 +13,9 @@ from polarguide.cli.runs import RunFolder, opened
 from polarguide.errors import PolarguideError, require_package
 from polarguide.options import EXPORT_PACKAGES, ComputeOptions
 
+_MOST_OBJECTS = 100
+"""Lines of the table: a terminal takes minutes to lay out the most that a scene may have."""
+
 
 def evaluate(
     run: RunFolder,
@@ -37,6 +40,10 @@ def evaluate(
         say(line)
     if record["objects"]:
         console.print(_errors(record))
+        if len(record["objects"]) > _MOST_OBJECTS:
+            say(
+                f"the {_MOST_OBJECTS} largest of {len(record['objects']):,} objects; metrics.json has all of them"
+            )
     sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE
     say(f"metrics: {run / 'metrics.json'}")
     say(f"where the errors are: {run / sheet}")
@@ -76,8 +83,9 @@ def _errors(record: dict[str, Any]) -> Table:
         texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if told else []
         table.add_row(Text(printable(name)), f"{errors['pixels']:,}", *texts)
 
-    for name, errors in record["objects"].items():
-        add(name, errors)
+    largest = sorted(record["objects"], key=lambda name: -record["objects"][name]["pixels"])[:_MOST_OBJECTS]
+    for name in filter(set(largest).__contains__, record["objects"]):
+        add(name, record["objects"][name])
     table.add_section()
     for kind, errors in record["materials"].items():
         add(f"all {kind}", errors)

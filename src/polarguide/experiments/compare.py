@@ -19,7 +19,7 @@ from polarguide.experiments.report import write_report
 from polarguide.experiments.results import Results
 from polarguide.experiments.study import write_study
 from polarguide.experiments.worker import Scoring, Task, Training
-from polarguide.files import make_folder, require_inside, write_text
+from polarguide.files import check_out, make_folder, require_inside, write_text
 from polarguide.options import ComputeOptions, PathLike, check_choice, check_count
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
@@ -86,6 +86,7 @@ def compare(
         check_count("steps", count)
     if not scenes:
         raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
+    check_out(comparison.out)
     refuse_scene(comparison.out)
     if options.against is not None:
         check_choice("against", options.against, [row.name for row in comparison.rows])

@@ -220,6 +220,13 @@ class Table:
             raise PolarguideError(
                 path, expected="the options that this table was made with", found="nothing", remedy=_ANEW
             )
+        elif os.path.lexists(self.folder / CSV) and not overwrite:
+            raise PolarguideError(
+                self.folder / CSV,
+                expected=f"a new table, or one with {LINES} beside it",
+                found="a file of this name alone",
+                remedy=_ANEW,
+            )
         write_whole(lines, b"")
         write_whole(path, to_json(settings))
         self._mend()

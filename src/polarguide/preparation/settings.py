@@ -16,6 +16,7 @@ from msgspec import Meta
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
 from polarguide.errors import PolarguideError
+from polarguide.numerals import decimal
 from polarguide.polarizer import ANGLES
 from polarguide.records import check_options, option_name
 
@@ -269,7 +270,7 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
 def _numbers(text: str) -> tuple[float, ...]:
     """The numbers of a list such as 1.9,1,1.6; none if it is something else."""
     try:
-        return tuple(float(part) for part in text.split(","))
+        return tuple(decimal(part) for part in text.split(","))
     except ValueError:
         return ()
 

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 
 from polarguide.camera import Camera
+from polarguide.capture.layout import refuse_scene
 from polarguide.capture.memory import require_memory
 from polarguide.errors import PolarguideError
-from polarguide.files import make_folder
+from polarguide.files import make_folder, require_inside
 from polarguide.options import PathLike, check_range
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.video import write_video
@@ -67,6 +68,9 @@ def write_film(
         PolarguideError: a layer that the recipe has not, cameras of several sizes, or a video that cannot be encoded.
     """
     out, names = Path(out), checked_layers(list(layers))
+    refuse_scene(out if out.suffix.lower() != ".mp4" else out.parent)
+    if out.parent == run.folder:  # somebody else may have made the run's folder
+        require_inside(run.folder, out)
     cameras, speed = path_cameras(run, path, frames)
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:

@@ -15,6 +15,7 @@ from polarguide.capture import Scene, View, load_scene, read_model
 from polarguide.capture.layout import find_layout
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
+from polarguide.numerals import decimal
 from polarguide.options import DeviceName, PathLike
 from polarguide.presentation import (
     CREDITS,
@@ -270,7 +271,7 @@ def _crop(text: str, up: Vector | None) -> dict[str, Any] | None:
 def _numbers(text: str) -> list[float]:
     """Numbers separated by commas; none where something else is among them."""
     try:
-        return [float(part) for part in text.split(",")]
+        return [decimal(part) for part in text.split(",")]
     except ValueError:
         return []
 

@@ -18,7 +18,7 @@ from polarguide.capture.background import without_surroundings
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.variants import captured_as
 from polarguide.errors import PolarguideError, PolarguideWarning
-from polarguide.files import make_folder
+from polarguide.files import check_out, make_folder
 from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import Backend, use_threads
@@ -314,6 +314,7 @@ def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
 
 def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
     try:
+        check_out(out)
         refuse_scene(out)
     except PolarguideError as error:
         return error

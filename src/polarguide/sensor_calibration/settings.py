@@ -14,6 +14,7 @@ from msgspec import Meta
 from polarguide.capture.calibration import Sense
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.errors import PolarguideError
+from polarguide.numerals import decimal
 from polarguide.records import check_options
 
 NAMES = "names"
@@ -144,7 +145,7 @@ def _angle_of(path: Path) -> float:
 
 def _numbers(text: str) -> list[float]:
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [decimal(part) for part in text.split(",")]
     except ValueError:
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):

@@ -14,6 +14,7 @@ from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture.colmap.model import fit_camera, read_model
 from polarguide.errors import PolarguideError
+from polarguide.numerals import decimal
 from polarguide.options import check_finite
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Map, ShotMaps
@@ -61,7 +62,7 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
         PolarguideError: it is something else.
     """
     try:
-        fx, fy, cx, cy = (float(part) for part in text.split(","))
+        fx, fy, cx, cy = (decimal(part) for part in text.split(","))
         # A center may lie outside of a cut picture; beyond these bounds it is a slip.
         centered = all(abs(c - n / 2) <= 10 * n for c, n in zip((cx, cy), size, strict=True))
         known = centered and all(0 < f <= 1e6 for f in (fx, fy))

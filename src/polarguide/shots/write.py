@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.errors import PolarguideError, optional_import
-from polarguide.files import atomic, in_utf8, make_folder, write_text, write_whole
+from polarguide.files import atomic, in_utf8, make_folder, require_inside, write_text, write_whole
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
 from polarguide.shots.catalog import KINDS
@@ -101,6 +101,7 @@ def write_shots(
                 require_name(shot)
                 folder = Path(out) / shot.name
                 require_own_folder(shot, folder)
+                require_inside(Path(out), folder)
                 maps = read_shot(shot, options)
                 surface = surface_maps(maps, camera_of(shot, maps.size, intrinsics), refractive_index)
                 write_maps(maps, surface, folder, formats)

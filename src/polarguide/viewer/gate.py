@@ -13,6 +13,8 @@ from polarguide.errors import PolarguideError
 WEB = ("http", "https")
 _PLACE = re.compile(r"(\[[^\[\]]*\]|[^\[\]:@]*)(:[0-9]*)?")
 """NAME or [ADDRESS], and :PORT."""
+_NAME = re.compile(r"[\w-]+(\.[\w-]+)*")
+"""No pattern: ``*`` is the name of nobody."""
 
 
 class Gate:
@@ -69,7 +71,7 @@ def host_of(url: str, schemes: tuple[str, ...] = ("",)) -> str | None:
 def _given(option: str, name: str) -> str:
     """A name of the user's, as NAME or with its scheme."""
     host = host_of(name if "://" in name else f"//{name}", schemes=("", *WEB))
-    if host is None:
+    if host is None or not (_is_address(host) or _NAME.fullmatch(host)):
         raise PolarguideError(
             option, expected="a name such as viewer.example.org", found=name, remedy="Give the name alone."
         )

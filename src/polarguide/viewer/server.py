@@ -245,7 +245,7 @@ def _listening(viser: Any, host: str, port: int, title: str) -> Any:
             listener.bind(address)
     except (OSError, UnicodeError) as error:  # the latter of a name that no network can have
         raise PolarguideError(
-            host,
+            f"the viewer's host {host!r}",
             expected="an address of this machine",
             found=getattr(error, "strerror", None) or str(error),
             remedy="Choose 127.0.0.1, or another address of this machine.",

@@ -20,7 +20,9 @@ _LONGEST_NAME = 4096
 
 
 def check_model_files(folder: Path, kind: str) -> None:
-    """Check the files of a model, of suffix ``kind``; missing files and text files are skipped.
+    """Check the files of a model, of suffix ``kind``; missing files are skipped.
+
+    Of text files, which pycolmap checks itself, only the colors of points are looked at.
 
     Raises:
         PolarguideError: a file is truncated, damaged, or has trailing bytes.
@@ -41,6 +43,8 @@ def check_model_files(folder: Path, kind: str) -> None:
                     found = f"{len(data)} bytes where its counts require {end}"
             except (struct.error, ValueError) as error:
                 found = f"a damaged one ({error})" if data else "an empty file"
+        elif name == "points3D":
+            found = _strange_color(data)
         if found is not None:
             raise PolarguideError(
                 path,
@@ -48,6 +52,21 @@ def check_model_files(folder: Path, kind: str) -> None:
                 found=found,
                 remedy="Copy or export the model again.",
             )
+
+
+def _strange_color(data: bytes) -> str | None:
+    """A line of ``points3D.txt`` with a color that pycolmap would take modulo 256; None where there is none.
+
+    What is no number at all, pycolmap finds itself.
+    """
+    for number, line in enumerate(data.splitlines(), 1):
+        cells = line.split(None, 7)[4:7]
+        if line[:1] != b"#" and any(
+            cell.lstrip(b"-").isdigit() and not (len(cell) <= 3 and 0 <= int(cell) <= 255) for cell in cells
+        ):
+            color = ", ".join(cell.decode("ascii", "replace")[:20] for cell in cells)
+            return f"a color of {color} in line {number}, whose parts go from 0 to 255"
+    return None
 
 
 def _cameras(data: bytes) -> int:

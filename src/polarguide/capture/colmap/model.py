@@ -26,7 +26,12 @@ FARTHEST_CENTER = 1e4
 """Of the principal point from the picture's corner, in sides of the picture, which may be a crop of a larger one."""
 SHORTEST_FOCAL = 1e-4
 """In sides of the picture."""
-LENS = f"positive focal lengths and a principal point, at most {FARTHEST_CENTER:g} sides of the picture away"
+MOST_STRETCH = 100.0
+"""Of one focal length over the other; anamorphic lenses have 2."""
+LENS = (
+    f"positive focal lengths, at most {MOST_STRETCH:g} times one another, and a principal point, at most "
+    f"{FARTHEST_CENTER:g} sides of the picture away"
+)
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 # Perspective models that are a plain pinhole when all of their distortion parameters are zero.
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -234,13 +239,20 @@ def is_pinhole(camera: Any) -> bool:
     return camera.model_name in PINHOLES and all(camera.params[index] == 0 for index in extra)
 
 
+def is_turn(quaternion: Any, tolerance: float) -> bool:
+    """Whether a quaternion has length 1, to a tolerance; false for NaN, and for squares beyond all numbers."""
+    parts = np.asarray(quaternion, np.float64)
+    return bool((np.abs(parts) <= 2).all()) and abs(float(np.linalg.norm(parts)) - 1) <= tolerance
+
+
 def is_lens(camera: Any) -> bool:
     """Whether a camera of pycolmap's has numbers that a lens can have, in single precision, too; false for NaN."""
     focal = camera.params[camera.focal_length_idxs()]
     center = np.abs(camera.params[camera.principal_point_idxs()])
     side = max(camera.width, camera.height, 1)  # that it has none is said where it meets its pictures
     sound = (np.abs(camera.params) <= FARTHEST).all() and (center <= FARTHEST_CENTER * side).all()
-    return bool(sound and (focal >= SHORTEST_FOCAL * side).all())
+    alike = focal.max() <= MOST_STRETCH * focal.min()
+    return bool(sound and alike and (focal >= SHORTEST_FOCAL * side).all())
 
 
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
@@ -257,7 +269,7 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     translation = np.asarray(placed.translation, dtype=np.float64)
     inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
     sound = bool((np.abs(translation) <= FARTHEST).all()) and is_lens(camera)
-    if not sound or abs(float(np.linalg.norm(placed.rotation.quat)) - 1.0) > 1e-6:
+    if not sound or not is_turn(placed.rotation.quat, 1e-6):
         raise PolarguideError(
             where,
             expected=f"a unit quaternion, a translation up to {FARTHEST:g} and {LENS}",

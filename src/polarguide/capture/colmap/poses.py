@@ -16,6 +16,7 @@ from polarguide.capture.colmap.model import (
     MODEL_FILES,
     find_model,
     is_lens,
+    is_turn,
     load_model,
     posed_images,
 )
@@ -161,8 +162,7 @@ class Poses:
         quaternion, translation = np.asarray(pose.rotation.quat), np.asarray(pose.translation)
         camera = self._model.cameras[image.camera_id]
         sound = bool((np.abs(translation) <= FARTHEST).all()) and is_lens(camera)  # false for NaN, too
-        turned = abs(float(np.linalg.norm(quaternion)) - 1) <= 1e-3
-        if not (sound and turned):
+        if not (sound and is_turn(quaternion, 1e-3)):
             raise PolarguideError(
                 f"{self.folder} (image {image.name})",
                 expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",

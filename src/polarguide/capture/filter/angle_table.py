@@ -11,6 +11,7 @@ from pathlib import Path
 from polarguide.capture.polarizer_angles import LARGEST, Angle, parse_angle
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
+from polarguide.numerals import decimal
 from polarguide.records import shortened
 
 TABLE = "angles.csv"
@@ -105,7 +106,7 @@ def _line(where: str, cells: dict[str, str]) -> Line:
 
 def _number(text: str) -> float | None:
     try:
-        value = float(text)
+        value = decimal(text)
     except ValueError:
         return None
     return value if math.isfinite(value) else None

@@ -196,6 +196,8 @@ def _png_damage(data: bytes) -> str | None:
         (stored,) = struct.unpack_from(">I", data, end - 4)
         if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != stored:
             return f"a damaged PNG file (wrong checksum at byte {at})"
+        if kind == b"acTL":  # decoders show any one of its pictures, or none
+            return "an animated PNG file"
         if kind == b"IEND":
             return None
     return f"a PNG file cut short (it ends after {len(data)} bytes)"

@@ -92,13 +92,33 @@ def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_
             maximum, which reads masks of 0 and 1, of 0 and 255, and those with soft edges alike.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, or of another kind.
+        PolarguideError: the file is damaged, cut short, of another kind, or says two masks.
     """
     pixels = decode_stored(path, data)
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
-    if any_value:
-        return np.asarray(gray > 0)
-    return np.asarray((gray > 0) & (2.0 * gray >= float(gray.max())))
+    mask = np.asarray(gray > 0)
+    if not any_value:
+        mask &= 2.0 * gray >= float(gray.max())
+    _require_one_mask(path, pixels, mask)
+    return mask
+
+
+def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_]) -> None:
+    """Refuse a picture that is one mask by its colors, and another by its transparency.
+
+    Raises:
+        PolarguideError: it is.
+    """
+    if pixels.shape[2:] != (4,) or pixels.dtype.kind != "u":
+        return
+    solid = pixels[..., 3] > np.iinfo(pixels.dtype).max // 2
+    if not solid.all() and (solid != mask).any():
+        raise PolarguideError(
+            path,
+            expected="a mask without transparency",
+            found=f"{1 - float(solid.mean()):.1%} of it transparent, which says another mask than its colors",
+            remedy="Save it as a gray picture, white where the mask is.",
+        )
 
 
 def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:

@@ -28,6 +28,7 @@ from polarguide.records import decode
 FORMAT, VERSION = "polarguide-analyzers", 1
 SUFFIX = ".safetensors"
 MOST_THROUGHPUT = 1e3
+_LONGEST_HEADER = 100_000_000  # bytes, by safetensors' format; text in their place is a larger number
 _ENTRY, _TENSOR = "polarguide", "vectors"
 _REMEDY = "Calibrate again (polarguide calibrate), or copy the file again."
 
@@ -59,11 +60,15 @@ UNITS = "intensity per Stokes component, (S0, S1, S2); an ideal polarizer has (1
 def is_analyzer_file(path: Path) -> bool:
     """Whether a file looks like one of analyzers rather than like JSON; False where it cannot be read."""
     try:
+        if not path.is_file():  # opening a pipe would wait for somebody who writes to it
+            return False
         with path.open("rb") as file:
             start = file.read(64)
     except OSError:
         return False
-    return path.suffix.lower() == SUFFIX or (start[8:9] == b"{" and not start[:8].isspace())
+    return path.suffix.lower() == SUFFIX or (
+        start[8:9] == b"{" and int.from_bytes(start[:8], "little") <= _LONGEST_HEADER
+    )
 
 
 def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
