@@ -149,6 +149,23 @@ def test_cameras_that_are_none_are_refused(change: dict[str, object], tmp_path: 
         read_path(file)
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"fx": 1e-30, "fy": 1e-30}, "positive focal lengths"),
+        ({"fx": 1e-2}, "positive focal lengths"),
+        ({"cx": 1e300}, "a principal point"),
+        ({"translation": [1e38, 0.0, 0.0]}, r"\.translation\): expected numbers up to 1e\+09"),
+        ({"width": 8192, "height": 8192}, "at most 33,177,600 pixels"),
+    ],
+)
+def test_numbers_that_no_camera_has_are_refused(change: dict[str, object], says: str, tmp_path: Path) -> None:
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps({"cameras": [camera_record(LENS), camera_record(LENS) | change]}))
+    with pytest.raises(PolarguideError, match=rf"path.json \(cameras\[1\].*{says}.*Give orbit, spiral"):
+        read_path(file)
+
+
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"cameras": []}', '{"cameras": 3}', "[" * 100_000])
 def test_files_without_cameras_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "path.json").write_text(text)

@@ -18,6 +18,28 @@ from torch import Tensor
 
 from polarguide.vectors import unit, unit_array
 
+FARTHEST = 1e9
+"""The largest coordinate and focal length; single precision tells nothing apart beyond."""
+FARTHEST_CENTER = 1e4
+"""Of the principal point from the picture's corner, in sides of the picture, which may be a crop of a larger one."""
+SHORTEST_FOCAL = 1e-4
+"""In sides of the picture."""
+MOST_STRETCH = 100.0
+"""Of one focal length over the other; anamorphic lenses have 2."""
+LENS = (
+    f"positive focal lengths, at most {MOST_STRETCH:g} times one another, and a principal point, at most "
+    f"{FARTHEST_CENTER:g} sides of the picture away"
+)
+
+
+def can_be_lens(size: ArrayLike, focal: ArrayLike, center: ArrayLike) -> bool:
+    """Whether a lens can have these numbers in pixels, in single precision, too; false for NaN."""
+    side = max(float(np.max(size)), 1.0)  # that a picture has no pixels is said elsewhere
+    lengths, places = np.asarray(focal, np.float64), np.abs(np.asarray(center, np.float64))
+    sound = (lengths <= FARTHEST).all() and (places <= min(FARTHEST, FARTHEST_CENTER * side)).all()
+    alike = lengths.max() <= MOST_STRETCH * lengths.min()
+    return bool(sound and alike and (lengths >= SHORTEST_FOCAL * side).all())
+
 
 @lru_cache(maxsize=4)
 def _pixel_rays(

@@ -20,13 +20,15 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from polarguide.camera import Camera, look_at
+from polarguide.camera import FARTHEST, LENS, Camera, can_be_lens, look_at
 from polarguide.errors import PolarguideError
 from polarguide.records import read_record
 from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.vectors import dot, unit
 
 LARGEST_SIDE = 8192
+MOST_PIXELS = 7680 * 4320
+"""Of a picture: what a rendering holds at once grows with them, and a file of a few lines may ask for any number."""
 MOST_FRAMES = 100_000
 REMEDY = "Give orbit, spiral, interpolate, or a JSON file with cameras as docs/how-to/export.md shows it."
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
@@ -129,18 +131,28 @@ def read_path(path: Path) -> tuple[list[Camera], float]:
         PolarguideError: no such file, or one that is not as the module says.
     """
     record = read_record(path, _PathRecord, remedy=REMEDY)
-    cameras = [
-        _camera_of(camera, f"{path} (cameras[{k}].rotation)") for k, camera in enumerate(record.cameras)
-    ]
+    cameras = [_camera_of(camera, f"{path} (cameras[{k}]") for k, camera in enumerate(record.cameras)]
     return cameras, record.frames_per_second
 
 
 def _camera_of(record: _CameraRecord, where: str) -> Camera:
+    lens = f"fx {record.fx:g}, fy {record.fy:g}, cx {record.cx:g}, cy {record.cy:g}"
+    size, place = f"{record.width} x {record.height}", list(record.translation)
+    if record.width * record.height > MOST_PIXELS:
+        raise _fault(f"{where})", f"at most {MOST_PIXELS:,} pixels (7680 x 4320)", size)
+    if not can_be_lens((record.width, record.height), (record.fx, record.fy), (record.cx, record.cy)):
+        raise _fault(f"{where})", f"numbers up to {FARTHEST:g}, {LENS}", f"{lens} for {size} pixels")
+    if not max(map(abs, place)) <= FARTHEST:
+        raise _fault(f"{where}.translation)", f"numbers up to {FARTHEST:g}", str(place))
     rotation = torch.tensor(record.rotation, dtype=torch.float64).reshape(3, 3)
     turned = torch.dist(rotation @ rotation.T, torch.eye(3, dtype=torch.float64)) < 1e-3
     if not (turned and float(torch.linalg.det(rotation)) > 0):
-        raise PolarguideError(where, expected="a rotation", found=str(list(record.rotation)), remedy=REMEDY)
+        raise _fault(f"{where}.rotation)", "a rotation", str(list(record.rotation)))
     return Camera(
         record.width, record.height, record.fx, record.fy, record.cx, record.cy,
         rotation, torch.tensor(record.translation, dtype=torch.float64),
     )  # fmt: skip
+
+
+def _fault(where: str, expected: str, found: str) -> PolarguideError:
+    return PolarguideError(where, expected=expected, found=found, remedy=REMEDY)

@@ -15,23 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.camera import FARTHEST, LENS, Camera, can_be_lens
 from polarguide.capture.colmap.files import check_model_files
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 
-FARTHEST = 1e9
-"""The largest coordinate and focal length; single precision tells nothing apart beyond."""
-FARTHEST_CENTER = 1e4
-"""Of the principal point from the picture's corner, in sides of the picture, which may be a crop of a larger one."""
-SHORTEST_FOCAL = 1e-4
-"""In sides of the picture."""
-MOST_STRETCH = 100.0
-"""Of one focal length over the other; anamorphic lenses have 2."""
-LENS = (
-    f"positive focal lengths, at most {MOST_STRETCH:g} times one another, and a principal point, at most "
-    f"{FARTHEST_CENTER:g} sides of the picture away"
-)
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 # Perspective models that are a plain pinhole when all of their distortion parameters are zero.
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -247,12 +235,11 @@ def is_turn(quaternion: Any, tolerance: float) -> bool:
 
 def is_lens(camera: Any) -> bool:
     """Whether a camera of pycolmap's has numbers that a lens can have, in single precision, too; false for NaN."""
-    focal = camera.params[camera.focal_length_idxs()]
-    center = np.abs(camera.params[camera.principal_point_idxs()])
-    side = max(camera.width, camera.height, 1)  # that it has none is said where it meets its pictures
-    sound = (np.abs(camera.params) <= FARTHEST).all() and (center <= FARTHEST_CENTER * side).all()
-    alike = focal.max() <= MOST_STRETCH * focal.min()
-    return bool(sound and alike and (focal >= SHORTEST_FOCAL * side).all())
+    focal, center = (
+        camera.params[list(of)] for of in (camera.focal_length_idxs(), camera.principal_point_idxs())
+    )
+    bounded = (np.abs(camera.params) <= FARTHEST).all()
+    return bool(bounded) and can_be_lens((camera.width, camera.height), focal, center)
 
 
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from polarguide.camera import FARTHEST, LENS
 from polarguide.capture.colmap.model import (
-    FARTHEST,
-    LENS,
     MODEL_FILES,
     find_model,
     is_lens,
