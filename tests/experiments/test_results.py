@@ -28,6 +28,9 @@ def test_what_is_written_passes(record: dict[str, Any], tmp_path: Path) -> None:
     assert read_results(tmp_path / "results.json") == record
 
 
+PART = {"material": None, "pixels": 3, "views": 1, "metrics": {}}
+
+
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
@@ -42,6 +45,17 @@ def test_what_is_written_passes(record: dict[str, Any], tmp_path: Path) -> None:
         (("recipes", 0, "data"), [], "(recipes[0].data): expected a JSON object {...}, found []"),
         (("runs", 0, "seed"), -1, "(runs[0].seed): expected 0 or more, found -1"),
         (("scenes", 0, "views"), -6, "(scenes[0].views): expected 0 or more, found -6"),
+        (("scenes", 0, "black_share"), -5.0, "(scenes[0].black_share): expected 0 to 1, found -5.0"),
+        (
+            ("runs", 0, "objects", "o"),
+            PART | {"pixels": -1},
+            "(runs[0].objects[...].pixels): expected 0 or more",
+        ),
+        (
+            ("runs", 0, "materials", "m"),
+            PART | {"views": -1},
+            "(runs[0].materials[...].views): expected 0 or more",
+        ),
         (("runs", 0, "scene"), "z", "(runs[0].scene): expected one of the scenes x, y, found "),
         (("runs", 1, "state"), "lost", "(runs[1].state): expected one of done, failed, missing, found "),
         (("runs", 1, "state"), "failed", "(runs[1].metrics): expected values for a run that is done"),

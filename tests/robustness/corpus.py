@@ -23,6 +23,7 @@ from forked import Case
 from fourth import fourth_cases
 from further import further_cases
 from options import option_cases
+from seventh import seventh_cases
 from sixth import sixth_cases
 
 BYTES = ("cut", "empty", "garbage", "flip", "fill", "insert", "append", "twice")
@@ -47,6 +48,7 @@ def corpus(first_seed: int = 0, times: int = 1) -> Iterator[Case]:
     yield from fourth_cases(every=times > 1)
     yield from fifth_cases(every=times > 1)
     yield from sixth_cases()
+    yield from seventh_cases()
 
 
 def case(

@@ -20,8 +20,8 @@ class PartScores(TypedDict):
     """
 
     material: str | None
-    pixels: int
-    views: int
+    pixels: Annotated[int, msgspec.Meta(ge=0)]
+    views: Annotated[int, msgspec.Meta(ge=0)]
     metrics: dict[str, float | None]
 
 

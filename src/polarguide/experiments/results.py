@@ -59,7 +59,7 @@ class SceneRecord(TypedDict):
     digest: str
     views: Annotated[int, msgspec.Meta(ge=0)]
     test_views: list[str]
-    black_share: float | None
+    black_share: Annotated[float, msgspec.Meta(ge=0, le=1)] | None
 
 
 class _Recipe(TypedDict):
