@@ -1,10 +1,12 @@
-"""CSV text whose cells no spreadsheet takes for formulas."""
+"""CSV text whose cells no spreadsheet takes for formulas, and no terminal for commands."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Iterable
+
+from polarguide.printable import printable
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
@@ -17,5 +19,7 @@ def csv_lines(rows: Iterable[Iterable[object]]) -> str:
 
 
 def plain(value: object) -> object:
-    """A value that spreadsheets do not take for a formula: names come from files and folders."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+    """A value that spreadsheets do not take for a formula, nor terminals for a command: names come from files."""
+    if not isinstance(value, str):
+        return value
+    return printable(f"'{value}" if value.startswith(_FORMULA) else value, lines=True)

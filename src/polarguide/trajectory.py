@@ -27,8 +27,6 @@ from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.vectors import dot, unit
 
 LARGEST_SIDE = 8192
-MOST_PIXELS = 4096 * 4096
-"""Of a picture: rendering one takes 100 bytes for each, and a file of a few lines may ask for any number."""
 MOST_FRAMES = 100_000
 REMEDY = "Give orbit, spiral, interpolate, or a JSON file with cameras as docs/how-to/export.md shows it."
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
@@ -138,8 +136,6 @@ def read_path(path: Path) -> tuple[list[Camera], float]:
 def _camera_of(record: _CameraRecord, where: str) -> Camera:
     lens = f"fx {record.fx:g}, fy {record.fy:g}, cx {record.cx:g}, cy {record.cy:g}"
     size, place = f"{record.width} x {record.height}", list(record.translation)
-    if record.width * record.height > MOST_PIXELS:
-        raise _fault(f"{where})", f"at most {MOST_PIXELS:,} pixels (as 4096 x 4096)", size)
     if not can_be_lens((record.width, record.height), (record.fx, record.fy), (record.cx, record.cy)):
         raise _fault(f"{where})", f"numbers up to {FARTHEST:g}, {LENS}", f"{lens} for {size} pixels")
     if not max(map(abs, place)) <= FARTHEST:

@@ -11,9 +11,10 @@ import pytest
 from rich.console import Console
 
 from polarguide.cli.app import run
-from polarguide.cli.console import printable, say, size_text
+from polarguide.cli.console import say, size_text
 from polarguide.cli.evaluate import _errors, _without_value
 from polarguide.evaluation.table import METRICS, OBJECT_METRICS
+from polarguide.printable import printable
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
 

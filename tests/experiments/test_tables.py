@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Callable
 
 import pytest
 from comparison_records import results, run, unfinished
@@ -11,6 +12,7 @@ from comparison_records import results, run, unfinished
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.aggregate import aggregate, cell_of
 from polarguide.experiments.forms import csv_text, latex, latex_text, markdown
+from polarguide.experiments.results import Results
 from polarguide.experiments.tables import leading_rows, notes, scores_section
 
 BY_KEY = {column.key: column for column in COLUMNS}
@@ -146,6 +148,13 @@ def test_notes_name_what_failed() -> None:
     assert "x, b, seed 0 failed: disk full" in said
     assert "x, c, seed 0 has not finished" in said
     assert not any("LPIPS" in note for note in said)
+
+
+@pytest.mark.parametrize("write", [markdown, latex, csv_text])
+def test_terminals_obey_no_name_in_a_file(write: Callable[[Results], str]) -> None:
+    text = write(results([run("s\x1b[2J", "a\x1b]0;mine\x07", 0, psnr=30.0)]))
+    assert all(sign.isprintable() or sign == "\n" for sign in text)
+    assert "x1b" in text
 
 
 def test_names_are_no_formulas_in_a_spreadsheet() -> None:

@@ -11,24 +11,11 @@ from typing import Any
 from rich.console import Console
 
 from polarguide.errors import PolarguideWarning
+from polarguide.printable import printable
 from polarguide.system import process_rank
 
 # Of several processes of one training, the first alone talks.
 console = Console(highlight=False, soft_wrap=True, quiet=process_rank() > 0)
-
-
-def printable(text: str, *, lines: bool = False) -> str:
-    """A text with escapes in place of what a terminal would obey: names in it come from files.
-
-    Args:
-        lines: whether it may have several lines.
-    """
-    return "".join(
-        sign
-        if sign.isprintable() or (lines and sign == "\n")
-        else sign.encode("unicode_escape", "backslashreplace").decode("ascii")
-        for sign in text
-    )
 
 
 def say(text: object, *, lines: bool = False, to: Console = console) -> None:

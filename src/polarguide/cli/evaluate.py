@@ -8,10 +8,11 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from polarguide.cli.console import console, printable, say
+from polarguide.cli.console import console, say
 from polarguide.cli.runs import RunFolder, opened
 from polarguide.errors import PolarguideError, require_package
 from polarguide.options import EXPORT_PACKAGES, ComputeOptions
+from polarguide.printable import printable
 
 _MOST_OBJECTS = 100
 """Lines of the table: a terminal takes minutes to lay out the most that a scene may have."""

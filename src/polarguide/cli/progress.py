@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterator
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
-from polarguide.cli.console import console, printable, say, warn
+from polarguide.cli.console import console, say, warn
+from polarguide.printable import printable
 from polarguide.progress import Advance, Reporter
 
 LINE_SECONDS = 15.0

@@ -11,6 +11,7 @@ from polarguide.experiments.part_tables import PART_METRICS, material_section, o
 from polarguide.experiments.results import Results
 from polarguide.experiments.shown import MINUS, Label, Section, ShownCell
 from polarguide.experiments.tables import scores_section
+from polarguide.printable import printable
 from polarguide.spreadsheet import csv_lines
 
 _LATEX = {
@@ -63,7 +64,7 @@ def markdown(results: Results) -> str:
 
 
 def _markdown_label(label: Label) -> str:
-    text = f"`{label.text}`" if label.code else _markdown_text(label.text)
+    text = f"`{printable(label.text)}`" if label.code else _markdown_text(label.text)
     return f"{text} ({_markdown_text(label.remark)})" if label.remark else text
 
 
@@ -79,7 +80,7 @@ def _markdown_row(cells: Iterable[str]) -> str:
 def _markdown_text(text: str) -> str:
     """Text on one line that Markdown leaves alone."""
     special = "\\`*_[]<>#"
-    return "".join("\\" + c if c in special else c for c in " ".join(text.split()))
+    return "".join("\\" + c if c in special else c for c in printable(" ".join(text.split())))
 
 
 def latex(results: Results) -> str:
@@ -87,7 +88,7 @@ def latex(results: Results) -> str:
     lines = ["% needs \\usepackage{booktabs}"]
     for section in sections(results):
         first, count = len(section.labels), len(section.labels) + len(section.headings)
-        lines += [f"% {section.title}"] if section.title else []
+        lines += [f"% {printable(section.title)}"] if section.title else []
         lines += [f"\\begin{{tabular}}{{{'l' * first}{'r' * (count - first)}}}", "\\toprule"]
         lines.append(_latex_row(map(latex_text, (*section.labels, *section.headings))))
         for block in section.blocks:
@@ -97,7 +98,7 @@ def latex(results: Results) -> str:
                 _latex_row([*map(_latex_label, r.labels), *map(_latex_cell, r.cells)]) for r in block.rows
             ]
         lines += ["\\bottomrule", "\\end{tabular}"]
-        lines += [f"% {note}" for note in section.notes]
+        lines += [f"% {printable(note)}" for note in section.notes]
     return "\n".join(" ".join(line.splitlines()) for line in lines) + "\n"
 
 
@@ -117,7 +118,7 @@ def _latex_cell(cell: ShownCell) -> str:
 
 def latex_text(text: str) -> str:
     """Text with everything escaped that LaTeX reads as a command."""
-    return "".join(_LATEX.get(character, character) for character in text)
+    return "".join(_LATEX.get(character, character) for character in printable(" ".join(text.splitlines())))
 
 
 def csv_text(results: Results) -> str:
