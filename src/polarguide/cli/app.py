@@ -153,7 +153,8 @@ def _while_loading(error: Exception) -> bool:
     return any(name.startswith("<frozen importlib") for name in frames[ours[-1] + 1 :]) if ours else False
 
 
-_LONG_WORD = re.compile(r"\S{1000,}")  # of a file or the command line: megabytes of it hide what is wrong
+# Of a file or the command line: megabytes of it hide what is wrong.
+_LONG_WORD = re.compile(r"\S{1000,}?(?=:?(?:\s|$))")
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
 _HOME = str(Path(__file__).parents[1]) + os.sep
 _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
