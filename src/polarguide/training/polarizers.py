@@ -44,7 +44,8 @@ VAGUE = 15.0
 """Spread (degrees) from which on a picture does not tell its angle."""
 LOST = 45.0
 """Spread (degrees) from which on a fitted angle is not even the best guess. Up to 30 degrees of error such a guess is
-nearer to the picture than a photograph without a filter would be, and errors are a third of the spread, mostly.
+nearer to the picture than a photograph without a filter would be; on the table of a test scene spreads of 20 to 60
+degrees had errors under 20, mostly.
 """
 DISAGREE = 10.0
 """Scatter (degrees) of the fits of one picture from which on they do not agree."""
