@@ -11,7 +11,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.optics import Mount
-from polarguide.training.angle_fit import fit_angle
+from polarguide.training.angle_fit import FLOOR, fit_angle
 
 HEIGHT, WIDTH = 48, 64
 EYE = torch.eye(3, dtype=torch.float64)
@@ -42,6 +42,27 @@ def test_angle_and_gain_are_found(degrees: float, mount: Mount) -> None:
     assert found.gain == pytest.approx(1.3, rel=1e-4)
     assert found.certainty == pytest.approx(1, abs=1e-3)
     assert found.spread < 0.1
+
+
+@pytest.mark.parametrize("mount", ["sensor", "filter"])
+def test_misfits_are_those_of_the_angle_and_of_a_quarter_turn(mount: Mount) -> None:
+    """Against the differences written out, of a picture with light that the prediction lacks."""
+    stokes, degrees = light(), 30.0
+    picture = 0.8 * behind(stokes, degrees, mount) + 0.02 * torch.rand(
+        HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(3)
+    )
+    found = fit_angle(picture, stokes, ALL, RAYS, mount)
+    assert found is not None
+
+    def misfit(angle: float) -> float:
+        cosine, sine = optics.analyzer(math.radians(angle), RAYS, mount)[..., None].unbind(0)
+        shown = stokes[0] + found.certainty * (stokes[1] * cosine + stokes[2] * sine)
+        fair = (1 / (stokes[0].mean(dim=-1) + FLOOR))[..., None]
+        return float((fair * (picture - found.gain * shown / 2).abs()).sum() / (fair * picture).sum())
+
+    assert found.misfit == pytest.approx(misfit(found.angle), rel=1e-2)
+    assert found.misfit_across == pytest.approx(misfit(found.angle + 90), rel=2e-2)
+    assert found.misfit < 0.05 < found.misfit_across
 
 
 def test_what_is_not_explained_does_not_pull() -> None:

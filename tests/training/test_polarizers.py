@@ -119,6 +119,36 @@ def test_pictures_whose_fits_do_not_agree_are_named(tmp_path: Path) -> None:
     assert all(name in warned[0] for name in names)
 
 
+def test_pictures_that_are_explained_poorly_are_named(tmp_path: Path) -> None:
+    """What is predicted of one view is another view's, so that its angle is sure, for all that it says, and wrong."""
+    scene = captured_as(WHOLE, "unknown")
+    poor = scene.train_views[2].name
+
+    def mixed(view: View) -> Tensor:
+        stokes = predicted(view).clone()
+        if view.name == poor:
+            stokes[1:] = (
+                0.3 * stokes[0] * torch.rand(2, *stokes.shape[1:], generator=torch.Generator().manual_seed(1))
+            )
+        return stokes
+
+    polarizers = Polarizers(scene, STOKES, STEPS)
+    fits = polarizers.fit(predicted)[None]
+    fits[..., 5:7] = torch.tensor([0.05, 0.2], dtype=fits.dtype)  # of a model that is not perfect
+    polarizers.take(fits)
+    assert not any(judgment.poorly_explained for judgment in polarizers.judgments())
+    row = [judgment.view for judgment in polarizers.judgments()].index(poor)
+    fits[0, row, 5:7] = polarizers.fit(mixed)[row, 5:7]
+    polarizers.take(fits)
+    found = polarizers.judgments()
+    misfit, across = fits[0, row, 5:7].tolist()
+    assert found[row].unexplained == pytest.approx(misfit / 0.05 * misfit / across)
+    assert [judgment.view for judgment in found if judgment.poorly_explained] == [poor]
+    heard = Heard()
+    report_polarizers(tmp_path, scene, polarizers, heard)
+    assert [poor in text for text in heard.said if "turned by 90 degrees" in text] == [True]
+
+
 def test_a_guess_is_better_than_a_photograph(tmp_path: Path) -> None:
     scene = captured_as(WHOLE, "unknown")
     polarizers = Polarizers(scene, STOKES, STEPS)

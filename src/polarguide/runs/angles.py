@@ -58,6 +58,11 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         reporter.warn(
             f"{named(unsettled)} may be at another angle: the fits of the training do not agree on it."
         )
+    if poor := [judgment for judgment in sought if judgment.poorly_explained and not judgment.unsettled]:
+        reporter.warn(
+            f"{named(poor)} may be at another angle: the scene explains them worse than the others, and hardly better "
+            "than a filter turned by 90 degrees would."
+        )
     if plain := [judgment for judgment in judgments if judgment.unfiltered]:
         reporter.warn(
             f"{named(plain)} look as if taken without a filter, or through a circular one mounted the wrong way round."

@@ -31,6 +31,8 @@ class FittedAngle:
         certainty: how much of the predicted polarization shows in the picture: 1 behind a polarizer, 0 without one.
         spread: standard deviation of the angle, degrees; at most 90.
         doubt: standard deviation of the certainty, at most 1.
+        misfit: what remains of the picture's light, relative to it: the mean of the differences over the picture's.
+        misfit_across: the same with the polarizer turned by 90 degrees.
     """
 
     angle: float
@@ -38,6 +40,8 @@ class FittedAngle:
     certainty: float
     spread: float
     doubt: float
+    misfit: float
+    misfit_across: float
 
 
 def fit_angle(
@@ -90,7 +94,13 @@ def fit_angle(
     spread = math.degrees(math.sqrt(max(0.0, float(across @ covariance @ across))) / length / 2)
     doubt = math.sqrt(max(0.0, float(torch.linalg.eigvalsh(covariance[1:, 1:])[-1]))) / gain
     certainty = length / gain
-    return FittedAngle(math.degrees(angle) % 180.0, gain, certainty, min(spread, 90.0), min(doubt, 1.0))
+    fair = plain.sqrt()
+    light = float((fair * y).sum())
+    turned = solution * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    misfit, across = (float((fair * (y - of @ columns).abs()).sum()) / light for of in (solution, turned))
+    return FittedAngle(
+        math.degrees(angle) % 180.0, gain, certainty, min(spread, 90.0), min(doubt, 1.0), misfit, across
+    )
 
 
 def _solvable(moments: Tensor) -> bool:
