@@ -25,6 +25,7 @@ ROOMS = (
     "progress",
     "color",
     "polarizer",
+    "native",
     "vectors",
     "camera",
     "scene_frame",

@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import normalize
 
 from polarguide import _native
+from polarguide.native import fits
 from polarguide.vectors import dot, unit
 
 # Cosine of the angle to the camera under which the outward side decides, not the camera.
@@ -106,8 +107,7 @@ def shortest_axis_normals(
         [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
     """
     center = center.detach().to(means).contiguous()
-    given = (means, quaternions, log_scales) if outward is None else (means, quaternions, log_scales, outward)
-    if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in given):
+    if fits(means, quaternions, log_scales, outward):
         result: Tensor = _Axes.apply(means, quaternions, log_scales, center, outward)
         return result
     return shortest_axis_normals_reference(means, quaternions, log_scales, center, outward)
@@ -124,7 +124,7 @@ def mirrored_directions(means: Tensor, center: Tensor, normals: Tensor) -> Tenso
     """
     means, normals = means.detach(), normals.detach()
     center = center.detach().to(means)
-    if means.device.type == "cpu" and means.dtype == normals.dtype == torch.float32:
+    if fits(means, normals):
         out = torch.empty_like(means)
         _native.mirrored_forward(means.contiguous(), center.contiguous(), normals.contiguous(), out)
         return out

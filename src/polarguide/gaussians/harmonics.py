@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
+from polarguide.native import fits
 
 SH_C0 = 0.28209479177387814
 """The basis function of degree 0."""
@@ -134,7 +135,7 @@ def evaluate_sh(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree:
     if not 0 <= degree <= 3:
         raise ValueError(f"degree: expected 0 to 3, found {degree}")
     center = center.detach().to(means)
-    if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (means, dc, rest)):
+    if fits(means, dc, rest):
         result: Tensor = _Harmonics.apply(means, center, dc, rest, degree)
         return result
     return evaluate_sh_reference(means, center, dc, rest, degree)

@@ -29,6 +29,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
+from polarguide.native import fits
 
 # Per face: axis and sign of the major component, of s and of t.
 _FACES = (
@@ -207,7 +208,7 @@ def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
         raise ValueError(f"texture: expected shape [6, R, R, C], found {list(texture.shape)}")
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ValueError(f"directions: expected shape [P, 3], found {list(directions.shape)}")
-    if all(x.device.type == "cpu" and x.dtype == torch.float32 for x in (texture, directions)):
+    if fits(texture, directions):
         result: Tensor = _Lookup.apply(texture, directions)
         return result
     return cubemap_lookup_reference(texture, directions)

@@ -14,6 +14,7 @@ from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import mirrored_directions
 from polarguide.gaussians.harmonics import evaluate_sh
+from polarguide.native import fits
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.conversion import convert, mirror_base, scale_light
 from polarguide.shading.cubemap import cubemap_lookup
@@ -234,7 +235,7 @@ class DeferredShading(ShadingModel):
         With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``.
         """
         features, texels = splatted.features, light["texels"]
-        if _fits_native(features, texels):
+        if fits(features, texels):
             return self._with_metals(
                 self._shade_native(features, texels, camera, held=False), splatted, texels, camera
             )
@@ -248,7 +249,7 @@ class DeferredShading(ShadingModel):
     ) -> tuple[dict[str, Any], HeldLayers | None]:
         """As ``ShadingModel`` has it; on the CPU in float32 one native pass."""
         texels = light["texels"]
-        if not _fits_native(splatted.features, texels):
+        if not fits(splatted.features, texels):
             return super().shade_held(splatted, light, camera)
         layers: dict[str, Any] = self._shade_native(splatted.features, texels, camera, held=True)
         specular, diffuse = layers.pop("held specular"), layers.pop("held diffuse")
@@ -352,11 +353,6 @@ class DeferredShading(ShadingModel):
             constants=constants,
             notes=[self.local_note] if self.local else [],
         )
-
-
-def _fits_native(*tensors: Tensor) -> bool:
-    """Whether the native pass takes these."""
-    return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
 
 
 def local_light(gaussians: Parameters, directions: Tensor, sh_degree: int) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.native import fits
 from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
 from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
 from polarguide.shading.native import split_native
@@ -80,12 +81,7 @@ Split = tuple[Tensor, Tensor | None, Tensor | None]
 
 def split(features: Tensor, alpha: Tensor, *, normals: bool, depth: bool) -> Split:
     """What a result holds of its G-buffer: ``split_reference``, on the CPU in float32 with one native gradient pass."""
-    if (
-        normals
-        and features.shape[-1] > 6
-        and features.device.type == "cpu"
-        and features.dtype == torch.float32
-    ):
+    if normals and features.shape[-1] > 6 and fits(features):
         return split_native(features, alpha, depth=depth)
     return split_reference(features, alpha, normals=normals, depth=depth)
 

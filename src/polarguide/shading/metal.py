@@ -22,6 +22,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.camera import Camera
+from polarguide.native import fits
 from polarguide.optics.conductor import LARGEST_REFLECTANCE
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.native import conductor_native
@@ -110,7 +111,7 @@ def metal_pixels(
     if local is not None:
         seen = (seen + local[pixels]).clamp(min=0)
     reflectances = metal[:, :3] * inverse[:, None]
-    if metal.device.type == "cpu" and metal.dtype == torch.float32:
+    if fits(metal):
         mean, slope = conductor_native(-along[:, 0], reflectances)
     else:
         mean, slope = optics.conductor(-along, reflectances)

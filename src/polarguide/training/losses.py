@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
+from polarguide.native import fits
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import (
@@ -20,7 +21,6 @@ from polarguide.training.native_terms import (
     Directions,
     Polarization,
     Terms,
-    fit_native,
     pixel_terms,
 )
 from polarguide.training.partial import PartialView, partial_terms
@@ -316,7 +316,7 @@ def _native_fits(result: RenderResult, priors: ViewPriors | None) -> bool:
     """Whether the native pass takes these pictures."""
     rendered = result.normal, result.specular, result.diffuse, result.depth, result.alpha
     compared = () if priors is None else (priors.stokes, priors.weight, priors.plane, priors.chromatic)
-    return result.normal is not None and min(result.alpha.shape) >= 3 and fit_native(*rendered, *compared)
+    return result.normal is not None and min(result.alpha.shape) >= 3 and fits(*rendered, *compared)
 
 
 def normal_terms_reference(

@@ -168,8 +168,3 @@ def _field(result: RenderResult) -> Tensor | None:
         return None
     both = torch.cat((metal.specular, metal.slope * metal.specular), dim=1)
     return both.new_zeros(result.alpha.numel(), 6).index_copy(0, metal.pixels, both)
-
-
-def fit_native(*tensors: Tensor | None) -> bool:
-    """Whether all that is given is float32 on the CPU."""
-    return all(t is None or (t.device.type == "cpu" and t.dtype == torch.float32) for t in tensors)

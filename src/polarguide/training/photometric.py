@@ -17,6 +17,7 @@ from torch.nn.functional import conv2d
 
 from polarguide import _native
 from polarguide.color import srgb_encode
+from polarguide.native import fits
 
 _WINDOW = 11
 _SIGMA = 1.5
@@ -173,7 +174,7 @@ def photometric_loss(
     _check(prediction, target_shown, weight)
     target_shown = target_shown.detach().to(prediction)
     weight = None if weight is None else weight.detach().to(prediction)
-    if prediction.device.type == "cpu" and prediction.dtype == torch.float32:
+    if fits(prediction):
         result: Tensor = _Photometric.apply(prediction, target_shown, weight, ssim_weight)
         return result
     if prediction.device.type == "cpu":
