@@ -97,9 +97,9 @@ def fit_angle(
     fair = plain.sqrt()
     light = float((fair * y).sum())
     turned = solution * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-    misfit, across = (float((fair * (y - of @ columns).abs()).sum()) / light for of in (solution, turned))
+    misfit, crossed = (float((fair * (y - of @ columns).abs()).sum()) / light for of in (solution, turned))
     return FittedAngle(
-        math.degrees(angle) % 180.0, gain, certainty, min(spread, 90.0), min(doubt, 1.0), misfit, across
+        math.degrees(angle) % 180.0, gain, certainty, min(spread, 90.0), min(doubt, 1.0), misfit, crossed
     )
 
 
