@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -46,6 +47,17 @@ def test_what_agrees_is_right() -> None:
     assert {key: check.verdict for key, check in found.items()} == dict.fromkeys(
         ("modulation", "handedness", "zero_offset", "angles"), "ok"
     )
+
+
+def test_what_the_scene_explains_poorly_contradicts_nothing() -> None:
+    found = findings(scattered(), list(SAID))
+    turned = dataclasses.replace(found.judgments[5], angle=(found.judgments[5].angle + 80.0) % 180.0)
+    for unexplained, verdict in ((0.3, "warning"), (1.5, "ok")):
+        other = dataclasses.replace(turned, unexplained=unexplained)
+        judgments = (*found.judgments[:5], other, *found.judgments[6:])
+        check = checks(dataclasses.replace(found, judgments=judgments))["angles"]
+        assert check.verdict == verdict
+        assert ("v5" in check.finding) == (verdict == "warning")
 
 
 def test_the_other_sense() -> None:
