@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ from tiny_capture import HEIGHT, WIDTH, TinyCapture, encode_srgb
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import load_scene
-from polarguide.capture.smaller import smaller
+from polarguide.capture.exposures import Exposure
+from polarguide.capture.smaller import SmallerViews, smaller
 
 
 def slow_boxes(values: np.ndarray, factor: int) -> list[list[np.ndarray]]:
@@ -149,3 +152,33 @@ def test_a_scene_is_made_smaller_as_if_it_had_been_read_so(capture: TinyCapture,
         )  # fmt: skip
         # Saturation is told before the average here, and after it there, where a box at full scale is needed.
         assert not bool((other.saturated & ~view.saturated).any())
+
+
+def test_views_are_made_smaller_one_by_one(capture: TinyCapture) -> None:
+    """Their pictures are those of a smaller scene; marks of the subject and of materials come along."""
+    full = load_scene(capture.root, hold=False)
+    materials = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
+    materials[: HEIGHT // 2], materials[0, 0] = 2, 1
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[1, 1] = True
+    read = full.train_views
+    marked = dataclasses.replace(load_scene(capture.root).train_views[1], materials=materials, mask=mask)
+    views = SmallerViews((read[0], marked), 2)
+    assert len(views) == 2
+    assert views[0] is views[0]
+    assert [view.name for view in views] == [view.name for view in views[:]]
+    for view, whole in zip(views, smaller(full, max(HEIGHT, WIDTH) // 2 + 1).views, strict=False):
+        assert torch.equal(view.codes, whole.codes)
+        assert torch.equal(view.invalid, whole.invalid)
+        assert view.camera.width == whole.camera.width
+        assert torch.equal(view.photograph(), whole.photograph())
+    assert views[0].mask is views[0].materials is None
+    found = views[1]
+    assert found.mask is not None
+    assert found.materials is not None
+    assert found.mask.nonzero().tolist() == [[0, 0]]
+    assert found.materials[0, :2].tolist() == [0, 2]  # a box of two materials is of none
+    assert int(found.materials.max()) == 2
+    other = found.with_exposures((Exposure(10.0),))
+    assert other.exposures == (Exposure(10.0),)
+    assert torch.equal(other.codes, found.codes)

@@ -16,6 +16,7 @@ from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.training.recipe import Recipe
 from polarguide.training.schedule import Schedule
 from polarguide.training.settings import TrainSettings
+from polarguide.training.sizes import coarse_steps
 from polarguide.training.trainer import Trainer
 
 LEAST_STEPS = 500
@@ -69,13 +70,15 @@ def forecast(
     trainer = Trainer(scene, recipe, replace(settings, begin_again=False), backend)
     first = len(trainer.state.gaussians)
     most = max(first, min(GROWTH * first, settings.gaussians or GROWTH * first))
-    seconds, priors = _measured(trainer)
-    priors *= _priors_made(recipe, settings, len(scene.train_views))
+    coarse = coarse_steps(recipe, scene.train_views, settings.steps)
+    seconds, of_view = _measured(trainer, coarse)
+    made = _priors_made(recipe, settings, len(scene.train_views), coarse)
+    priors = sum(count * of_view.get(size, 0.0) for size, count in made.items())
     again = 1 + _search_share(scene, recipe, settings)
     least = greatest = again * (seconds + priors)
     if most != first:
         _multiply(trainer, most)
-        greatest = again * (_measured(trainer)[0] + priors)
+        greatest = again * (_measured(trainer, coarse)[0] + priors)
     return Forecast(least, greatest, first, most, peak)
 
 
@@ -97,28 +100,30 @@ def in_words(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def _measured(trainer: Trainer) -> tuple[float, float]:
-    """Seconds of all steps with as many Gaussians as now, without priors, and seconds of the priors of one view."""
+def _measured(trainer: Trainer, coarse: int) -> tuple[float, dict[bool, float]]:
+    """Seconds of all steps with as many Gaussians as now, without priors, and seconds of the priors of one view, by
+    whether its picture is one of the smaller ones of the first steps.
+    """
     schedule, steps = trainer.schedule, trainer.settings.steps
     stages = [schedule.at(step).stage for step in range(steps)]
-    found: dict[tuple[bool, object], float] = {}
-    seconds, priors = 0.0, 0.0
+    found: dict[tuple[bool, bool, object], float] = {}
+    priors: dict[bool, float] = {}
     for step in range(1, steps - 1):
         position = schedule.at(step)
-        kind = position.stage.reflection, position.stage.weights
-        if kind in found or position.actions or stages[step + 1] is not position.stage:
+        small = step < coarse
+        kind = small, position.stage.reflection, position.stage.weights
+        if kind in found or position.actions or stages[step + 1] is not position.stage or step + 1 == coarse:
             continue
         if (step + 1) % trainer.recipe.densification.every == 0:
             continue
-        if not found or (position.stage.weights.priors and not priors):
+        if not found or (position.stage.weights.priors and small not in priors):
             # What is loaded and made once, on another view: this one shall have no priors yet.
             _timed(trainer, step + 1)
         fresh, found[kind] = _timed(trainer, step), _timed(trainer, step)
         if position.stage.weights.priors:
-            priors = max(priors, fresh - found[kind])
-    for stage in stages:
-        seconds += found.get((stage.reflection, stage.weights), max(found.values()))
-    return seconds, priors
+            priors[small] = max(priors.get(small, 0.0), fresh - found[kind])
+    kinds = ((step < coarse, stage.reflection, stage.weights) for step, stage in enumerate(stages))
+    return sum(found.get(kind, max(found.values())) for kind in kinds), priors
 
 
 def _timed(trainer: Trainer, step: int) -> float:
@@ -129,15 +134,16 @@ def _timed(trainer: Trainer, step: int) -> float:
     return time.perf_counter() - begin
 
 
-def _priors_made(recipe: Recipe, settings: TrainSettings, views: int) -> int:
-    """How many times priors of a view are computed."""
-    schedule, made, due = Schedule(recipe, settings.steps), 0, views
+def _priors_made(recipe: Recipe, settings: TrainSettings, views: int, coarse: int) -> dict[bool, int]:
+    """How many times priors of a view are computed, by whether its picture is one of the smaller ones."""
+    schedule, due = Schedule(recipe, settings.steps), views
+    made = {True: 0, False: 0}
     for step in range(settings.steps):
         position = schedule.at(step)
-        if "refresh_priors" in position.actions:
+        if "refresh_priors" in position.actions or step == coarse:
             due = views
         if position.stage.weights.priors:
-            made += min(due, settings.views_per_step)
+            made[step < coarse] += min(due, settings.views_per_step)
             due -= min(due, settings.views_per_step)
     return made
 

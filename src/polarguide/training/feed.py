@@ -50,6 +50,7 @@ class Feed:
         backend: device and rasterizer. priors: the recipe's. index: of refraction.
         black: whether nothing is behind the subject.
         store: keeps what is computed of the views. views: that are trained on.
+        label: of what is kept; views of another size have another.
     """
 
     def __init__(
@@ -61,9 +62,11 @@ class Feed:
         views: Sequence[View],
         *,
         black: bool,
+        label: str = "",
     ) -> None:
         self._backend, self._settings, self._index, self._black = backend, priors, index, black
         self._store, self._views = store, views
+        self._shown, self._unguided, self._priors = (label + kind for kind in ("shown", "unguided", "priors"))
         self._flat: dict[str, Flat] | None = None
         self._partial: dict[str, PartialView] = {}
 
@@ -71,12 +74,18 @@ class Feed:
         """What is believed of these views has changed."""
         for name in names:
             self._partial.pop(name, None)
-            for kind in ("shown", "unguided", "priors"):
+            for kind in (self._shown, self._unguided, self._priors):
                 self._store.drop(kind, name)
+
+    def clear(self) -> None:
+        """Forget everything; it is made again where it is asked for."""
+        self._partial.clear()
+        for kind in (self._shown, self._unguided, self._priors):
+            self._store.drop(kind)
 
     def refresh_priors(self) -> None:
         """There is another guide."""
-        self._store.drop("priors")
+        self._store.drop(self._priors)
 
     def shown(self, view: View) -> Shown:
         """The photograph of a view."""
@@ -90,7 +99,7 @@ class Feed:
                 entry["empty"] = Packed(empty_pixels(view).to(device))
             return entry
 
-        kept = self._store.get("shown", view.name, make)
+        kept = self._store.get(self._shown, view.name, make)
         valid, empty = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
         if view.is_determined:
             return Shown(unpacked(kept["picture"]), valid, empty, None)
@@ -106,10 +115,10 @@ class Feed:
             guide: Gaussians whose normals resolve what polarization leaves open.
         """
         fields = fields_read(stage.weights)
-        entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields, guide))
+        entry = self._store.get(self._priors, view.name, lambda: self._new_priors(view, fields, guide))
         if not holds(entry, fields):  # the stage reads more than the one before
-            self._store.drop("priors", view.name)
-            entry = self._store.get("priors", view.name, lambda: self._new_priors(view, fields, guide))
+            self._store.drop(self._priors, view.name)
+            entry = self._store.get(self._priors, view.name, lambda: self._new_priors(view, fields, guide))
         return unpack_priors(entry, view.camera, self._settings)
 
     def _new_priors(self, view: View, fields: frozenset[str], frozen: Mapping[str, Tensor]) -> Entry:
@@ -123,7 +132,7 @@ class Feed:
             return {name: Packed(values) for name, values in found.items() if values is not None}
 
         # It can be had again for a part of the work, so that it is not worth a file.
-        kept = self._store.get("unguided", view.name, make, disposable=True)
+        kept = self._store.get(self._unguided, view.name, make, disposable=True)
         known = Unguided(**{name: part.codes for name, part in kept.items()})
         flat = self._flat_surfaces().get(view.name)
         return pack_priors(view_priors(view, guide, self._settings, self._index, known, metal, flat), fields)

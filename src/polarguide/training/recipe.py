@@ -218,6 +218,20 @@ class Method(ABC):
 
 
 @dataclass(frozen=True)
+class Coarse:
+    """Smaller pictures for the first steps, in which large ones show nothing that the Gaussians could take up yet.
+
+    Attributes:
+        share: of all steps. factor: side of the boxes of pixels that are averaged.
+        pixels: of the largest training view, from which on there are such steps.
+    """
+
+    share: float = 0.5
+    factor: int = 2
+    pixels: int = 1_000_000
+
+
+@dataclass(frozen=True)
 class Recipe(Method):
     """All that distinguishes one method of Gaussians from another.
 
@@ -230,6 +244,7 @@ class Recipe(Method):
         means_decay: factor on the means' rate at the last step (exponential in between).
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         metals: share of all steps between which refreshes look for metals, where the shading knows them.
+        coarse: which steps look at smaller pictures.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
 
@@ -245,6 +260,7 @@ class Recipe(Method):
     means_decay: float = 0.01
     oriented: bool = False
     metals: tuple[float, float] = (0.4, 0.72)
+    coarse: Coarse = field(default_factory=Coarse)
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
     ssim_weight: float = 0.2
     densification: Densification = field(default_factory=Densification)

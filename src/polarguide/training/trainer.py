@@ -26,7 +26,6 @@ from polarguide.shading.model import PLAIN
 from polarguide.shading.visibility import outward_directions, touched_pixels
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
-from polarguide.training.feed import Feed
 from polarguide.training.losses import step_loss
 from polarguide.training.metals import CONTRADICTED, contradiction, decide, evidence, light_gain
 from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
@@ -34,6 +33,7 @@ from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Action, Recipe, Stage
 from polarguide.training.schedule import Schedule
 from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.sizes import Sizes
 from polarguide.training.state import TrainingState, first_state, seeded
 from polarguide.training.view_store import ViewStore
 
@@ -111,7 +111,7 @@ class Trainer:
         self._limit = settings.gaussians or int(pixels / recipe.densification.pixels_each)
         store = ViewStore() if self._searches else self._store
         index = settings.refractive_index
-        self._feed = Feed(self.backend, recipe.priors, index, store, self._views, black=self.black)
+        self._sizes = Sizes(self.backend, recipe, index, store, self._views, steps, black=self.black)
         self._use_batch_rates()
 
     def _first_state(self) -> TrainingState:
@@ -228,7 +228,7 @@ class Trainer:
             held=stage.reflection and stage.hold_normals and stage.weights.layers,
             statistic=statistic,
         )
-        shown = self._feed.shown(view)
+        shown = self._sizes.feed(state.step).shown(view)
         loss, photometric = step_loss(
             result,
             shown.picture,
@@ -304,7 +304,7 @@ class Trainer:
         self.ranks.broadcast(table)
         earlier = [] if state.angles is None else [*state.angles]
         state.angles = torch.stack([*earlier, table.cpu()])
-        self._feed.forget(self.polarizers.take(state.angles))
+        self._sizes.forget(self.polarizers.take(state.angles))
 
     def _begin_again(self) -> None:
         """Back to the first step, with what was found of the polarizers."""
@@ -331,7 +331,7 @@ class Trainer:
             if sought and first <= self.state.step / self._steps < last:
                 self._find_metals()
             self.state.frozen = self.state.gaussians.snapshot()
-            self._feed.refresh_priors()
+            self._sizes.refresh_priors()
 
     @torch.no_grad()
     def _find_metals(self) -> None:
@@ -360,7 +360,7 @@ class Trainer:
 
         Every epoch visits every training view once, in an order of its own.
         """
-        views = self._views
+        views = self._sizes.views(self.state.step)
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
         return self.polarizers.believed(views[int(order[place])])
@@ -371,7 +371,7 @@ class Trainer:
         if self.state.frozen is None:
             self._act("refresh_priors")
         assert self.state.frozen is not None
-        return self._feed.priors(view, stage, self.state.frozen)
+        return self._sizes.feed(self.state.step).priors(view, stage, self.state.frozen)
 
 
 @torch.no_grad()
