@@ -103,7 +103,7 @@ class Ours:
             torch.rand(len(gaussians), 8, device=gaussians["means"].device),
         )
         splats = Splats(*(t.detach().requires_grad_() for t in inputs))
-        shown = trainer._feed.shown(view).picture
+        shown = trainer._sizes.feed(trainer.state.step).shown(view).picture
         prediction = shown.clone().requires_grad_()
 
         def raster() -> None:
