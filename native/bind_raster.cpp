@@ -102,6 +102,21 @@ void bind_raster(nb::module_ &module) {
             nb::arg("out"), nb::arg("alpha"), nb::arg("radius"), nb::arg("count_pairs") = false,
             nb::arg("for_backward") = true)
         .def(
+            "surface",
+            [](Wrapped &self, const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
+               const Array &features, float width, Array out) {
+                GaussianInputs in = inputs(means, quaternions, scales, opacities, features);
+                if (self.channels != 4) throw std::invalid_argument("surface: expected a rasterizer of four channels");
+                if (!(width > 0.0f)) throw std::invalid_argument("width: expected more than 0");
+                expect_shape(features, "features", {in.count, 4});
+                expect_shape(out, "out", {self.height, self.width, 4});
+                self.drawn = nothing_drawn;
+                nb::gil_scoped_release release;
+                self.rasterizer.surface(in, width, out.data());
+            },
+            nb::arg("means"), nb::arg("quaternions"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
+            nb::arg("width"), nb::arg("out"))
+        .def(
             "backward",
             [](Wrapped &self, const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
                const Array &features, const Array &out, const Array &grad_out, const Array &grad_alpha, Array d_means,

@@ -60,6 +60,7 @@ struct RasterArgs {
     float *alpha;                   // [H,W]
     float *transmittance;           // [H,W]
     int64_t *pairs;                 // optional [tiles]: contributing pixel-Gaussian pairs
+    float surface_width;            // of what is blended around the median depth, in shares of that
     // Backward, in (out and transmittance are read)
     const float *grad_out, *grad_alpha; // [H,W,channels_real], [H,W]
     int statistic_channels;
@@ -80,12 +81,13 @@ struct ProjectBackwardArgs {
 struct RasterScratch {
     float *rows;      // [n, channels + 6] Gaussians of the tile, where they are not kept
     int32_t *lists;   // [16, n]
-    float *moments;   // [n, channels + 9]
+    float *moments;   // [n, channels + 9], or [n, 16]
 };
 
 POLARGUIDE_DECLARE(void project(const ProjectArgs &args, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void raster_forward(const RasterArgs &args, int64_t tile, const RasterScratch &scratch))
+POLARGUIDE_DECLARE(void raster_surface(const RasterArgs &args, int64_t tile, const RasterScratch &scratch))
 POLARGUIDE_DECLARE(void raster_backward(const RasterArgs &args, int64_t tile, const RasterScratch &scratch))
 POLARGUIDE_DECLARE(void project_backward(const ProjectBackwardArgs &args, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(int64_t first_not_finite(const float *values, int64_t count)) // index, or -1

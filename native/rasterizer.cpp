@@ -126,7 +126,7 @@ template <class F> void Rasterizer::for_tiles(F &&body) {
         Worker &w = workers[size_t(worker)];
         if (!w.scratch.rows) {
             w.rows.resize(longest_ * (channels_ + 6) + 16), w.lists.resize(longest_ * 16 + 16);
-            w.moments.resize(longest_ * (channels_ + 9) + 32);
+            w.moments.resize(longest_ * std::max(channels_ + 9, 16) + 32);
             w.scratch = {w.rows.get(), w.lists.get(), w.moments.get()};
         }
         for (int64_t tile = begin; tile < end; ++tile) body(tile, w.scratch);
@@ -134,15 +134,19 @@ template <class F> void Rasterizer::for_tiles(F &&body) {
     parallel_chunks(int64_t(tiles_x_) * tiles_y_, 2, run);
 }
 
-void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs,
-                         bool for_backward) {
+void Rasterizer::project(const GaussianInputs &in, float *radius) {
     screen_.resize(in.count * screen_values), depth_.resize(in.count), box_.resize(in.count * 4);
-    transmittance_.resize(int64_t(camera_.width) * camera_.height);
     ProjectArgs project_args{in.count, in.means, in.quaternions, in.scales, in.opacities, camera_,
                              screen_.get(), depth_.get(), radius, box_.get()};
     auto project_chunk = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(project)(project_args, b, e); };
     parallel_chunks(in.count, gaussian_chunk, project_chunk);
     bin(in.count);
+}
+
+void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs,
+                         bool for_backward) {
+    transmittance_.resize(int64_t(camera_.width) * camera_.height);
+    project(in, radius);
     kept_ = for_backward;
     if (kept_) rows_.resize(instance_count_ * (channels_ + 6) + 16), blocks_.resize(instance_count_);
     RasterArgs args = raster_args(in);
@@ -152,6 +156,16 @@ void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, flo
     for_tiles([&](int64_t tile, const RasterScratch &s) { POLARGUIDE_DISPATCH(raster_forward)(args, tile, s); });
     pairs_ = 0;
     for (int64_t n : pairs) pairs_ += n;
+}
+
+void Rasterizer::surface(const GaussianInputs &in, float width, float *out) {
+    Buffer<float> radius;
+    radius.resize(in.count);
+    project(in, radius.get());
+    kept_ = false;
+    RasterArgs args = raster_args(in);
+    args.out = out, args.surface_width = width;
+    for_tiles([&](int64_t tile, const RasterScratch &s) { POLARGUIDE_DISPATCH(raster_surface)(args, tile, s); });
 }
 
 void Rasterizer::backward(const GaussianInputs &in, const float *out, const float *grad_out, const float *grad_alpha,

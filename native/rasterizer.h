@@ -32,6 +32,8 @@ class Rasterizer {
     Rasterizer(const PinholeCamera &camera, std::vector<int32_t> permutation, int statistic_channels);
     // What a backward pass reads is kept only `for_backward`.
     void forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs, bool for_backward);
+    // Of four channels, the last camera depth: their means around each pixel's median depth.
+    void surface(const GaussianInputs &in, float width, float *out);
     bool kept() const { return kept_; }
     struct Gradients {
         float *means, *quaternions, *scales, *opacities, *features, *statistic; // statistic may be null
@@ -42,6 +44,7 @@ class Rasterizer {
     int64_t instances() const { return instance_count_; }
 
   private:
+    void project(const GaussianInputs &in, float *radius);
     void bin(int64_t count);
     RasterArgs raster_args(const GaussianInputs &in) const;
     template <class F> void for_tiles(F &&body);

@@ -1,7 +1,7 @@
 """What rendering all layers costs against plain Gaussian splatting of the same Gaussians.
 
-Every test view is drawn in turn as color alone and as all layers, with and without depth; the ratio is taken within
-each turn, so that a slow moment of the machine meets both. Run it alone:
+Every test view is drawn in turn as color alone and as all layers, without depth, with it, and with normals and depth of
+the surface; the ratio is taken within each turn, so that a slow moment of the machine meets all. Run it alone:
 ``python benchmarks/speed/rendering.py RUN... [--size 1920x1080] [--threads 1 2]``.
 """
 
@@ -52,12 +52,15 @@ def measure(opened: Run, rounds: int, size: tuple[int, int] | None, threads: int
         return render(rows, camera, rasterize, normals=False)
 
     def layers(camera: Camera) -> object:
-        return opened.result(camera, depth=False).to("cpu")
+        return opened.result(camera, depth=False, surface=False).to("cpu")
 
     def layers_and_depth(camera: Camera) -> object:
+        return opened.result(camera, surface=False).to("cpu")
+
+    def surface(camera: Camera) -> object:
         return opened.result(camera).to("cpu")
 
-    ways = (plain, layers, layers_and_depth)
+    ways = (plain, layers, layers_and_depth, surface)
     cameras = [shown_at(view.camera, size) for view in opened.scene.test_views]
     times: dict[str, list[float]] = {way.__name__: [] for way in ways}
     for turn in range(rounds + 1):
@@ -75,7 +78,7 @@ def measure(opened: Run, rounds: int, size: tuple[int, int] | None, threads: int
     print(
         f"| {opened.folder.name} | {opened.recipe.name} | {threads} | {camera.width} x {camera.height} "
         f"| {len(rows):,} | "
-        f"{median['plain']:.1f} | {median['layers']:.1f} | {median['layers_and_depth']:.1f} | "
+        + "".join(f"{median[way.__name__]:.1f} | " for way in ways)
         + " | ".join(f"{ratio:.2f}" for ratio in ratios)
         + " |"
     )
@@ -92,9 +95,10 @@ def main() -> None:
     assert size is None or len(size) == 2
     print(f"{_native.simd()}\n")
     print(
-        "| run | recipe | threads | size | Gaussians | color ms | layers ms | with depth ms | ratio | with depth |"
+        "| run | recipe | threads | size | Gaussians | color ms | layers ms | with depth ms | of the surface ms "
+        "| ratio | with depth | of the surface |"
     )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
     with torch.no_grad():
         for run in arguments.runs:
             for threads in arguments.threads:

@@ -38,6 +38,16 @@ class Rasterizer:
         count_pairs: bool = False,
         for_backward: bool = True,
     ) -> None: ...
+    def surface(
+        self,
+        means: Tensor,
+        quaternions: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        width: float,
+        out: Tensor,
+    ) -> None: ...
     def backward(
         self,
         means: Tensor,

@@ -31,7 +31,7 @@ def paint(seen, appearance=PLAIN, view=None, camera=CAMERA, **named):
 @pytest.mark.parametrize("recipe", KINDS)
 def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
     seen = shown(recipe)
-    result = seen.render(CAMERA, depth=True)
+    result = seen.render(CAMERA, depth=True, surface=True)
     for layer in LAYERS:
         picture = paint(seen, Appearance(layer=layer))
         if getattr(result, layer) is None:

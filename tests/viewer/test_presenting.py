@@ -78,7 +78,7 @@ class Visit:
 
     def pick(self, what: str, *places: tuple[float, float]) -> list:  # type: ignore[type-arg]
         """Surfaces at places in pixels, after picking them."""
-        result = self.seen.render(self.camera, depth=True)
+        result = self.seen.render(self.camera, depth=True, surface=True)
         self.press("Pick", what)
         found = []
         for x, y in places:
@@ -103,7 +103,7 @@ def visit() -> Visit:
 
 def places(visit: Visit) -> list[tuple[float, float]]:
     """Two pixels where there is a surface with a normal, well apart."""
-    result = visit.seen.render(visit.camera, depth=True)
+    result = visit.seen.render(visit.camera, depth=True, surface=True)
     rows, columns = torch.nonzero((result.alpha > 0.8) & (result.final.amin(dim=-1) > 0.02)).unbind(1)
     first, last = int(columns.argmin()), int(columns.argmax())
     return [(float(columns[k]) + 0.5, float(rows[k]) + 0.5) for k in (first, last)]
@@ -136,7 +136,7 @@ def test_gray_world_is_that_of_the_photographs(visit: Visit) -> None:
 
 
 def test_nothing_and_black_are_no_white(visit: Visit) -> None:
-    result = visit.seen.render(visit.camera, depth=True)
+    result = visit.seen.render(visit.camera, depth=True, surface=True)
     row, column = torch.nonzero(result.alpha < 0.1)[0].tolist()
     visit.pick("white", (column + 0.5, row + 0.5))
     assert "Nothing is there" in visit.status

@@ -89,7 +89,7 @@ class Opened:
         lens = self.photographs[name].view.camera
         scaled = {key: 4 * getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
         camera = replace(lens, **scaled)
-        result = self.seen.render(camera, depth=True)
+        result = self.seen.render(camera, depth=True, surface=True)
         if layer == "normal":
             return figures.normal_to_rgb(result.normal, camera)
         return figures.radiance_to_rgb(getattr(result, layer))
@@ -154,7 +154,7 @@ def test_white_and_a_length_are_picked_in_the_picture_and_saved(opened):
     camera = opened.photographs["v1"].view.camera
     scaled = {key: 4 * getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     camera = replace(camera, **scaled)
-    result = opened.seen.render(camera, depth=True)
+    result = opened.seen.render(camera, depth=True, surface=True)
     there = (result.alpha > 0.8) & (result.final.amin(dim=-1) > 0.05)
     there[:150], there[-60:], there[:, :60], there[:, WIDTH - 400 :] = False, False, False, False
     rows, columns = there.nonzero().unbind(1)

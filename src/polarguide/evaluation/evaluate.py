@@ -108,7 +108,7 @@ def _score(
     """Score a view; its errors are added to those by object, and its pictures to the sheet."""
     # First what is known of it: copied later, it would have to wait until the rendering is done.
     target = ViewTarget.of_view(view, facts, run.model.device)
-    result = run.model.render(view.camera, depth=True)
+    result = run.model.render(view.camera, depth=True, surface=True)
     stokes = run.model.stokes(result, view.camera)
     if not view.measures_radiance:
         result = replace(result, final=cross_fitted(view, result.final, stokes))
@@ -124,7 +124,7 @@ def _surface(run: OpenedRun) -> Surface:
     if isinstance(run.model, FieldModel):
         return implicit_surface(run.cameras, run.model, resolution=RESOLUTION)
     fused, _, _ = fused_surface(
-        run.cameras, lambda camera: run.model.render(camera, depth=True), resolution=RESOLUTION
+        run.cameras, lambda camera: run.model.render(camera, depth=True, surface=True), resolution=RESOLUTION
     )
     return fused
 

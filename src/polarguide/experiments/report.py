@@ -135,7 +135,7 @@ def _ground_truth_tile(view: View) -> Tile:
 
 def _tile(name: str, run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
     """What a run, called ``name``, shows of one view."""
-    result = run.model.render(view.camera).to("cpu")
+    result = run.model.render(view.camera, surface=True).to("cpu")
     pictures: dict[str, Picture] = {}
     for layer in ("final", "diffuse", "specular", "normal"):
         picture = layer_picture(result, layer, view.camera)

@@ -251,6 +251,7 @@ def _fused(run: OpenedRun, shown: _Shown, resolution: int) -> ColoredMesh:
             light=model.light,
             normals=True,
             depth=True,
+            surface=True,
         )
 
     with torch.no_grad():

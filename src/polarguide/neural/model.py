@@ -78,12 +78,19 @@ class FieldModel:
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, *, normals: bool = True, depth: bool = False, kept: Kept | None = None
+        self,
+        camera: Camera,
+        *,
+        normals: bool = True,
+        depth: bool = False,
+        surface: bool = False,
+        kept: Kept | None = None,
     ) -> RenderResult:
         """All layers; ``depth`` only if asked for.
 
         Args:
-            camera: any. normals: they come with the colors. kept: see ``Kept``; None: all, with what lies behind.
+            camera: any. normals: they come with the colors. surface: its depth is that of the surface in any case.
+            kept: see ``Kept``; None: all, with what lies behind.
         """
         seen = [self._seen(*rays, depth, kept) for rays in self._rays(camera)]
         color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*seen, strict=True))

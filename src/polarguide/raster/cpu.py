@@ -37,16 +37,26 @@ def native_rasterizer(camera: Camera, channels: int, statistic: ScreenStatistic 
     )
 
 
+def finite(*splats: Tensor) -> list[Tensor]:
+    """The tensors of ``Splats`` as the kernels take them: on the CPU, contiguous, and finite.
+
+    Raises:
+        PolarguideError: a value is not finite.
+    """
+    inputs = [t.detach().cpu().contiguous() for t in splats]
+    for name, tensor in zip(Splats._fields, inputs, strict=True):
+        bad = _native.first_not_finite(tensor)
+        if bad >= 0:
+            raise not_finite(name, bad // max(1, tensor[0].numel()))
+    return inputs
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, camera: Camera, statistic: ScreenStatistic | None, *splats: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = [t.detach().contiguous() for t in splats]
-        for name, tensor in zip(Splats._fields, inputs, strict=True):
-            bad = _native.first_not_finite(tensor)
-            if bad >= 0:
-                raise not_finite(name, bad // max(1, tensor[0].numel()))
+        inputs = finite(*splats)
         count, channels = inputs[-1].shape
         rasterizer = native_rasterizer(camera, channels, statistic)
         out = torch.empty(camera.height, camera.width, channels)

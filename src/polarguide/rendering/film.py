@@ -115,7 +115,8 @@ def _picture(
     gains: torch.Tensor | None,
 ) -> Picture:
     """Layers side by side."""
-    result = run.model.render(camera, depth="depth" in layers)
+    surface = bool({"normal", "depth"} & {*layers})
+    result = run.model.render(camera, depth="depth" in layers, surface=surface)
     run.chosen_layers(result, layers)
     pictures = [layer_picture(result, name, camera, depths, gains=gains) for name in layers]
     return np.concatenate([picture for picture in pictures if picture is not None], axis=1)
@@ -125,7 +126,7 @@ def _depths(run: OpenedRun, cameras: list[Camera]) -> tuple[float, float]:
     """One range of depths for the whole path, so that its colors do not flicker: that of a few of its cameras."""
     values = []
     for camera in cameras[:: max(1, len(cameras) // 4)]:
-        result = run.model.render(camera, depth=True)
+        result = run.model.render(camera, depth=True, surface=True)
         assert result.depth is not None
         values.append(result.depth[result.alpha > 0.5])
     joined = torch.cat(values)[:1_000_000]

@@ -48,8 +48,15 @@ class Model(Protocol):
     def size(self) -> str:
         """How large it is, for people."""
 
-    def render(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
-        """All layers; ``normals`` where the model can do without them, and ``depth``, only if asked for."""
+    def render(
+        self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
+    ) -> RenderResult:
+        """All layers.
+
+        Args:
+            camera: any. normals: also where the model can do without them. depth: only if asked for.
+            surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
+        """
 
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
         """The Stokes vectors [3, H, W, 3] that a rendered picture predicts; None: it predicts none."""
@@ -97,8 +104,10 @@ class GaussianModel:
         return f"{self.gaussians:,} Gaussians"
 
     @torch.no_grad()
-    def render(self, camera: Camera, *, normals: bool = True, depth: bool = False) -> RenderResult:
-        """All layers; ``normals`` where the model can do without them, and ``depth``, only if asked for."""
+    def render(
+        self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
+    ) -> RenderResult:
+        """All layers: see ``Model``."""
         return render(
             self.state.gaussians,
             camera,
@@ -107,6 +116,7 @@ class GaussianModel:
             light=self.light,
             normals=normals,
             depth=depth,
+            surface=surface,
         )
 
     @torch.no_grad()

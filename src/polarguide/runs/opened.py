@@ -209,15 +209,19 @@ class OpenedRun:
         """Names of the layers that this run renders, in the order of ``LAYERS``."""
         return self.model.layers
 
-    def result(self, camera: Camera | str, *, normals: bool = True, depth: bool = True) -> RenderResult:
+    def result(
+        self, camera: Camera | str, *, normals: bool = True, depth: bool = True, surface: bool = True
+    ) -> RenderResult:
         """Everything that can be rendered, as one typed record on the run's device.
 
         Args:
             camera: any camera, or the name of a view (then the scene is read).
             normals, depth: whether to render these layers where the recipe can do without them.
+            surface: whether they are those of the surface at the pixel's median depth; otherwise blended, which is
+                faster.
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
-        return self.model.render(chosen, normals=normals, depth=depth)
+        return self.model.render(chosen, normals=normals, depth=depth, surface=surface)
 
     def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:
         """Layers of a picture.
@@ -234,7 +238,8 @@ class OpenedRun:
             PolarguideError: there is no such layer, or this recipe has not got it.
         """
         names = checked_layers([layers] if isinstance(layers, str) else list(layers))
-        return self.chosen_layers(self.result(camera), names)
+        shown = {"normal", "depth"} & {*names}
+        return self.chosen_layers(self.result(camera, surface=bool(shown)), names)
 
     def chosen_layers(self, result: RenderResult, names: Iterable[str]) -> dict[str, Tensor]:
         """Layers of a picture by name.

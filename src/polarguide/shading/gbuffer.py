@@ -11,6 +11,7 @@ from polarguide.camera import Camera
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.native import fits
 from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
+from polarguide.raster.surface import surface_picture
 from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
 from polarguide.shading.native import split_native
 from polarguide.shading.result import RenderResult
@@ -30,6 +31,7 @@ def render(
     normals: bool = True,
     depth: bool = False,
     held: bool = False,
+    surface: bool = False,
     statistic: ScreenStatistic | None = None,
 ) -> RenderResult:
     """Render one view.
@@ -42,6 +44,7 @@ def render(
         normals: also splat normals where the shading model does not need them.
         depth: also splat camera depth.
         held: also give the layers without a gradient on the normals, of a shading model that has them.
+        surface: normals and depth are those around the median depth, without gradients; the layers are shaded as ever.
         statistic: see ``ScreenStatistic``; the color channels come first.
     """
     pose = camera.pose(gaussians["means"].dtype, gaussians["means"].device)
@@ -63,6 +66,12 @@ def render(
         layers, again = shading.shade_held(splatted, light, camera)
     else:
         layers, again = shading.shade(splatted, light, camera), None
+    blended = None
+    if surface and (normals or depth):
+        found = surface_picture(splats(gaussians, axes if normals else torch.zeros_like(means)), camera)
+        camera_depth = found.depth if depth else None
+        if normals:
+            normal, blended = picture.alpha[..., None] * found.directions, normal
     return RenderResult(
         final=layers["final"],
         base=features[..., :3],
@@ -73,6 +82,7 @@ def render(
         radii=picture.radii,
         held=again,
         metal=layers.get("metal"),
+        blended_normal=blended,
     )
 
 

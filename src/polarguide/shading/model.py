@@ -269,19 +269,20 @@ class ShadingModel(ABC):
         Args:
             result: with the specular and diffuse layers and the normal.
         """
+        normal = result.shaded_normal
         assert result.specular is not None
         assert result.diffuse is not None
-        assert result.normal is not None
+        assert normal is not None
         stokes = optics.predicted_stokes(
             2 * result.specular,
             2 * result.diffuse,
-            camera.to_camera(result.normal),
-            camera.rays(device=result.normal.device),
+            camera.to_camera(normal),
+            camera.rays(device=normal.device),
             self.refractive_index,
         )
         if result.metal is None:
             return stokes
-        layers, index = (result.specular, result.diffuse, result.normal), self.refractive_index
+        layers, index = (result.specular, result.diffuse, normal), self.refractive_index
         metal = metal_stokes(*layers, result.metal, camera, index)
         return stokes.flatten(1, 2).index_copy(1, result.metal.pixels, metal).view_as(stokes)
 

@@ -41,13 +41,16 @@ class RenderResult:
         reflection: the environment seen along the mirrored ray; None where the shading has no such layer.
         strength: [H, W] reflection strength in [0, 1]; None where the shading has none.
         metalness: [H, W] share of metals in [0, 1]; None where the shading knows none.
-        normal: blended normal in world axes, not normalized; None where the stage does not splat it.
-        depth: [H, W] expected camera depth over alpha; None where not asked for.
+        normal: blended normal in world axes, not normalized; None where the stage does not splat it. Where the surface
+            was asked for, that around the pixel's median depth, see ``raster.surface``.
+        depth: [H, W] expected camera depth over alpha; None where not asked for. Where the surface was asked for, that
+            around the median.
         alpha: [H, W] in [0, 1].
         radii: [N] pixels, of the projected Gaussians; 0 where culled; None where there are no Gaussians.
         held: ``specular``, ``diffuse`` and ``metal`` once more, without a gradient on the normals; None where not asked
             for.
         metal: what metals add to ``specular``; None where there is none.
+        blended_normal: the blended normal, where ``normal`` is that of the surface.
     """
 
     final: Tensor
@@ -63,6 +66,12 @@ class RenderResult:
     held: HeldLayers | None = None
     metal: MetalPixels | None = None
     metalness: Tensor | None = None
+    blended_normal: Tensor | None = None
+
+    @property
+    def shaded_normal(self) -> Tensor | None:
+        """The normal that the layers were shaded with."""
+        return self.normal if self.blended_normal is None else self.blended_normal
 
     def to(self, device: torch.device | str) -> RenderResult:
         """The same on a device, but for ``held``; nothing is copied that is there already."""
@@ -81,4 +90,4 @@ class RenderResult:
                     for new, old in zip((height, width), layer.shape[:2], strict=True)
                 )
                 found[name] = layer[rows][:, columns]
-        return replace(self, held=None, radii=None, metal=None, **found)
+        return replace(self, held=None, radii=None, metal=None, blended_normal=None, **found)

@@ -113,7 +113,10 @@ class Painter:
         if appearance.turn % 360:
             presented = Presentation(up_axis=appearance.up_axis)
             turn = presented.upright(self.around).turn(appearance.turn)
-        result = shown.render(camera, depth=appearance.layer == "depth", kept=kept, turn=turn)
+        surface = appearance.layer in ("normal", "depth")
+        result = shown.render(
+            camera, depth=appearance.layer == "depth", surface=surface, kept=kept, turn=turn
+        )
         if result.specular is None or result.diffuse is None or appearance.strength == 1.0:
             return result
         specular = appearance.strength * result.specular

@@ -38,6 +38,7 @@ class Scenery(Protocol):
         camera: Camera,
         *,
         depth: bool,
+        surface: bool = False,
         kept: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:
@@ -67,6 +68,7 @@ class Shown:
         camera: Camera,
         *,
         depth: bool,
+        surface: bool = False,
         kept: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:
@@ -74,6 +76,7 @@ class Shown:
 
         Args:
             camera: with the size of the picture. depth: whether depth is one of them.
+            surface: whether normals and depth are those of the surface at the pixel's median depth.
             kept: which places [N, 3] of the scene are shown, [N] bool; None: all.
             turn: rotation [3, 3] of the light from afar, where it is radiance; None: as learned.
         """
@@ -89,6 +92,7 @@ class Shown:
             shading=self.shading,
             light=self.light if turn is None else self._turned(turn),
             depth=depth,
+            surface=surface,
         ).to("cpu")
 
     def _turned(self, turn: Tensor) -> Light:
@@ -111,6 +115,7 @@ class ShownField:
         camera: Camera,
         *,
         depth: bool,
+        surface: bool = False,
         kept: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:

@@ -1,0 +1,80 @@
+// What a pixel's Gaussians show around its median depth. See src/polarguide/raster/surface.py for the definition.
+#include "raster_tile.h"
+
+namespace polarguide {
+namespace POLARGUIDE_ISA {
+namespace {
+
+constexpr int surface_channels = 4, depth_at = 6 + surface_channels - 1; // three of the caller's, then camera depth
+
+// Blended weights of the Gaussians in `list` at some pixels, as many rows as the result says; `total` is their sum.
+POLARGUIDE_INLINE int blended_weights(const Tile &t, const int32_t *list, int count, const Pixels &pixels, float *weights,
+                                      reg *total) {
+    reg live = reg_splat(1.0f), sum = reg{};
+    for (int i = 0; i < count; ++i) {
+        const Alpha at = alpha_at(t.rows + int64_t(list[i]) * (surface_channels + 6), pixels);
+        const reg next = live - live * at.value;
+        const ireg go = next >= minimum_transmittance;
+        const reg weight = go ? live * at.value : reg{};
+        reg_store(weights + int64_t(i) * reg_lanes, weight);
+        sum += weight;
+        live = go ? next : reg{};
+        if (!any(go)) {
+            count = i + 1;
+            break;
+        }
+    }
+    *total = sum;
+    return count;
+}
+
+POLARGUIDE_INLINE reg median_depth(const Tile &t, const int32_t *list, int count, const float *weights, reg total) {
+    reg upto = reg{}, median = reg_splat(1.0f);
+    ireg open = total > 0.0f;
+    for (int i = 0; i < count && any(open); ++i) {
+        const reg weight = reg_load(weights + int64_t(i) * reg_lanes);
+        upto += weight;
+        const ireg here = open & (weight > 0.0f) & (upto + upto >= total);
+        median = here ? reg_splat(t.rows[int64_t(list[i]) * (surface_channels + 6) + depth_at]) : median;
+        open &= ~here;
+    }
+    return median;
+}
+
+} // namespace
+
+void raster_surface(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
+    const Tile t = gather_tile<surface_channels>(a, tile, s);
+    const float sharp = 1.0f / a.surface_width, half_log2_e = 0.72134752f;
+    float *weights = s.moments;
+    for (int block = 0; block < 16; ++block) {
+        Block b;
+        if (!open_block(a, t, block, &b)) continue;
+        const int32_t *list = s.lists + int64_t(block) * t.count;
+        alignas(64) float values[surface_channels][16];
+        for (int l = 0; l < lanes; l += reg_lanes) {
+            reg total, acc[surface_channels] = {}, sum = reg{};
+            const int count = blended_weights(t, list, t.list_sizes[block], pixels_from(b, l), weights, &total);
+            const reg median = median_depth(t, list, count, weights, total);
+            for (int i = 0; i < count; ++i) {
+                const float *row = t.rows + int64_t(list[i]) * (surface_channels + 6);
+                const reg off = (median * (1.0f / row[depth_at]) - 1.0f) * sharp;
+                const reg near = exp2(max(off * off * -half_log2_e, reg_splat(-60.0f)));
+                const reg weight = reg_load(weights + int64_t(i) * reg_lanes) * near;
+                for (int k = 0; k < surface_channels; ++k) acc[k] += weight * row[6 + k];
+                sum += weight;
+            }
+            const reg scale = total > 0.0f ? 1.0f / sum : reg{};
+            for (int k = 0; k < surface_channels; ++k) reg_store(values[k] + l, total > 0.0f ? acc[k] * scale : reg{});
+        }
+        const int rows = a.height - b.y < 4 ? a.height - b.y : 4, columns = a.width - b.x < 4 ? a.width - b.x : 4;
+        for (int j = 0; j < rows; ++j)
+            for (int i = 0; i < columns; ++i) {
+                float *out = a.out + (int64_t(b.y + j) * a.width + b.x + i) * surface_channels;
+                for (int k = 0; k < surface_channels; ++k) out[k] = values[k][4 * j + i];
+            }
+    }
+}
+
+} // namespace POLARGUIDE_ISA
+} // namespace polarguide
