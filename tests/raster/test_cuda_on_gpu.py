@@ -19,6 +19,7 @@ from raster_scenes import (
 from polarguide.raster import Splats, choose_backend, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, rasterize_cuda
+from polarguide.raster.surface import surface_picture
 
 pytestmark = [
     pytest.mark.gpu,
@@ -99,3 +100,12 @@ def test_nothing_in_view_is_an_empty_picture() -> None:
     assert not bool(found.features.any())
     assert not bool(found.radii.any())
     assert all(bool(torch.isfinite(t).all()) for t in found.gradients)
+
+
+def test_the_surface_comes_back_to_the_gpu() -> None:
+    camera = posed(31, 18)
+    splats = in_view(camera, 60, 3, seed=8)
+    found = surface_picture(Splats(*(t.cuda() for t in splats)), camera)
+    for ours, true in zip(found, surface_picture(splats, camera), strict=True):
+        assert ours.is_cuda
+        torch.testing.assert_close(ours.cpu(), true)
