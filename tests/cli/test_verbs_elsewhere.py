@@ -46,7 +46,7 @@ def test_scores_are_made_there_and_read_once_a_view(run: Path) -> None:
         opened = open_run(run)
         record = opened.evaluate()
         view, facts = opened.scene.test_views[0], SceneFacts.of(opened.scene)
-        result = opened.model.render(view.camera, depth=True)
+        result = opened.model.render(view.camera, depth=True, surface=True)
         stokes = opened.model.stokes(result, view.camera)
         cpu, target = torch.device("cpu"), ViewTarget.of_view(view, facts, BACKEND.device)
         in_front = opened.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
