@@ -35,6 +35,7 @@ FOREIGN_OPTIONS = {
         "large",
         "tiny",
         "picture",
+        "opensplat",
         "gaussians",
     ),
 }
