@@ -21,28 +21,6 @@ SIZES = ((1, 1), (3, 2), (16, 16), (17, 33), (31, 18), (50, 37))
 STATISTICS = (None, (0, 1, 2), (1, 4), (2,))
 
 
-def instruction_sets() -> list[str]:
-    """The variants that this processor can run."""
-    names = []
-    active = _native.simd()
-    for name in ("baseline", "avx2", "avx512"):
-        try:
-            _native.select_simd(name)
-        except ValueError:
-            continue
-        names.append(name)
-    _native.select_simd(active)
-    return names
-
-
-@pytest.fixture(params=instruction_sets())
-def simd(request: pytest.FixtureRequest) -> Iterator[str]:
-    active = _native.simd()
-    _native.select_simd(request.param)
-    yield request.param
-    _native.select_simd(active)
-
-
 @pytest.fixture
 def threads() -> Iterator[None]:
     before = _native.thread_count()

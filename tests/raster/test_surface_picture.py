@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from raster_scenes import in_view, looking_ahead, posed, round_gaussian
-from test_backends import instruction_sets
 
 from polarguide import _native
 from polarguide.camera import Camera
@@ -15,14 +12,6 @@ from polarguide.errors import PolarguideError
 from polarguide.raster import Splats, rasterize_reference
 from polarguide.raster.cpu import native_rasterizer, rasterize_cpu
 from polarguide.raster.surface import SurfacePicture, surface_picture, surface_reference
-
-
-@pytest.fixture(params=instruction_sets())
-def simd(request: pytest.FixtureRequest) -> Iterator[str]:
-    active = _native.simd()
-    _native.select_simd(request.param)
-    yield request.param
-    _native.select_simd(active)
 
 
 def reference(splats: Splats, camera: Camera) -> SurfacePicture:

@@ -11,13 +11,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide._native import MAX_CHANNELS
 from polarguide.camera import Camera
 from polarguide.raster.cpu import finite, native_rasterizer
 from polarguide.raster.interface import Rasterize, Splats
 
 WIDTH = 0.02
 """Standard deviation of what is taken around the median depth, as a share of it."""
-MOST_CHANNELS = 32
 
 
 class SurfacePicture(NamedTuple):
@@ -73,7 +73,7 @@ def surface_reference(splats: Splats, camera: Camera, rasterize: Rasterize) -> S
     whole = Splats(*(t[order] for t in splats))
     alone = torch.eye(len(order), dtype=places.dtype, device=places.device)
     parts = [
-        rasterize(whole._replace(features=own), camera).features for own in alone.split(MOST_CHANNELS, dim=1)
+        rasterize(whole._replace(features=own), camera).features for own in alone.split(MAX_CHANNELS, dim=1)
     ]
     weights = torch.cat(parts, dim=-1)
     upto, depth = weights.cumsum(dim=-1), places[order]
