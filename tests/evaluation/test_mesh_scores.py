@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import math
 
 import numpy as np
@@ -190,8 +191,19 @@ def test_nothing_to_compare_or_to_fuse(monkeypatch: pytest.MonkeyPatch) -> None:
         return dataclasses.replace(seen, alpha=0 * seen.alpha)
 
     assert measured.mesh_scores(fused(nothing), views()) == dict.fromkeys(KEYS, 0.0)
-    monkeypatch.setattr(measured, "_libraries", lambda: False)
-    assert measured.mesh_scores(fused(sphere_result), views()) == {}
+
+
+def test_a_package_that_is_missing_is_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "skimage" else find_spec(name)
+    )
+    got = measured.mesh_scores(fused(sphere_result), views())
+    assert set(got) == {"mesh_fscore_1_reason"}
+    assert "skimage is not installed" in str(got["mesh_fscore_1_reason"])
+    assert "pip install 'polarguide[export]'" in str(got["mesh_fscore_1_reason"])
+    unknown = [dataclasses.replace(view, ground_truth=None) for view in views()]
+    assert measured.mesh_scores(fused(sphere_result), unknown) == {}
 
 
 def test_without_masks_everything_is_judged() -> None:

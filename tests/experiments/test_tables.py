@@ -99,6 +99,7 @@ def test_markdown() -> None:
     assert "| `a` | **30.50** ± 0.71 | n/a |" in text
     assert "| `b` | 29.00 ± 0.00 | 12.5 ± 0.0 |" in text
     assert "LPIPS n/a: no weights." in text
+    assert "mesh F-score" not in text
     assert "SSIM" not in text, "a column without values"
     assert "over 2 seeds" in text
 
@@ -164,3 +165,9 @@ def test_names_are_no_formulas_in_a_spreadsheet() -> None:
         )
     )
     assert {row["scene"] for row in rows} >= {"'=1+1", "'@x", "cup"}
+
+
+def test_why_a_mesh_has_no_score_is_said_once() -> None:
+    runs = [run("x", name, 0) | {"mesh_reason": "skimage is not installed"} for name in "ab"]
+    said = notes(results(runs))  # type: ignore[arg-type]
+    assert said.count("mesh F-score 1 % n/a: skimage is not installed.") == 1

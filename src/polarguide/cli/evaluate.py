@@ -10,8 +10,7 @@ from rich.text import Text
 
 from polarguide.cli.console import console, say
 from polarguide.cli.runs import RunFolder, opened
-from polarguide.errors import PolarguideError, require_package
-from polarguide.options import EXPORT_PACKAGES, ComputeOptions
+from polarguide.options import ComputeOptions
 from polarguide.printable import printable
 
 _MOST_OBJECTS = 100
@@ -51,17 +50,9 @@ def evaluate(
 
 
 def _without_value(record: dict[str, Any]) -> list[str]:
-    """What has no value and why, a line for each reason."""
-    table = importlib.import_module("polarguide.evaluation.table")
-    absent, lines = table.absent_metrics(record), []
-    if table.MESH_LABEL in absent and record["depth_error_median_percent"] is not None:
-        try:
-            for package in EXPORT_PACKAGES["mesh"]:
-                require_package(package, table.MESH_LABEL)
-        except PolarguideError as error:
-            absent.remove(table.MESH_LABEL)
-            lines.append(f"n/a: {error}")
-    return lines + ([f"no ground truth, or no such layer, for: {', '.join(absent)}"] if absent else [])
+    """What has no value for want of something to compare, a line of it if there is any."""
+    absent = importlib.import_module("polarguide.evaluation.table").absent_metrics(record)
+    return [f"no ground truth, or no such layer, for: {', '.join(absent)}"] if absent else []
 
 
 def _errors(record: dict[str, Any]) -> Table:

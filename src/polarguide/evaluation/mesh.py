@@ -14,8 +14,10 @@ from torch import Tensor
 
 from polarguide.camera import seen_at
 from polarguide.capture import View
-from polarguide.errors import PolarguideError, optional_import
+from polarguide.errors import PolarguideError, optional_import, require_package
+from polarguide.evaluation.table import MESH_LABEL
 from polarguide.evaluation.target import jumps
+from polarguide.options import EXPORT_PACKAGES
 from polarguide.rendering.fusion import NoSurfaceError, Surface, seen_points
 
 THRESHOLDS = {"05": 0.005, "1": 0.01}
@@ -31,28 +33,41 @@ FINEST = 6
 Points = NDArray[np.float64]
 
 
-def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> dict[str, float]:
+def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> dict[str, float | str]:
     """The scores of the mesh that ``polarguide export --format mesh`` writes, by key.
 
     Args:
         surface: makes it, as the export does. views: the test views; those with a true depth count.
 
     Returns:
-        Shares in [0, 1]; nothing where no depth is known, or a library is missing. Where there is no surface to fuse,
-        all are 0.
+        Shares in [0, 1]; nothing where no depth is known. Where there is no surface to fuse, all are 0. Where a library
+        is missing, ``mesh_fscore_1_reason`` alone, which says so.
     """
     known = [view for view in views if view.ground_truth is not None and view.ground_truth.depth is not None]
-    if not known or not _libraries():
-        return {}
     if not any(bool(_known(view)[1].any()) for view in known):
         return {}
+    lacking = missing_package()
+    if lacking is not None:
+        return {"mesh_fscore_1_reason": lacking}
     try:
         made = surface()
     except NoSurfaceError:
         return {
             f"mesh_{name}_{end}": 0.0 for end in THRESHOLDS for name in ("accuracy", "completeness", "fscore")
         }
-    return surface_scores(made, known)
+    return {**surface_scores(made, known)}
+
+
+def missing_package() -> str | None:
+    """Which package that makes a mesh is not installed, and how to install it; None where all are."""
+    for module in EXPORT_PACKAGES["mesh"]:
+        try:
+            require_package(module, MESH_LABEL)
+        except PolarguideError as error:
+            return (
+                f"{error.expected} is not installed; {error.remedy[0].lower()}{error.remedy[1:].rstrip('.')}"
+            )
+    return None
 
 
 def surface_scores(surface: Surface, views: Sequence[View]) -> dict[str, float]:
@@ -158,13 +173,3 @@ def _distances(points: Points, others: Points, farthest: float) -> Points:
     if not len(others):
         return np.full(len(points), np.inf)
     return np.asarray(cKDTree(others).query(points, distance_upper_bound=farthest)[0], np.float64)
-
-
-def _libraries() -> bool:
-    """Whether the libraries that make a mesh are installed."""
-    try:
-        optional_import("skimage.measure", "a mesh")
-        optional_import("trimesh", "a mesh")
-    except PolarguideError:
-        return False
-    return True

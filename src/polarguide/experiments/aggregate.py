@@ -25,14 +25,7 @@ class PartScores(TypedDict):
     metrics: dict[str, float | None]
 
 
-class RunRecord(TypedDict):
-    """One training: what it was, the state of its work, and its scores.
-
-    ``metrics`` holds numbers or None by key, and is None unless the run is done; ``views`` holds the same for each test
-    view, ``objects`` for each object by name, ``materials`` for each class of material; the last two are empty where
-    the scene has no table of objects. ``folder`` is relative to that of the record.
-    """
-
+class _Run(TypedDict):
     scene: str
     recipe: str
     seed: Annotated[int, msgspec.Meta(ge=0)]
@@ -44,6 +37,18 @@ class RunRecord(TypedDict):
     views: dict[str, dict[str, float | None]]
     objects: dict[str, PartScores]
     materials: dict[str, PartScores]
+
+
+class RunRecord(_Run, total=False):
+    """One training: what it was, the state of its work, and its scores.
+
+    ``metrics`` holds numbers or None by key, and is None unless the run is done; ``views`` holds the same for each test
+    view, ``objects`` for each object by name, ``materials`` for each class of material; the last two are empty where
+    the scene has no table of objects. ``folder`` is relative to that of the record.
+    ``lpips_reason`` and ``mesh_reason`` say why these have no value; records of earlier versions lack the second.
+    """
+
+    mesh_reason: str | None
 
 
 class Cell(TypedDict):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
+from polarguide.evaluation.mesh import missing_package
 from polarguide.experiments.bench_options import BENCH, Bench, BenchOptions
 from polarguide.experiments.compare import compare, locked
 from polarguide.experiments.results import Results
@@ -58,6 +59,9 @@ def run_bench(
     for name in rows:  # hours of rendering should not end in a wrong name
         recipe_named(name)
     choose_backend(options.device)
+    lacking = missing_package() if rows else None
+    if lacking is not None:
+        reporter.warn(f"mesh scores will have no value: {lacking}")
     places = {name: Path(out) / SCENES / spec.name for name, spec in specs.items()}
     states = {name: _state(places[name], spec, bench) for name, spec in specs.items()}
     threads = options.jobs * options.threads

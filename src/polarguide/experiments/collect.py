@@ -105,7 +105,8 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
         "state": "done" if metrics is not None else "failed" if failure is not None else "missing",
         "error": None if metrics is not None else failure,
         "metrics": metrics,
-        "lpips_reason": record.get("lpips_reason") if record is not None else None,
+        "lpips_reason": (record or {}).get("lpips_reason"),
+        "mesh_reason": (record or {}).get("mesh_fscore_1_reason"),
         "views": {
             name: {m.key: scores[m.key] for m in COLUMNS if m.key in scores}
             for name, scores in record["views"].items()

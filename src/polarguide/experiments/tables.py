@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from polarguide.evaluation.table import COLUMNS, Metric
+from polarguide.evaluation.table import COLUMNS, MESH_LABEL, Metric
 from polarguide.experiments.aggregate import NO_VALUE, Cell, Row, RunRecord
 from polarguide.experiments.intervals import mean
 from polarguide.experiments.noise import known_scatter, training_noise
@@ -150,8 +150,10 @@ def notes(results: Results) -> list[str]:
         said.append(
             "Mean over scenes: over those where any recipe has a value of the column, with one weight each."
         )
-    reasons = {r["lpips_reason"]: 0 for r in results["runs"] if r["state"] == "done" and r["lpips_reason"]}
-    said += [f"LPIPS {NOT_APPLICABLE}: {reason}." for reason in reasons]
+    done = [run for run in results["runs"] if run["state"] == "done"]
+    absent = {f"LPIPS {NOT_APPLICABLE}: {run['lpips_reason']}.": 0 for run in done if run["lpips_reason"]}
+    absent |= {f"{MESH_LABEL} {NOT_APPLICABLE}: {why}.": 0 for run in done if (why := run.get("mesh_reason"))}
+    said += absent
     unfinished = [r for r in results["runs"] if r["state"] != "done"]
     for run in unfinished:
         what = "failed" if run["state"] == "failed" else "has not finished"
