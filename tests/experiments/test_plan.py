@@ -158,6 +158,6 @@ def test_ablations_by_name() -> None:
     with pytest.raises(PolarguideError, match="only: expected one of only-normals"):
         ablated("polarguide", ("without-luck",))
     with pytest.raises(
-        PolarguideError, match=r"base: expected a recipe with ablations: .*polarguide.*, found 3dgs"
+        PolarguideError, match=r"base: expected a recipe with ablations: .*polarguide.*, found ref-gs"
     ):
-        ablated("3dgs")
+        ablated("ref-gs")

@@ -48,7 +48,7 @@ def test_a_built_in_name_loads_no_plug_in(monkeypatch: pytest.MonkeyPatch, tmp_p
     module(monkeypatch, tmp_path, "idle", "ONE")
     assert recipe_named("polarguide") is RECIPES["polarguide"]
     assert ablations_of("polarguide") == ABLATIONS["polarguide"]
-    assert ablations_of("3dgs") == ()
+    assert ablations_of("ref-gs") == ()
     assert "plug_idle" not in sys.modules
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from polarguide.recipes.baselines import RECIPE_3DGS_DR
+from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import (
     RECIPE_POLARGUIDE,
     RECIPE_POLARGUIDE_PAPER,
@@ -80,6 +80,12 @@ def firm_to_the_end(base: Recipe) -> Recipe:
     return replace(base, stages=(*before, replace(final, weights=weights, rate_factors={})))
 
 
+def release_rates(**others: float) -> Change:
+    """The geometry learns as slowly as in the release of 3DGS; ``others``: more rates of it."""
+    slow = {"means": 1.6e-4, "log_scales": 5e-3, **others}
+    return lambda recipe: replace(recipe, rates={**recipe.rates, **slow}, means_decay=0.01)
+
+
 _NORMAL_TERMS_OFF = off("normal", "azimuth", "chromatic", "consistency")
 _POLARIZED_TERMS = ("normal", "azimuth", "chromatic", "stokes", "specular", "diffuse")
 _UNPOLARIZED = (
@@ -129,8 +135,22 @@ _COMMON = (
         "The terms on directions are averaged over what is polarized, however few pixels that are.",
         priors(azimuth_share=0.0, chromatic_share=0.0),
     ),
+    (
+        "release-rates",
+        "Means and scales learn as slowly as in the release of 3DGS, which takes 30,000 steps.",
+        release_rates(),
+    ),
     _UNPOLARIZED,
     _UNPOLARIZED_INCONSISTENT,
+)
+
+ABLATIONS_3DGS = varied(
+    RECIPE_3DGS,
+    (
+        "release-rates",
+        "The geometry learns as slowly as in the release, which takes 30,000 steps.",
+        release_rates(quaternions=1e-3),
+    ),
 )
 
 ABLATIONS_3DGS_DR = varied(

@@ -84,7 +84,9 @@ RECIPE_POLARGUIDE: Recipe = replace(
     ),
 )
 
-SHADING_STOKES = replace(SHADING_3DGS_DR, blend="fresnel", local=True, first_strength=0.5, metal=True)
+SHADING_STOKES = replace(
+    SHADING_3DGS_DR, blend="fresnel", local=True, local_rate=5e-3, first_strength=0.5, metal=True
+)
 
 RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     RECIPE_POLARGUIDE,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from polarguide.recipes.baselines import RATES_3DGS, RESET
+from polarguide.recipes.baselines import RATES, RESET
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe, Stage, Weights
 
@@ -15,10 +15,7 @@ RECIPE_REF_GS = Recipe(
         Stage("densify", 0.5, reflection=True, weights=WEIGHTS, densify=True, repeats=(RESET,)),
         Stage("refine", 0.5, reflection=True, weights=WEIGHTS),
     ),
-    rates={
-        **RATES_3DGS,
-        "quaternions": 1e-2,
-    },
+    rates=RATES,
     shading=DirectionalShading(
         width=64, environment_spread=0.5, environment_rate=1e-2, environment_resolution=32
     ),

@@ -12,6 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from polarguide.errors import PolarguideError
 from polarguide.recipes.ablations import (
+    ABLATIONS_3DGS,
     ABLATIONS_3DGS_DR,
     ABLATIONS_PAPER,
     ABLATIONS_POLARGUIDE,
@@ -40,6 +41,7 @@ RECIPES: dict[str, Method] = {
 """The built-in recipes."""
 
 ABLATIONS: dict[str, tuple[Method, ...]] = {
+    "3dgs": ABLATIONS_3DGS,
     "3dgs-dr": ABLATIONS_3DGS_DR,
     "polarguide-paper": ABLATIONS_PAPER,
     "polarguide": ABLATIONS_POLARGUIDE,

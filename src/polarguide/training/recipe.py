@@ -257,7 +257,7 @@ class Recipe(Method):
     stages: tuple[Stage, ...]
     rates: Mapping[str, float]
     shading: ShadingModel = PLAIN
-    means_decay: float = 0.01
+    means_decay: float = 0.1
     oriented: bool = False
     metals: tuple[float, float] = (0.4, 0.72)
     coarse: Coarse = field(default_factory=Coarse)
