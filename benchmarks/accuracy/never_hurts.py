@@ -197,7 +197,8 @@ def main() -> None:
     print("| over | PSNR (dB) | foreground (dB) | normals | specular (dB) | diffuse (dB) |")
     print("|---|---:|---:|---:|---:|---:|")
     for other in (*options.against, *controls):
-        print(mean_gains(scenes, recipe, other))
+        if any(other in rows for rows in scenes.values()):
+            print(mean_gains(scenes, recipe, other))
     print()
     for scene, rows in scenes.items():
         for line in bad_views(scene, rows, recipe):
