@@ -11,7 +11,7 @@ from rich.console import Console
 
 from polarguide.cli.app import run
 from polarguide.cli.console import say, size_text
-from polarguide.cli.evaluate import _errors, _without_value
+from polarguide.cli.evaluate import _errors, _table, _without_value
 from polarguide.evaluation.table import METRICS, OBJECT_METRICS, shown_metrics
 from polarguide.printable import printable
 
@@ -51,6 +51,14 @@ def test_what_has_no_value_is_named_once() -> None:
     record["mesh_fscore_1_reason"] = "skimage is not installed"
     assert _without_value(record) == ["no ground truth, or no such layer, for: normal error"]
     assert dict(shown_metrics(record))["mesh F-score 1 %"] == "n/a (skimage is not installed)"
+
+
+def test_a_reason_keeps_its_brackets() -> None:
+    record = {metric.key: 1.0 for metric in METRICS} | {"mesh_fscore_1": None}
+    record["mesh_fscore_1_reason"] = "pip install 'polarguide[export]'"
+    shown = Console(file=io.StringIO(), width=400)
+    shown.print(_table(record, "scores"))
+    assert "n/a (pip install 'polarguide[export]')" in shown.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_lines_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,5 +89,5 @@ def _table(record: dict[str, Any], title: str) -> Table:
     table.add_column("metric")
     table.add_column("value", justify="right")
     for label, text in importlib.import_module("polarguide.evaluation.table").shown_metrics(record):
-        table.add_row(label, text)
+        table.add_row(label, Text(text))
     return table
