@@ -256,6 +256,20 @@ def test_rendered_scenes_do_not_need_mitsuba(
     assert len(compared) == 1
 
 
+def test_that_meshes_will_have_no_score_is_said_at_once(
+    rendered: Path,
+    bench: Bench,
+    compared: list[tuple[tuple[Any, ...], dict[str, Any]]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for lacking, times in ((None, 0), ("skimage is not installed", 1)):
+        monkeypatch.setattr(benches, "missing_package", lambda lacking=lacking: lacking)
+        heard = Heard()
+        run_bench(rendered, BenchOptions(jobs=1), bench=bench, reporter=heard)
+        assert heard.said.count("mesh scores will have no value: skimage is not installed") == times
+    assert len(compared) == 2
+
+
 def test_an_unknown_row_is_refused_before_rendering(bench: Bench, tmp_path: Path) -> None:
     with pytest.raises(PolarguideError, match="magic"):
         run_bench(tmp_path / "out", BenchOptions(), bench=dataclasses.replace(bench, rows={"magic": 1}))

@@ -3,28 +3,16 @@
 from collections.abc import Iterator
 
 import pytest
+from instruction_sets import instruction_sets, selected
 
 from polarguide import _native
 
 
-def _available() -> list[str]:
-    names = []
-    for name in ("baseline", "avx2", "avx512"):
-        try:
-            _native.select_simd(name)
-        except ValueError:
-            continue
-        names.append(name)
-    _native.select_simd("auto")
-    return names
-
-
-@pytest.fixture(params=_available())
+@pytest.fixture(params=instruction_sets())
 def simd(request: pytest.FixtureRequest) -> Iterator[str]:
     """The instruction set in use during the test."""
-    _native.select_simd(request.param)
-    yield request.param
-    _native.select_simd("auto")
+    with selected(request.param) as name:
+        yield name
 
 
 @pytest.fixture(autouse=True)

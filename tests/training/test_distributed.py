@@ -77,9 +77,9 @@ def test_other_shares_agree_up_to_summation_order(
     assert {n: t.shape for n, t in first.items()} == {n: t.shape for n, t in expected.items()}
     for name in ("gaussians.means", "gaussians.sh_dc", "gaussians.log_scales", "gaussians.opacity_logits"):
         # Adam's first steps have the size of the rate, whatever the gradient: where one rounds to the other side of
-        # zero the row goes the other way. There are a few dozen rows.
-        close = torch.isclose(first[name], expected[name], rtol=2e-3, atol=2e-4).float().mean()
-        assert close > 0.75, (name, float(close))
+        # zero the row goes the other way.
+        close = torch.isclose(first[name], expected[name], rtol=1e-3, atol=1e-4).float().mean()
+        assert close > 0.9, (name, float(close))
 
 
 def test_several_views_a_step_are_resumed_bit_by_bit(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ FINEST = 6
 Points = NDArray[np.float64]
 
 
-def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> dict[str, float | str]:
+def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> Mapping[str, float | str]:
     """The scores of the mesh that ``polarguide export --format mesh`` writes, by key.
 
     Args:
@@ -55,7 +55,7 @@ def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> dict[s
         return {
             f"mesh_{name}_{end}": 0.0 for end in THRESHOLDS for name in ("accuracy", "completeness", "fscore")
         }
-    return {**surface_scores(made, known)}
+    return surface_scores(made, known)
 
 
 def missing_package() -> str | None:

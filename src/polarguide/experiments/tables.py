@@ -151,9 +151,11 @@ def notes(results: Results) -> list[str]:
             "Mean over scenes: over those where any recipe has a value of the column, with one weight each."
         )
     done = [run for run in results["runs"] if run["state"] == "done"]
-    absent = {f"LPIPS {NOT_APPLICABLE}: {run['lpips_reason']}.": 0 for run in done if run["lpips_reason"]}
-    absent |= {f"{MESH_LABEL} {NOT_APPLICABLE}: {why}.": 0 for run in done if (why := run.get("mesh_reason"))}
-    said += absent
+    for label, reasons in (
+        ("LPIPS", (run["lpips_reason"] for run in done)),
+        (MESH_LABEL, (run.get("mesh_reason") for run in done)),
+    ):
+        said += [f"{label} {NOT_APPLICABLE}: {reason}." for reason in dict.fromkeys(reasons) if reason]
     unfinished = [r for r in results["runs"] if r["state"] != "done"]
     for run in unfinished:
         what = "failed" if run["state"] == "failed" else "has not finished"
