@@ -23,6 +23,7 @@ import torch
 import polarguide as pg
 from polarguide.evaluation.record import read_metrics
 from polarguide.recipes import recipe_named
+from polarguide.recipes.baselines import RESET
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe, Stage, Weights
@@ -57,6 +58,12 @@ def priors(recipe: Recipe, **values: Any) -> Recipe:
 
 def staged(recipe: Recipe, **values: Any) -> Recipe:
     return replace(recipe, stages=tuple(replace(stage, **values) for stage in recipe.stages))
+
+
+def resets(recipe: Recipe) -> Recipe:
+    """Opacity is reset where the density is controlled."""
+    stages = (replace(stage, repeats=(RESET,)) if stage.densify else stage for stage in recipe.stages)
+    return replace(recipe, stages=tuple(stages))
 
 
 def weighted(recipe: Recipe, **values: Any) -> Recipe:
@@ -145,13 +152,16 @@ def _of_ref_gs(base: Recipe) -> dict[str, Recipe]:
     return {
         "MLP of width 128": shaded(base, width=128),
         "of width 32": shaded(base, width=32),
-        "MLP learns three times as fast": shaded(base, mlp_rate=1.5e-3),
-        "albedo three times as fast": shaded(base, albedo_rate=3e-3),
-        "features three times as fast": shaded(base, feature_rate=6e-3),
+        "MLP learns three times as fast": shaded(base, mlp_rate=4.5e-3),
+        "MLP a third as fast": shaded(base, mlp_rate=5e-4),
+        "albedo three times as fast": shaded(base, albedo_rate=9e-3),
+        "albedo a third as fast": shaded(base, albedo_rate=1e-3),
+        "features three times as fast": shaded(base, feature_rate=1.8e-2),
+        "features a third as fast": shaded(base, feature_rate=2e-3),
         "grid of 64 texels": shaded(base, environment_resolution=64),
         "of 16 texels": shaded(base, environment_resolution=16),
         "consistency 0.1, flatness 0.3": staged(base, weights=Weights(consistency=0.1, flatness=0.3)),
-        "no resets": staged(base, repeats=()),
+        "resets as 3dgs has them": resets(base),
         "density control at half the gradient": densify(base, gradient=1e-4),
     }
 
@@ -173,6 +183,9 @@ def _of_paper_kind(base: Recipe) -> dict[str, Recipe]:
         "flatness 0.1": with_geometry(base, flatness=0.1, consistency=0.0),
         "flatness 0.1, consistency 0.05": with_geometry(base, flatness=0.1, consistency=0.05),
         "first strength 0.5": shaded(base, first_strength=0.5),
+        "strength learns twice as fast": shaded(base, strength_rate=1.2e-2),
+        "environment of 16 texels": shaded(base, environment_resolution=16),
+        "density control at half the gradient": densify(base, gradient=1e-4),
     }
 
 

@@ -24,6 +24,7 @@ from polarguide.api import Run, open_run
 from polarguide.camera import Camera
 from polarguide.raster import use_threads
 from polarguide.shading.gbuffer import render
+from polarguide.system import keep_freed_memory
 
 ROUNDS = 7
 
@@ -93,6 +94,7 @@ def main() -> None:
     arguments = parser.parse_args()
     size = tuple(int(side) for side in arguments.size.split("x")) if arguments.size else None
     assert size is None or len(size) == 2
+    keep_freed_memory()  # as the command line does
     print(f"{_native.simd()}\n")
     print(
         "| run | recipe | threads | size | Gaussians | color ms | layers ms | with depth ms | of the surface ms "
