@@ -12,6 +12,9 @@ constexpr float blur = 0.1f; // px^2, added to the projected covariance
 constexpr float natural = 0.693147181f;
 constexpr float minimum_opacity = 1.0f / 255.0f;
 
+alignas(64) const float lane_tile[16] = {0, 16, 32, 48, 64, 80, 96, 112, 128, 144, 160, 176, 192, 208, 224, 240};
+static_assert(tile_size == 16, "lane_tile says where the next tiles begin");
+
 // All that the forward and the backward projection share, of as many Gaussians as a register has lanes. What a culled
 // one's lane holds has no meaning.
 struct Projection {
@@ -135,22 +138,25 @@ void project(const ProjectArgs &p, int64_t begin, int64_t end) {
 }
 
 void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
+    constexpr float side = tile_size - 1; // between the outermost pixel centers
     for (int64_t g = begin; g < end; ++g) {
         const int32_t *box = args.box + 4 * g;
         int32_t *out = args.tiles + args.offset[g], n = 0;
         const float *s = args.screen + g * screen_values;
-        for (int ty = box[2]; ty < box[3]; ++ty)
-            for (int tx = box[0]; tx < box[1]; ++tx) {
-                // The largest exponent over the tile's pixel centers: on one of the two sides facing the center.
-                const float x0 = float(tx * tile_size) + 0.5f - s[0], x1 = x0 + (tile_size - 1);
-                const float y0 = float(ty * tile_size) + 0.5f - s[1], y1 = y0 + (tile_size - 1);
-                const float cx = x0 > 0 ? x0 : x1 < 0 ? x1 : 0, cy = y0 > 0 ? y0 : y1 < 0 ? y1 : 0;
-                float ey = -0.5f * s[3] * cx / s[4], ex = -0.5f * s[3] * cy / s[2];
-                ey = ey < y0 ? y0 : ey > y1 ? y1 : ey, ex = ex < x0 ? x0 : ex > x1 ? x1 : ex;
-                const float q1 = s[2] * cx * cx + s[3] * cx * ey + s[4] * ey * ey;
-                const float q2 = s[2] * ex * ex + s[3] * ex * cy + s[4] * cy * cy;
-                if ((q1 > q2 ? q1 : q2) + s[5] >= -7.9945f) out[n++] = ty * args.tiles_x + tx;
+        const float to_y = -0.5f * s[3] / s[4], to_x = -0.5f * s[3] / s[2];
+        for (int ty = box[2]; ty < box[3]; ++ty) {
+            // The largest exponent over a tile's pixel centers: on one of the two sides facing the center.
+            const reg y0 = reg_splat(float(ty * tile_size) + 0.5f - s[1]), y1 = y0 + side, cy = clamp(reg{}, y0, y1);
+            for (int tx = box[0]; tx < box[1]; tx += reg_lanes) {
+                const reg x0 = reg_load(lane_tile) + (float(tx * tile_size) + 0.5f - s[0]), x1 = x0 + side;
+                const reg cx = clamp(reg{}, x0, x1), ey = clamp(cx * to_y, y0, y1), ex = clamp(cy * to_x, x0, x1);
+                const reg q1 = s[2] * cx * cx + s[3] * cx * ey + s[4] * ey * ey;
+                const reg q2 = s[2] * ex * ex + s[3] * ex * cy + s[4] * cy * cy;
+                uint32_t touched = bits(max(q1, q2) + s[5] >= -7.9945f);
+                if (box[1] - tx < reg_lanes) touched &= (1u << (box[1] - tx)) - 1;
+                for (; touched; touched &= touched - 1) out[n++] = ty * args.tiles_x + tx + __builtin_ctz(touched);
             }
+        }
         args.touched[g] = n;
     }
 }

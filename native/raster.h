@@ -80,7 +80,8 @@ struct ProjectBackwardArgs {
 // Scratch of one worker, sized for the longest tile list.
 struct RasterScratch {
     float *rows;      // [n, channels + 6] Gaussians of the tile, where they are not kept
-    int32_t *lists;   // [16, n]
+    uint16_t *blocks; // [n] which blocks they touch, likewise
+    int32_t *list;    // [n] those that touch one block
     float *moments;   // [n, channels + 9], or [n, 16]
 };
 

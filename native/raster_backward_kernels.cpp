@@ -120,7 +120,7 @@ __attribute__((noinline)) void flush(Batch &batch, const BlockGradients<D> &grad
 enum { statistic_none = 0, statistic_three = 3, statistic_any = -1 };
 
 template <int D, int S>
-POLARGUIDE_INLINE void backward_block(const RasterArgs &a, const Tile &t, int block, const Block &b, const RasterScratch &s) {
+POLARGUIDE_INLINE void backward_block(const RasterArgs &a, const Tile &t, int count, const Block &b, const RasterScratch &s) {
     constexpr int parts = lanes / reg_lanes; // of a block's pixels
     BlockGradients<D> gradients;
     load_gradients<D>(a, b, &gradients);
@@ -132,9 +132,8 @@ POLARGUIDE_INLINE void backward_block(const RasterArgs &a, const Tile &t, int bl
         remaining_statistic[p] = reg_load(gradients.remaining_statistic + p * reg_lanes);
     }
     Batch batch;
-    const int32_t *list = s.lists + int64_t(block) * t.count;
-    for (int i = 0, n = t.list_sizes[block]; i < n; ++i) {
-        const float *row = t.rows + int64_t(list[i]) * (D + 6);
+    for (int i = 0; i < count; ++i) {
+        const float *row = t.rows + int64_t(s.list[i]) * (D + 6);
         bool going = false;
         for (int p = 0; p < parts; ++p) {
             const int l = p * reg_lanes;
@@ -160,10 +159,10 @@ POLARGUIDE_INLINE void backward_block(const RasterArgs &a, const Tile &t, int bl
                 reg_store(batch.statistic[batch.size] + l,
                           (live[p] * dot_statistic - remaining_statistic[p] * inverse) * factor);
             }
-            live[p] = go ? next : reg{};
+            live[p] = next; // never rises again where a pixel has ended
             going |= any(go);
         }
-        batch.local[batch.size++] = list[i];
+        batch.local[batch.size++] = s.list[i];
         if (batch.size == 16) flush<D, S != 0>(batch, gradients, b.center_x, b.center_y, s.moments);
         if (!going) break;
     }
@@ -171,12 +170,14 @@ POLARGUIDE_INLINE void backward_block(const RasterArgs &a, const Tile &t, int bl
 }
 
 template <int D, int S> void backward_tile(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
-    const Tile t = reopen_tile<D>(a, tile, s);
+    const Tile t = reopen_tile<D>(a, tile);
     constexpr int stride = D + 9, out_stride = D + instance_extra, ahead = 8;
     for (int64_t i = 0; i < int64_t(t.count) * stride; ++i) s.moments[i] = 0.0f;
     for (int block = 0; block < 16; ++block) {
         Block b;
-        if (t.list_sizes[block] && open_block(a, t, block, &b)) backward_block<D, S>(a, t, block, b, s);
+        if (!open_block(a, t, block, &b)) continue;
+        const int count = positions_of_bit(t.blocks, t.count, block, s.list);
+        if (count) backward_block<D, S>(a, t, count, b, s);
     }
     int64_t begin = a.tile_begin[tile];
     for (int i = 0; i < t.count; ++i) {

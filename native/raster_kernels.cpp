@@ -12,14 +12,14 @@ template <int D> void forward_tile(const RasterArgs &a, int64_t tile, const Rast
     for (int block = 0; block < 16; ++block) {
         Block b;
         if (!open_block(a, t, block, &b)) continue;
-        const int32_t *list = s.lists + int64_t(block) * t.count;
+        const int n = positions_of_bit(t.blocks, t.count, block, s.list);
         alignas(64) float values[D + 1][16];
         for (int l = 0; l < lanes; l += reg_lanes) {
             const Pixels pixels = pixels_from(b, l);
             reg acc[D] = {};
-            reg live = reg_splat(1.0f), final = live; // transmittance; `live` turns 0 where a pixel has ended
-            for (int i = 0, n = t.list_sizes[block]; i < n; ++i) {
-                const float *row = t.rows + int64_t(list[i]) * (D + 6);
+            reg live = reg_splat(1.0f), final = live; // transmittance; `live` never rises again where a pixel has ended
+            for (int i = 0; i < n; ++i) {
+                const float *row = t.rows + int64_t(s.list[i]) * (D + 6);
                 const Alpha at = alpha_at(row, pixels);
                 const reg next = live - live * at.value;
                 const ireg go = next >= minimum_transmittance;
@@ -27,7 +27,7 @@ template <int D> void forward_tile(const RasterArgs &a, int64_t tile, const Rast
                 for (int k = 0; k < D; ++k) acc[k] += weight * row[6 + k];
                 if (__builtin_expect(a.pairs != nullptr, 0)) pairs += __builtin_popcount(bits(weight > 0.0f));
                 final = go ? next : final;
-                live = go ? next : reg{};
+                live = next;
                 if (!any(go)) break;
             }
             for (int k = 0; k < D; ++k) reg_store(values[k] + l, acc[k]);

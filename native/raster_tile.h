@@ -35,36 +35,28 @@ POLARGUIDE_INLINE uint32_t touched_blocks(const float *row) {
 }
 
 struct Tile {
-    const float *rows; // [count, channels + 6]
+    const float *rows;      // [count, channels + 6]
+    const uint16_t *blocks; // [count] which of the tile's blocks each touches
     int count;
     int x0, y0;
     float center_x, center_y;
-    int list_sizes[16];
 };
 
-POLARGUIDE_INLINE Tile open_tile(const RasterArgs &a, int64_t tile, const float *rows) {
+POLARGUIDE_INLINE Tile open_tile(const RasterArgs &a, int64_t tile, const float *rows, const uint16_t *blocks) {
     Tile t;
-    t.rows = rows;
+    t.rows = rows, t.blocks = blocks;
     t.count = int(a.tile_begin[tile + 1] - a.tile_begin[tile]);
     t.x0 = int(tile % a.tiles_x) * tile_size, t.y0 = int(tile / a.tiles_x) * tile_size;
     t.center_x = float(t.x0) + 8.0f, t.center_y = float(t.y0) + 8.0f;
-    for (int &size : t.list_sizes) size = 0;
     return t;
 }
 
-// Adds Gaussian `i` of the tile to the lists of the blocks that it touches.
-POLARGUIDE_INLINE void list_in_blocks(uint32_t blocks, int i, int32_t *lists, Tile *t) {
-    for (; blocks; blocks &= blocks - 1) {
-        const int block = __builtin_ctz(blocks);
-        lists[int64_t(block) * t->count + t->list_sizes[block]++] = i;
-    }
-}
-
-// Gathers the tile's Gaussians into contiguous rows and sorts them into one list per block.
+// Gathers the tile's Gaussians into contiguous rows and finds the blocks that they touch.
 template <int D> POLARGUIDE_INLINE Tile gather_tile(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
     const int64_t begin = a.tile_begin[tile];
     float *rows = a.rows ? a.rows + begin * (D + 6) : s.rows;
-    Tile t = open_tile(a, tile, rows);
+    uint16_t *blocks = a.blocks ? a.blocks + begin : s.blocks;
+    const Tile t = open_tile(a, tile, rows, blocks);
     const int real = a.channels_real;
     constexpr int ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
     for (int i = 0; i < t.count; ++i) {
@@ -81,19 +73,15 @@ template <int D> POLARGUIDE_INLINE Tile gather_tile(const RasterArgs &a, int64_t
         for (int k = 2; k < 6; ++k) row[k] = screen[k];
         for (int k = 0; k < real; ++k) row[6 + k] = features[a.permutation[k]];
         for (int k = real; k < D; ++k) row[6 + k] = 0.0f;
-        const uint32_t blocks = touched_blocks(row);
-        if (a.blocks) a.blocks[begin + i] = uint16_t(blocks);
-        list_in_blocks(blocks, i, s.lists, &t);
+        blocks[i] = uint16_t(touched_blocks(row));
     }
     return t;
 }
 
 // The same tile again in the backward pass, from what the forward pass kept.
-template <int D> POLARGUIDE_INLINE Tile reopen_tile(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
+template <int D> POLARGUIDE_INLINE Tile reopen_tile(const RasterArgs &a, int64_t tile) {
     const int64_t begin = a.tile_begin[tile];
-    Tile t = open_tile(a, tile, a.rows + begin * (D + 6));
-    for (int i = 0; i < t.count; ++i) list_in_blocks(a.blocks[begin + i], i, s.lists, &t);
-    return t;
+    return open_tile(a, tile, a.rows + begin * (D + 6), a.blocks + begin);
 }
 
 struct Block {
@@ -123,7 +111,7 @@ POLARGUIDE_INLINE Alpha alpha_at(const float *row, const Pixels &p) {
     Alpha r;
     const reg dx = p.x - row[0], dy = p.y - row[1];
     const reg e = (dx * row[2] + dy * row[3]) * dx + (dy * row[4]) * dy + row[5];
-    const reg alpha = exp2(max(e, reg_splat(-30.0f)));
+    const reg alpha = exp2(e); // of no meaning far below the threshold, and not used there
     r.capped = alpha > maximum_alpha;
     r.value = e >= log2_minimum ? min(alpha, reg_splat(maximum_alpha)) : reg{};
     return r;

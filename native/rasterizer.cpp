@@ -67,39 +67,65 @@ void Rasterizer::bin(int64_t count) {
     auto emit = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(emit_tiles)(args, b, e); };
     parallel_chunks(count, gaussian_chunk, emit);
 
-    const int64_t tile_count = int64_t(tiles_x_) * tiles_y_;
-    instance_begin_.resize(count + 1), tile_begin_.resize(tile_count + 1);
-    int64_t *first = instance_begin_.get(), *tile_begin = tile_begin_.get();
-    std::fill(tile_begin, tile_begin + tile_count + 1, 0);
+    instance_begin_.resize(count + 1);
+    int64_t *first = instance_begin_.get();
     first[0] = 0;
-    for (int64_t g = 0; g < count; ++g) {
-        const int32_t *t = tiles.get() + offset[size_t(g)], n = touched.get()[g];
-        first[g + 1] = first[g] + n;
-        for (int32_t i = 0; i < n; ++i) ++tile_begin[t[i] + 1];
-    }
-    longest_ = 0;
-    for (int64_t t = 0; t < tile_count; ++t) {
-        longest_ = std::max(longest_, tile_begin[t + 1]);
-        tile_begin[t + 1] += tile_begin[t];
-    }
+    for (int64_t g = 0; g < count; ++g) first[g + 1] = first[g] + touched.get()[g];
     instance_count_ = first[count];
     gaussians_.resize(instance_count_), instances_.resize(instance_count_);
-    std::vector<int64_t> next(tile_begin, tile_begin + tile_count);
-    const std::vector<int32_t> order = depth_order(depth_.get(), touched.get(), count);
-    constexpr size_t ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
-    for (size_t k = 0; k < order.size(); ++k) {
-        if (k + 2 * ahead < order.size()) {
-            const size_t later = size_t(order[k + 2 * ahead]);
-            __builtin_prefetch(&offset[later]), __builtin_prefetch(touched.get() + later), __builtin_prefetch(first + later);
+    sort_into_tiles(depth_order(depth_.get(), touched.get(), count), tiles.get(), offset.data(), touched.get());
+}
+
+void Rasterizer::sort_into_tiles(const std::vector<int32_t> &order, const int32_t *tiles, const int64_t *offset,
+                                 const int32_t *touched) {
+    // The order is cut into parts, one a thread. What a part has in a tile comes behind what the parts before it have
+    // there, so that the result is the same for any number of them.
+    const int64_t tile_count = int64_t(tiles_x_) * tiles_y_, parts = thread_count();
+    const int64_t length = (int64_t(order.size()) + parts - 1) / parts;
+    std::vector<int64_t> next(size_t(parts * tile_count), 0); // first how many, then where the next goes
+    const int64_t *first = instance_begin_.get();
+    auto each = [&](int64_t part, auto &&body) { // body(Gaussian, the tiles it touches, how many)
+        constexpr int64_t ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
+        const int64_t end = std::min(int64_t(order.size()), (part + 1) * length);
+        for (int64_t k = part * length; k < end; ++k) {
+            if (k + 2 * ahead < end) {
+                const int32_t later = order[size_t(k + 2 * ahead)];
+                __builtin_prefetch(offset + later), __builtin_prefetch(touched + later), __builtin_prefetch(first + later);
+            }
+            if (k + ahead < end) __builtin_prefetch(tiles + offset[order[size_t(k + ahead)]]);
+            const int32_t g = order[size_t(k)];
+            body(g, tiles + offset[g], touched[g]);
         }
-        if (k + ahead < order.size()) __builtin_prefetch(tiles.get() + offset[size_t(order[k + ahead])]);
-        const int32_t g = order[k];
-        const int32_t *t = tiles.get() + offset[size_t(g)], n = touched.get()[g];
-        for (int32_t i = 0; i < n; ++i) {
-            int64_t slot = next[size_t(t[i])]++;
-            gaussians_.get()[slot] = g, instances_.get()[slot] = first[g] + i;
+    };
+    auto count = [&](int64_t part, int64_t, int) {
+        int64_t *here = next.data() + part * tile_count;
+        each(part, [&](int32_t, const int32_t *t, int32_t n) {
+            for (int32_t i = 0; i < n; ++i) ++here[t[i]];
+        });
+    };
+    parallel_chunks(parts, 1, count);
+    tile_begin_.resize(tile_count + 1);
+    int64_t sum = 0;
+    longest_ = 0;
+    for (int64_t t = 0; t < tile_count; ++t) {
+        tile_begin_.get()[t] = sum;
+        for (int64_t part = 0; part < parts; ++part) {
+            const int64_t n = next[size_t(part * tile_count + t)];
+            next[size_t(part * tile_count + t)] = sum, sum += n;
         }
+        longest_ = std::max(longest_, sum - tile_begin_.get()[t]);
     }
+    tile_begin_.get()[tile_count] = sum;
+    auto place = [&](int64_t part, int64_t, int) {
+        int64_t *here = next.data() + part * tile_count;
+        each(part, [&](int32_t g, const int32_t *t, int32_t n) {
+            for (int32_t i = 0; i < n; ++i) {
+                const int64_t slot = here[t[i]]++;
+                gaussians_.get()[slot] = g, instances_.get()[slot] = first[g] + i;
+            }
+        });
+    };
+    parallel_chunks(parts, 1, place);
 }
 
 RasterArgs Rasterizer::raster_args(const GaussianInputs &in) const {
@@ -118,16 +144,17 @@ template <class F> void Rasterizer::for_tiles(F &&body) {
     // Each worker gets its own scratch, allocated when it sees its first tile.
     struct Worker {
         Buffer<float> rows, moments;
-        Buffer<int32_t> lists;
+        Buffer<uint16_t> blocks;
+        Buffer<int32_t> list;
         RasterScratch scratch{};
     };
     std::vector<Worker> workers(static_cast<size_t>(thread_count()));
     auto run = [&](int64_t begin, int64_t end, int worker) {
         Worker &w = workers[size_t(worker)];
         if (!w.scratch.rows) {
-            w.rows.resize(longest_ * (channels_ + 6) + 16), w.lists.resize(longest_ * 16 + 16);
+            w.rows.resize(longest_ * (channels_ + 6) + 16), w.blocks.resize(longest_ + 16), w.list.resize(longest_ + 16);
             w.moments.resize(longest_ * std::max(channels_ + 9, 16) + 32);
-            w.scratch = {w.rows.get(), w.lists.get(), w.moments.get()};
+            w.scratch = {w.rows.get(), w.blocks.get(), w.list.get(), w.moments.get()};
         }
         for (int64_t tile = begin; tile < end; ++tile) body(tile, w.scratch);
     };
@@ -148,7 +175,7 @@ void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, flo
     transmittance_.resize(int64_t(camera_.width) * camera_.height);
     project(in, radius);
     kept_ = for_backward;
-    if (kept_) rows_.resize(instance_count_ * (channels_ + 6) + 16), blocks_.resize(instance_count_);
+    if (kept_) rows_.resize(instance_count_ * (channels_ + 6) + 16), blocks_.resize(instance_count_ + 16);
     RasterArgs args = raster_args(in);
     args.out = out, args.alpha = alpha;
     std::vector<int64_t> pairs;

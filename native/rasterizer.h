@@ -46,6 +46,9 @@ class Rasterizer {
   private:
     void project(const GaussianInputs &in, float *radius);
     void bin(int64_t count);
+    // From the visible Gaussians in order of depth, and the tiles that each touches, to each tile's list of them.
+    void sort_into_tiles(const std::vector<int32_t> &order, const int32_t *tiles, const int64_t *offset,
+                         const int32_t *touched);
     RasterArgs raster_args(const GaussianInputs &in) const;
     template <class F> void for_tiles(F &&body);
 

@@ -65,6 +65,17 @@ POLARGUIDE_INLINE uint32_t bits(ireg mask) {
     return result;
 #endif
 }
+// The same as of the templates above, NaN included: GCC would compare and select.
+#if defined(__AVX512F__)
+POLARGUIDE_INLINE reg min(reg a, reg b) { return _mm512_min_ps(a, b); }
+POLARGUIDE_INLINE reg max(reg a, reg b) { return _mm512_max_ps(a, b); }
+#elif defined(__AVX2__)
+POLARGUIDE_INLINE reg min(reg a, reg b) { return _mm256_min_ps(a, b); }
+POLARGUIDE_INLINE reg max(reg a, reg b) { return _mm256_max_ps(a, b); }
+#elif defined(__SSE2__)
+POLARGUIDE_INLINE reg min(reg a, reg b) { return _mm_min_ps(a, b); }
+POLARGUIDE_INLINE reg max(reg a, reg b) { return _mm_max_ps(a, b); }
+#endif
 POLARGUIDE_INLINE bool any(ireg mask) {
 #if defined(__SSE2__)
     return bits(mask) != 0;
@@ -73,6 +84,25 @@ POLARGUIDE_INLINE bool any(ireg mask) {
     const v2l halves = reinterpret_cast<const v2l &>(mask);
     return (halves[0] | halves[1]) != 0;
 #endif
+}
+
+// Where a bit is set in `count` words, in order, and how many they are. Both arrays have room for a whole vector at the end.
+POLARGUIDE_INLINE int positions_of_bit(const uint16_t *words, int count, int bit, int32_t *positions) {
+    int found = 0;
+#if defined(__AVX512F__)
+    const __m512i wanted = _mm512_set1_epi32(1 << bit);
+    __m512i position = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    for (int i = 0; i < count; i += 16, position = _mm512_add_epi32(position, _mm512_set1_epi32(16))) {
+        const __m256i some = _mm256_loadu_si256(reinterpret_cast<const __m256i *>(words + i));
+        const __mmask16 counted = count - i < 16 ? __mmask16((1u << (count - i)) - 1) : __mmask16(0xffff);
+        const __mmask16 set = _mm512_mask_test_epi32_mask(counted, _mm512_cvtepu16_epi32(some), wanted);
+        _mm512_storeu_si512(positions + found, _mm512_maskz_compress_epi32(set, position));
+        found += __builtin_popcount(set);
+    }
+#else
+    for (int i = 0; i < count; ++i) positions[found] = i, found += words[i] >> bit & 1; // no branch to guess wrong
+#endif
+    return found;
 }
 
 template <class V> POLARGUIDE_INLINE V square_root(V x) {

@@ -18,7 +18,7 @@ POLARGUIDE_INLINE int blended_weights(const Tile &t, const int32_t *list, int co
         const reg weight = go ? live * at.value : reg{};
         reg_store(weights + int64_t(i) * reg_lanes, weight);
         sum += weight;
-        live = go ? next : reg{};
+        live = next; // never rises again
         if (!any(go)) {
             count = i + 1;
             break;
@@ -50,11 +50,12 @@ void raster_surface(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
     for (int block = 0; block < 16; ++block) {
         Block b;
         if (!open_block(a, t, block, &b)) continue;
-        const int32_t *list = s.lists + int64_t(block) * t.count;
+        const int32_t *list = s.list;
+        const int listed = positions_of_bit(t.blocks, t.count, block, s.list);
         alignas(64) float values[surface_channels][16];
         for (int l = 0; l < lanes; l += reg_lanes) {
             reg total, acc[surface_channels] = {}, sum = reg{};
-            const int count = blended_weights(t, list, t.list_sizes[block], pixels_from(b, l), weights, &total);
+            const int count = blended_weights(t, list, listed, pixels_from(b, l), weights, &total);
             const reg median = median_depth(t, list, count, weights, total);
             for (int i = 0; i < count; ++i) {
                 const float *row = t.rows + int64_t(list[i]) * (surface_channels + 6);
