@@ -24,7 +24,7 @@ from polarguide.training.trainer import Trainer, TrainSettings
 from tests.helpers.glossy_ball import ball, camera_at
 
 METALS = {"gold": (0.95, 0.78, 0.37), "aluminium": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
-BODIES = {"white": (0.6, 0.6, 0.6), "red": (0.5, 0.1, 0.05), "gray": (0.2, 0.2, 0.2)}
+BODIES = {"white": (0.6, 0.6, 0.6), "red": (0.5, 0.1, 0.05), "gray": (0.2, 0.2, 0.2), "black": (0.02, 0.02, 0.02)}
 RECIPE = RECIPES["polarguide-stokes"]
 
 
@@ -36,20 +36,29 @@ def light(directions: Tensor) -> Tensor:
     return (gray.clamp(min=0.03) + 1.2 * window)[..., None].expand(*directions.shape[:-1], 3) / 2
 
 
-def measured(material: str, cosine: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
-    """S0 and polarization across the plane of incidence [..., 3] of a smooth surface under light [..., 3]."""
+def measured(
+    material: str, cosine: Tensor, light: Tensor, polarized: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """S0, polarization across the plane of incidence and at 45 degrees to it [..., 3] of a smooth surface.
+
+    Args:
+        light: [..., 3]. polarized: its shares [..., 1] that are polarized across that plane and at 45 degrees to it.
+    """
     c = cosine[..., None]
     sine2 = 1 - c * c
+    body, under = torch.zeros_like(light), torch.zeros_like(c)
     if material in METALS:
         mean, slope = optics.conductor(c, torch.tensor(METALS[material], dtype=c.dtype))
-        return mean * light, slope * sine2 * mean * light
-    s, p = optics.reflectances_from_cosine(c)
-    specular, diffuse = (
-        0.5 * (s + p) * light,
-        torch.tensor(BODIES[material], dtype=c.dtype).expand_as(light) / 2,
-    )
-    over, under = (slope * sine2 for slope in optics.dolp_slopes(c))
-    return specular + diffuse, over * specular - under * diffuse
+        over = slope * sine2
+    else:
+        s, p = optics.reflectances_from_cosine(c)
+        mean = 0.5 * (s + p)
+        over, under = (slope * sine2 for slope in optics.dolp_slopes(c))
+        body = torch.tensor(BODIES[material], dtype=c.dtype).expand_as(light) / 2
+    across, oblique = (torch.zeros_like(c), torch.zeros_like(c)) if polarized is None else polarized
+    mirrored = mean * light
+    s0 = mirrored * (1 + over * across) + body
+    return s0, mirrored * (over + across) - under * body, -mirrored * (1 - over**2).sqrt() * oblique
 
 
 @pytest.mark.parametrize("material", [*METALS, *BODIES])
@@ -57,8 +66,8 @@ def test_the_right_explanation_leaves_less(material: str) -> None:
     generator = torch.Generator().manual_seed(0)
     cosine = 0.35 + 0.6 * torch.rand(24, 40, generator=generator)
     seen = 0.1 + torch.rand(24, 40, 1, generator=generator).expand(24, 40, 3)
-    s0, across = measured(material, cosine, seen)
-    found = residuals(Seen(torch.ones(24, 40), s0, across, cosine), 1.5)
+    s0, across, _ = measured(material, cosine, seen)
+    found = residuals(Seen(torch.ones(24, 40), s0, across, torch.zeros_like(s0), cosine), 1.5)
     dielectric, metal, reflectance = found
     if material in METALS:
         assert bool((metal < 0.1 * dielectric).all())
@@ -68,8 +77,18 @@ def test_the_right_explanation_leaves_less(material: str) -> None:
         assert bool((metal > dielectric).all())
 
 
-def views_of(material: str) -> list[View]:
-    """A ball of one material in the room, from all around."""
+def polarized_light(coming_from: Tensor, normal: Tensor, degree: float) -> tuple[Tensor, Tensor]:
+    """Light that vibrates as level as it can: across the plane of incidence and at 45 degrees to it [..., 1]."""
+    up = torch.tensor([0.3, 0.1, 1.0]).expand_as(normal)
+    vibration = torch.nn.functional.normalize(torch.linalg.cross(coming_from, up), dim=-1)
+    across = torch.nn.functional.normalize(torch.linalg.cross(coming_from, normal), dim=-1)
+    along = torch.linalg.cross(coming_from, across)
+    s, p = (vibration * across).sum(-1, keepdim=True), (vibration * along).sum(-1, keepdim=True)
+    return degree * (s * s - p * p), 2 * degree * s * p
+
+
+def views_of(material: str, degree: float = 0.0) -> list[View]:
+    """A ball of one material in the room, from all around; the light has a degree of polarization."""
     found = []
     for k in range(16):
         camera = camera_at(2 * math.pi * k / 16, (0.15, 0.5, 0.75)[k % 3], 0.0)
@@ -77,11 +96,13 @@ def views_of(material: str) -> list[View]:
         rays = camera.rays()
         cosine = -(normal * rays).sum(dim=-1).clamp(-1, 0)
         mirrored = camera.to_world(rays + 2 * cosine[..., None] * normal)
-        s0, across = measured(material, cosine.double(), light(mirrored))
+        polarized = polarized_light(mirrored, camera.to_world(normal), degree)
+        s0, across, oblique = measured(material, cosine.double(), light(mirrored), polarized)
         x_ref, up_ref = optics.lens_frame(rays)
         x, y = (normal * x_ref).sum(-1), (normal * up_ref).sum(-1)
         sine2 = (x * x + y * y).clamp(min=1e-9)
-        s1, s2 = -across * ((x * x - y * y) / sine2)[..., None], -across * (2 * x * y / sine2)[..., None]
+        cosine2, sine = ((x * x - y * y) / sine2)[..., None], (2 * x * y / sine2)[..., None]
+        s1, s2 = -across * cosine2 - oblique * sine, -across * sine + oblique * cosine2
         stokes = torch.stack((s0, s1, s2)) * hit[..., None]
         codes = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in ANGLES])
         codes = (codes.clamp(0, 1) * 65535).round().to(torch.uint16)
@@ -119,6 +140,30 @@ def test_balls_of_metal_are_found_and_no_others(material: str, least: float, mos
     assert not bool(decide(found, nothing, nothing).any())
 
 
+@pytest.mark.parametrize("degree", [0.2, 0.4])
+@pytest.mark.parametrize(
+    ("material", "least", "most"), [(m, 0.5, 1.0) for m in METALS] + [(b, 0, 0) for b in BODIES]
+)
+def test_polarized_light_shows_metals_and_makes_none(
+    material: str, least: float, most: float, degree: float
+) -> None:
+    found = evidence(gaussians_of_the_ball(), views_of(material, degree), rasterize_cpu, 1.5)
+    nothing = torch.zeros(900, dtype=torch.bool)
+    metal = decide(found, nothing, ~nothing)
+    seen = gaussians_of_the_ball()["means"][:, 2] > 0.1
+    assert least <= float(metal[seen].float().mean()) <= most
+
+
+def test_oblique_polarization_has_to_be_much_and_to_explain_the_misfit() -> None:
+    oblique, misfit, brightness = torch.full((90,), 0.01), torch.full((90,), 0.1), torch.ones(90)
+    oblique[5:25] = oblique[35:55] = oblique[65:85] = 0.09
+    misfit[35:55] = 0.25
+    brightness[65:85] = 0.3  # a dark body, of a light that is bright elsewhere
+    nothing = torch.zeros(90, dtype=torch.bool)
+    found = said(90, oblique=oblique, metal_misfit=misfit, brightness=brightness)
+    assert decide(found, nothing, ~nothing).nonzero()[:, 0].tolist() == list(range(5, 25))
+
+
 def said(count: int, **values: Tensor) -> Evidence:
     """Evidence along a line of Gaussians that says nothing but what is given."""
     near = (torch.arange(count)[:, None] + torch.tensor([0, 1, -1, 2, -2])).clamp(0, count - 1)
@@ -128,6 +173,9 @@ def said(count: int, **values: Tensor) -> Evidence:
         reflectance=torch.full((count, 3), 0.6),
         near=near,
         alike=torch.ones(count, 5),
+        brightness=torch.ones(count),
+        metal_misfit=torch.full((count,), 0.1),
+        oblique=torch.zeros(count),
         support=torch.ones(count),
         said=torch.zeros(count, 2),
     )

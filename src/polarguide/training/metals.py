@@ -10,6 +10,10 @@ Either has one unknown per color, which all views share, and one per color and v
 across the line of what the free light can explain, as log(E_dielectric / E_metal) over a neighborhood. That a metal
 fits better counts only where no dielectric fits: a matte white body under an even sky could as well be aluminium. And a
 metal's color is that of the light it mirrors times r, so that r follows the color that it shows.
+
+In polarized light neither fits. A metal then shows light that is polarized at 45 degrees to the plane of incidence, of
+which a dielectric reflects a twentieth at most: where there is much of it, measured by the light of the scene, and the
+metal is not much farther off across the plane than at 45 degrees to it, is metal, too.
 """
 
 from __future__ import annotations
@@ -56,12 +60,18 @@ LEAST_RESIDUAL = 2e-4
 BEGIN, CONTINUE, STAY = 2.2, 0.4, 0.3
 BEGIN_MISFIT, CONTINUE_MISFIT = 0.05, 0.02
 CROWD, ALONE = 0.12, 0.2
+# In polarized light: what is polarized at 45 degrees, as a share of what is seen and of the scene's mean light, and how
+# many times its square that of the metal's misfit may be.
+BEGIN_OBLIQUE, BEGIN_LIGHT, BEGIN_TIMES = 0.03, 0.08, 4.0
+CONTINUE_OBLIQUE, CONTINUE_LIGHT, CONTINUE_TIMES = 0.02, 0.02, 6.0
 # Of a piece that hangs together, the share, and how many, that have to be surely metal. True ones had 0.25 to 0.56, a
 # plate in polarized light 0.02 to 0.13. Neighbors hang together from this likeness of their normals on.
 SURE_SHARE, FEWEST_SURE = 0.18, 10
 TOUCHING = 0.2
 # Share of the user's words from which on their contradictions are told.
 CONTRADICTED = 0.15
+# Neighbors whose brightness differs by this factor's logarithm are of another material, more or less.
+LIKE_BRIGHTNESS = 0.4
 ROUNDS = 12
 # Of how many views the gain of the light is taken, and where.
 GAIN_VIEWS, CLEAR_SHARE, LEAST_COVERED, MOST_GAIN = 10, 0.6, 0.003, 4.0
@@ -71,12 +81,16 @@ class Evidence(NamedTuple):
     """What the views say of N Gaussians.
 
     Attributes:
-        ratio: [N] log(E_dielectric / E_metal), over the neighborhood.
+        ratio: [N] log(E_dielectric / E_metal), over the neighborhood, in which those of like brightness count.
         misfit: [N] root of the mean E_dielectric of the neighborhood: how far from any dielectric.
         reflectance: [N, 3] of the metal that fits best.
         near: [N, K] int64 the neighborhoods, nearest first.
-        alike: [N, K] in [0, 1], how alike neighbors are turned: others belong to another surface, such as the table
-            under a pot.
+        alike: [N, K] in [0, 1], how alike neighbors are turned, and how alike their brightness is: others belong to
+            another surface, such as the table under a pot, or are of another material, such as the tire around a wheel.
+        brightness: [N] mean S0 of what is seen, over that of all that is seen.
+        metal_misfit: [N] root of the mean E_metal of the neighborhood.
+        oblique: [N] root of the mean square of what is polarized at 45 degrees to the plane of incidence, of the
+            neighborhood, relative like the residuals.
         support: [N] share of the neighborhood that enough views show.
         said: [N, 2] weight of pixels that the user calls dielectric and metal.
     """
@@ -86,6 +100,9 @@ class Evidence(NamedTuple):
     reflectance: Tensor
     near: Tensor
     alike: Tensor
+    brightness: Tensor
+    metal_misfit: Tensor
+    oblique: Tensor
     support: Tensor
     said: Tensor
 
@@ -102,16 +119,19 @@ def shares(gaussians: Parameters, view: View, target: Tensor, rasterize: Rasteri
 
 
 class Seen(NamedTuple):
-    """Means over what V views show of each Gaussian: weight [V, N], S0, P [V, N, 3], cosine of the zenith [V, N]."""
+    """Means over what V views show of each Gaussian: weight [V, N], S0, P, the polarization at 45 degrees to both
+    [V, N, 3], cosine of the zenith [V, N].
+    """
 
     weight: Tensor
     s0: Tensor
     across: Tensor
+    oblique: Tensor
     cosine: Tensor
 
 
 def _look(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
-    """Sums [N, 8] over a view's pixels: 1, S0, P and the cosine."""
+    """Sums [N, 11] over a view's pixels: 1, S0, P, the polarization at 45 degrees to it and the cosine."""
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, sh_degree=0).normal
     assert normal is not None
@@ -122,20 +142,21 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
     x_ref, up_ref = optics.lens_frame(rays)
     x, y = dot(guide, x_ref), dot(guide, up_ref)
     sine2 = (x * x + y * y).clamp(min=1e-6)
-    across = -(s1 * ((x * x - y * y) / sine2)[..., None] + s2 * (2 * x * y / sine2)[..., None])
+    cosine2, sine = ((x * x - y * y) / sine2)[..., None], (2 * x * y / sine2)[..., None]
+    across, oblique = -(s1 * cosine2 + s2 * sine), s2 * cosine2 - s1 * sine
     one = torch.ones_like(x)[..., None]
     good = (known & ~(view.invalid | view.saturated))[..., None]
-    target = torch.cat((one, s0, across, -dot(guide, rays)[..., None]), dim=-1) * good
+    target = torch.cat((one, s0, across, oblique, -dot(guide, rays)[..., None]), dim=-1) * good
     return shares(gaussians, view, target.contiguous(), rasterize)
 
 
 def _seen(sums: Tensor) -> Seen:
-    """Means of the sums [V, N, 8], with the weight of views that count."""
+    """Means of the sums [V, N, 11], with the weight of views that count."""
     weight = sums[..., 0]
     means = sums[..., 1:] / weight.clamp(min=1e-6)[..., None]
-    cosine = means[..., 6].clamp(0, 1)
+    cosine = means[..., 9].clamp(0, 1)
     counts = (weight > LEAST_SHARE * weight.amax(dim=0)) & (cosine > COSINES[0]) & (cosine < COSINES[1])
-    return Seen(weight * counts, means[..., :3], means[..., 3:6], cosine)
+    return Seen(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
 
 
 def residuals(seen: Seen, refractive_index: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -167,6 +188,14 @@ def residuals(seen: Seen, refractive_index: float) -> tuple[Tensor, Tensor, Tens
     return misfit.mean(dim=1), best, fitted
 
 
+def oblique_light(seen: Seen) -> Tensor:
+    """Mean squares [N] of the polarization at 45 degrees to the plane of incidence, relative like the residuals."""
+    above = seen.s0.clamp(min=0) + DARK
+    weight = seen.weight[..., None] / above
+    scale = (weight * above * above).sum(dim=0).clamp(min=1e-9)
+    return ((weight * seen.oblique**2).sum(dim=0) / scale).mean(dim=1)
+
+
 @torch.no_grad()
 def evidence(
     gaussians: Parameters, views: Sequence[View], rasterize: Rasterize, refractive_index: float
@@ -191,7 +220,10 @@ def evidence(
         gaussians["means"], gaussians["quaternions"], gaussians["log_scales"], total.new_zeros(3), None
     )
     alike = dot(axes[:, None], axes[near]) ** 4
-    trust = (known + 1e-6)[near]
+    shown = (seen.weight * seen.s0.mean(dim=2)).sum(dim=0) / total.clamp(min=1e-6)
+    brightness = shown.clamp(min=0) + DARK
+    like_bright = torch.exp(-0.5 * ((brightness[near] / brightness[:, None]).log() / LIKE_BRIGHTNESS) ** 2)
+    trust = (known + 1e-6)[near] * like_bright
 
     def over_neighbors(values: Tensor) -> Tensor:
         return (values[near] * trust).sum(dim=1) / trust.sum(dim=1)
@@ -206,7 +238,16 @@ def evidence(
     reflectance = torch.stack([over_neighbors(r) for r in reflectance.unbind(1)], dim=1)
     support = (known > LEAST_SEEN).float()[near].mean(dim=1)
     return Evidence(
-        over_neighbors(ratio), over_neighbors(dielectric).sqrt(), reflectance, near, alike, support, said
+        over_neighbors(ratio),
+        over_neighbors(dielectric).sqrt(),
+        reflectance,
+        near,
+        alike * like_bright,
+        brightness * known.sum() / (brightness * known).sum().clamp(min=1e-6),
+        over_neighbors(metal).sqrt(),
+        over_neighbors(oblique_light(seen)).sqrt(),
+        support,
+        said,
     )
 
 
@@ -224,10 +265,25 @@ def decide(found: Evidence, was: Tensor, allowed: Tensor) -> Tensor:
     told = found.said.sum(dim=1) > LEAST_SEEN
     told_metal = told & (found.said[:, 1] > found.said[:, 0])
     able &= ~told
-    surely = (found.ratio > BEGIN) & (found.misfit > BEGIN_MISFIT)
-    metal = told_metal | (able & (surely | (was & (found.ratio > STAY))))
-    likely, nearest = able & (found.ratio > CONTINUE), found.near[:, :NEAREST]
-    counts = found.alike[:, :NEAREST]
+    no_dielectric = found.misfit > BEGIN_MISFIT
+    surely = told_metal | (able & no_dielectric & (found.ratio > BEGIN))
+    begun = surely | (able & was & (found.ratio > STAY))
+    metal = _pieces(found, surely, begun, able & (found.ratio > CONTINUE))
+    surely = able & no_dielectric & _obliquely(found, BEGIN_OBLIQUE, BEGIN_LIGHT, BEGIN_TIMES)
+    likely = able & _obliquely(found, CONTINUE_OBLIQUE, CONTINUE_LIGHT, CONTINUE_TIMES)
+    metal |= _pieces(found, surely, surely | (was & likely), likely)
+    return told_metal | metal
+
+
+def _obliquely(found: Evidence, least: float, light: float, times: float) -> Tensor:
+    """Whether so much is polarized at 45 degrees, of what is seen and of the scene's light, and explains the misfit."""
+    fits = found.metal_misfit**2 < times * found.oblique**2
+    return fits & (found.oblique > least) & (found.oblique * found.brightness > light)
+
+
+def _pieces(found: Evidence, surely: Tensor, metal: Tensor, likely: Tensor) -> Tensor:
+    """What is metal [N] where ``metal`` begins and ``likely`` joins, in pieces of which enough is sure."""
+    nearest, counts = found.near[:, :NEAREST], found.alike[:, :NEAREST]
 
     def among(metal: Tensor) -> Tensor:
         """Share of metals among the nearest of each."""
@@ -238,18 +294,14 @@ def decide(found: Evidence, was: Tensor, allowed: Tensor) -> Tensor:
         if bool((grown == metal).all()):
             break
         metal = grown
-    metal &= among(metal) > ALONE
-    return told_metal | (metal & _sure_enough(found, metal, surely | told_metal))
+    metal = metal & (among(metal) > ALONE)
+    return metal & _sure_enough(nearest, counts > TOUCHING, metal, surely)
 
 
-def _sure_enough(found: Evidence, metal: Tensor, surely: Tensor) -> Tensor:
+def _sure_enough(nearest: Tensor, touching: Tensor, metal: Tensor, surely: Tensor) -> Tensor:
     """Which metals [N] lie in a connected piece of them of which enough is sure."""
-    near, touching = (
-        found.near[:, :NEAREST].cpu().numpy(),
-        (found.alike[:, :NEAREST] > TOUCHING).cpu().numpy(),
-    )
-    inside, sure = metal.cpu().numpy(), surely.cpu().numpy()
-    edges = touching & inside[:, None] & inside[near]
+    near, inside, sure = nearest.cpu().numpy(), metal.cpu().numpy(), surely.cpu().numpy()
+    edges = touching.cpu().numpy() & inside[:, None] & inside[near]
     rows, columns = np.nonzero(edges)
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, near[rows, columns])), shape=(len(inside),) * 2)
     pieces, piece = connected_components(graph, directed=False)
