@@ -24,7 +24,12 @@ from polarguide.training.trainer import Trainer, TrainSettings
 from tests.helpers.glossy_ball import ball, camera_at
 
 METALS = {"gold": (0.95, 0.78, 0.37), "aluminium": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
-BODIES = {"white": (0.6, 0.6, 0.6), "red": (0.5, 0.1, 0.05), "gray": (0.2, 0.2, 0.2), "black": (0.02, 0.02, 0.02)}
+BODIES = {
+    "white": (0.6, 0.6, 0.6),
+    "red": (0.5, 0.1, 0.05),
+    "gray": (0.2, 0.2, 0.2),
+    "black": (0.02, 0.02, 0.02),
+}
 RECIPE = RECIPES["polarguide-stokes"]
 
 
@@ -140,7 +145,7 @@ def test_balls_of_metal_are_found_and_no_others(material: str, least: float, mos
     assert not bool(decide(found, nothing, nothing).any())
 
 
-@pytest.mark.parametrize("degree", [0.2, 0.4])
+@pytest.mark.parametrize("degree", [0.2, 0.4, 0.6])
 @pytest.mark.parametrize(
     ("material", "least", "most"), [(m, 0.5, 1.0) for m in METALS] + [(b, 0, 0) for b in BODIES]
 )

@@ -60,10 +60,10 @@ LEAST_RESIDUAL = 2e-4
 BEGIN, CONTINUE, STAY = 2.2, 0.4, 0.3
 BEGIN_MISFIT, CONTINUE_MISFIT = 0.05, 0.02
 CROWD, ALONE = 0.12, 0.2
-# In polarized light: what is polarized at 45 degrees, as a share of what is seen and of the scene's mean light, and how
-# many times its square that of the metal's misfit may be.
-BEGIN_OBLIQUE, BEGIN_LIGHT, BEGIN_TIMES = 0.03, 0.08, 4.0
-CONTINUE_OBLIQUE, CONTINUE_LIGHT, CONTINUE_TIMES = 0.02, 0.02, 6.0
+# In polarized light: what is polarized at 45 degrees, as a share of what is seen and of the scene's mean light, how
+# many times its square that of the metal's misfit may be, and the least evidence.
+BEGIN_OBLIQUE, BEGIN_LIGHT, BEGIN_TIMES, BEGIN_EVEN = 0.03, 0.08, 4.0, 0.0
+CONTINUE_OBLIQUE, CONTINUE_LIGHT, CONTINUE_TIMES, CONTINUE_EVEN = 0.02, 0.02, 6.0, -0.5
 # Of a piece that hangs together, the share, and how many, that have to be surely metal. True ones had 0.25 to 0.56, a
 # plate in polarized light 0.02 to 0.13. Neighbors hang together from this likeness of their normals on.
 SURE_SHARE, FEWEST_SURE = 0.18, 10
@@ -269,15 +269,19 @@ def decide(found: Evidence, was: Tensor, allowed: Tensor) -> Tensor:
     surely = told_metal | (able & no_dielectric & (found.ratio > BEGIN))
     begun = surely | (able & was & (found.ratio > STAY))
     metal = _pieces(found, surely, begun, able & (found.ratio > CONTINUE))
-    surely = able & no_dielectric & _obliquely(found, BEGIN_OBLIQUE, BEGIN_LIGHT, BEGIN_TIMES)
-    likely = able & _obliquely(found, CONTINUE_OBLIQUE, CONTINUE_LIGHT, CONTINUE_TIMES)
+    surely = able & no_dielectric & _obliquely(found, BEGIN_OBLIQUE, BEGIN_LIGHT, BEGIN_TIMES, BEGIN_EVEN)
+    likely = able & _obliquely(found, CONTINUE_OBLIQUE, CONTINUE_LIGHT, CONTINUE_TIMES, CONTINUE_EVEN)
     metal |= _pieces(found, surely, surely | (was & likely), likely)
     return told_metal | metal
 
 
-def _obliquely(found: Evidence, least: float, light: float, times: float) -> Tensor:
-    """Whether so much is polarized at 45 degrees, of what is seen and of the scene's light, and explains the misfit."""
-    fits = found.metal_misfit**2 < times * found.oblique**2
+def _obliquely(found: Evidence, least: float, light: float, times: float, even: float) -> Tensor:
+    """Whether so much is polarized at 45 degrees, of what is seen and of the scene's light, and explains the misfit.
+
+    Args:
+        even: evidence below which a dielectric explains more.
+    """
+    fits = (found.metal_misfit**2 < times * found.oblique**2) & (found.ratio > even)
     return fits & (found.oblique > least) & (found.oblique * found.brightness > light)
 
 
