@@ -160,12 +160,14 @@ def test_polarized_light_shows_metals_and_makes_none(
 
 
 def test_oblique_polarization_has_to_be_much_and_to_explain_the_misfit() -> None:
-    oblique, misfit, brightness = torch.full((90,), 0.01), torch.full((90,), 0.1), torch.ones(90)
-    oblique[5:25] = oblique[35:55] = oblique[65:85] = 0.09
+    oblique, misfit, brightness, ratio = (torch.full((120,), v) for v in (0.01, 0.1, 1.0, 0.2))
+    for begin in (5, 35, 65, 95):
+        oblique[begin : begin + 20] = 0.09
     misfit[35:55] = 0.25
     brightness[65:85] = 0.3  # a dark body, of a light that is bright elsewhere
-    nothing = torch.zeros(90, dtype=torch.bool)
-    found = said(90, oblique=oblique, metal_misfit=misfit, brightness=brightness)
+    ratio[95:115] = -0.2  # a dielectric fits better
+    nothing = torch.zeros(120, dtype=torch.bool)
+    found = said(120, oblique=oblique, metal_misfit=misfit, brightness=brightness, ratio=ratio)
     assert decide(found, nothing, ~nothing).nonzero()[:, 0].tolist() == list(range(5, 25))
 
 
