@@ -92,8 +92,12 @@ def polarized_light(coming_from: Tensor, normal: Tensor, degree: float) -> tuple
     return degree * (s * s - p * p), 2 * degree * s * p
 
 
-def views_of(material: str, degree: float = 0.0) -> list[View]:
-    """A ball of one material in the room, from all around; the light has a degree of polarization."""
+def views_of(material: str, degree: float = 0.0, other: str | None = None) -> list[View]:
+    """A ball in the room, from all around; the light has a degree of polarization.
+
+    Args:
+        other: material where x is negative; the same, if not given.
+    """
     found = []
     for k in range(16):
         camera = camera_at(2 * math.pi * k / 16, (0.15, 0.5, 0.75)[k % 3], 0.0)
@@ -102,7 +106,11 @@ def views_of(material: str, degree: float = 0.0) -> list[View]:
         cosine = -(normal * rays).sum(dim=-1).clamp(-1, 0)
         mirrored = camera.to_world(rays + 2 * cosine[..., None] * normal)
         polarized = polarized_light(mirrored, camera.to_world(normal), degree)
-        s0, across, oblique = measured(material, cosine.double(), light(mirrored), polarized)
+        one, two = (
+            measured(m, cosine.double(), light(mirrored), polarized) for m in (material, other or material)
+        )
+        here = camera.to_world(normal)[..., :1] > 0
+        s0, across, oblique = (torch.where(here, a, b) for a, b in zip(one, two, strict=True))
         x_ref, up_ref = optics.lens_frame(rays)
         x, y = (normal * x_ref).sum(-1), (normal * up_ref).sum(-1)
         sine2 = (x * x + y * y).clamp(min=1e-9)
@@ -157,6 +165,17 @@ def test_polarized_light_shows_metals_and_makes_none(
     metal = decide(found, nothing, ~nothing)
     seen = gaussians_of_the_ball()["means"][:, 2] > 0.1
     assert least <= float(metal[seen].float().mean()) <= most
+
+
+def test_a_dark_neighbor_of_a_metal_is_none() -> None:
+    """The two halves of a ball meet; what is near the seam is judged by neighbors of like brightness."""
+    ball_of_two = gaussians_of_the_ball()
+    found = evidence(ball_of_two, views_of("aluminium", other="black"), rasterize_cpu, 1.5)
+    nothing = torch.zeros(900, dtype=torch.bool)
+    metal = decide(found, nothing, ~nothing)
+    x, _, z = ball_of_two["means"].unbind(1)
+    assert float(metal[(z > 0.1) & (x > 0.1)].float().mean()) > 0.8
+    assert float(metal[(z > 0.1) & (x < -0.1)].float().mean()) < 0.02
 
 
 def test_oblique_polarization_has_to_be_much_and_to_explain_the_misfit() -> None:

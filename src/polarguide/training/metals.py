@@ -12,8 +12,8 @@ fits better counts only where no dielectric fits: a matte white body under an ev
 metal's color is that of the light it mirrors times r, so that r follows the color that it shows.
 
 In polarized light neither fits. A metal then shows light that is polarized at 45 degrees to the plane of incidence, of
-which a dielectric reflects a twentieth at most: where there is much of it, measured by the light of the scene, and the
-metal is not much farther off across the plane than at 45 degrees to it, is metal, too.
+which a dielectric reflects a twentieth at most, up to 60 degrees: where there is much of it, measured by the light of
+the scene, and the metal is not much farther off across the plane than at 45 degrees to it, is metal, too.
 """
 
 from __future__ import annotations
@@ -60,10 +60,6 @@ LEAST_RESIDUAL = 2e-4
 BEGIN, CONTINUE, STAY = 2.2, 0.4, 0.3
 BEGIN_MISFIT, CONTINUE_MISFIT = 0.05, 0.02
 CROWD, ALONE = 0.12, 0.2
-# In polarized light: what is polarized at 45 degrees, as a share of what is seen and of the scene's mean light, how
-# many times its square that of the metal's misfit may be, and the least evidence.
-BEGIN_OBLIQUE, BEGIN_LIGHT, BEGIN_TIMES, BEGIN_EVEN = 0.03, 0.08, 4.0, 0.0
-CONTINUE_OBLIQUE, CONTINUE_LIGHT, CONTINUE_TIMES, CONTINUE_EVEN = 0.02, 0.02, 6.0, -0.5
 # Of a piece that hangs together, the share, and how many, that have to be surely metal. True ones had 0.25 to 0.56, a
 # plate in polarized light 0.02 to 0.13. Neighbors hang together from this likeness of their normals on.
 SURE_SHARE, FEWEST_SURE = 0.18, 10
@@ -75,6 +71,24 @@ LIKE_BRIGHTNESS = 0.4
 ROUNDS = 12
 # Of how many views the gain of the light is taken, and where.
 GAIN_VIEWS, CLEAR_SHARE, LEAST_COVERED, MOST_GAIN = 10, 0.6, 0.003, 4.0
+
+
+class Limits(NamedTuple):
+    """From which on a neighborhood is metal in polarized light.
+
+    Attributes:
+        oblique: what is polarized at 45 degrees, as a share of what is seen. light: of the scene's mean light.
+        times: how many times its square that of the metal's misfit may be.
+        ratio: evidence below which a dielectric explains more.
+    """
+
+    oblique: float
+    light: float
+    times: float
+    ratio: float
+
+
+BEGIN_OBLIQUELY, CONTINUE_OBLIQUELY = Limits(0.03, 0.08, 4.0, 0.0), Limits(0.02, 0.02, 6.0, -0.5)
 
 
 class Evidence(NamedTuple):
@@ -159,14 +173,18 @@ def _seen(sums: Tensor) -> Seen:
     return Seen(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
 
 
+def _relative(seen: Seen) -> tuple[Tensor, Tensor]:
+    """Weights [V, N, 3] of squares, and what their sums over the views are relative to [N, 3]."""
+    above = seen.s0.clamp(min=0) + DARK  # the variance of light that is counted grows with the light
+    weight = seen.weight[..., None] / above
+    return weight, (weight * above * above).sum(dim=0).clamp(min=1e-9)
+
+
 def residuals(seen: Seen, refractive_index: float) -> tuple[Tensor, Tensor, Tensor]:
     """Mean squares of the relative residuals of a dielectric and of a metal [N], and the metal's reflectance [N, 3]."""
     s0, across, cosine = seen.s0, seen.across, seen.cosine[..., None]
     sine2 = 1 - cosine * cosine
-    # The variance of light that is counted grows with the light.
-    above = s0.clamp(min=0) + DARK
-    weight = seen.weight[..., None] / above
-    scale = (weight * above * above).sum(dim=0).clamp(min=1e-9)
+    weight, scale = _relative(seen)
     specular, diffuse = (slope * sine2 for slope in optics.dolp_slopes(cosine, refractive_index))
     seen_body, of_body = specular * s0 - across, specular + diffuse
     by_line = weight / (1 + specular * specular)
@@ -190,9 +208,7 @@ def residuals(seen: Seen, refractive_index: float) -> tuple[Tensor, Tensor, Tens
 
 def oblique_light(seen: Seen) -> Tensor:
     """Mean squares [N] of the polarization at 45 degrees to the plane of incidence, relative like the residuals."""
-    above = seen.s0.clamp(min=0) + DARK
-    weight = seen.weight[..., None] / above
-    scale = (weight * above * above).sum(dim=0).clamp(min=1e-9)
+    weight, scale = _relative(seen)
     return ((weight * seen.oblique**2).sum(dim=0) / scale).mean(dim=1)
 
 
@@ -269,20 +285,16 @@ def decide(found: Evidence, was: Tensor, allowed: Tensor) -> Tensor:
     surely = told_metal | (able & no_dielectric & (found.ratio > BEGIN))
     begun = surely | (able & was & (found.ratio > STAY))
     metal = _pieces(found, surely, begun, able & (found.ratio > CONTINUE))
-    surely = able & no_dielectric & _obliquely(found, BEGIN_OBLIQUE, BEGIN_LIGHT, BEGIN_TIMES, BEGIN_EVEN)
-    likely = able & _obliquely(found, CONTINUE_OBLIQUE, CONTINUE_LIGHT, CONTINUE_TIMES, CONTINUE_EVEN)
+    surely = able & no_dielectric & _obliquely(found, BEGIN_OBLIQUELY)
+    likely = able & _obliquely(found, CONTINUE_OBLIQUELY)
     metal |= _pieces(found, surely, surely | (was & likely), likely)
     return told_metal | metal
 
 
-def _obliquely(found: Evidence, least: float, light: float, times: float, even: float) -> Tensor:
-    """Whether so much is polarized at 45 degrees, of what is seen and of the scene's light, and explains the misfit.
-
-    Args:
-        even: evidence below which a dielectric explains more.
-    """
-    fits = (found.metal_misfit**2 < times * found.oblique**2) & (found.ratio > even)
-    return fits & (found.oblique > least) & (found.oblique * found.brightness > light)
+def _obliquely(found: Evidence, limits: Limits) -> Tensor:
+    """Whether so much is polarized at 45 degrees that it tells of metal, and explains the metal's misfit."""
+    much = (found.oblique > limits.oblique) & (found.oblique * found.brightness > limits.light)
+    return much & (found.metal_misfit**2 < limits.times * found.oblique**2) & (found.ratio > limits.ratio)
 
 
 def _pieces(found: Evidence, surely: Tensor, metal: Tensor, likely: Tensor) -> Tensor:
