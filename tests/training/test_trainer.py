@@ -209,3 +209,20 @@ def test_a_loss_that_is_not_finite_stops_the_training(tiny_scene: Scene) -> None
         trainer.state.gaussians["sh_dc"][0, 0] = math.nan
     with pytest.raises(PolarguideError, match="finite"):
         trainer.step()
+
+
+@pytest.mark.parametrize(("consistency", "moved"), [(0.1, True), (0.0, False)])
+def test_a_held_depth_is_not_moved_by_the_consistency(
+    tiny_scene: Scene, consistency: float, moved: bool
+) -> None:
+    states = []
+    for held in (True, False):
+        stages = tuple(
+            dataclasses.replace(
+                stage, weights=dataclasses.replace(stage.weights, consistency=consistency), hold_depth=held
+            )
+            for stage in RECIPES["3dgs-dr"].stages
+        )
+        recipe = dataclasses.replace(RECIPES["3dgs-dr"], stages=stages)
+        states.append(train(tiny_scene, recipe, steps=10)[0].state.tensors())
+    assert ("gaussians.means" in different(*states)) == moved

@@ -116,6 +116,11 @@ _COMMON = (
         priors(bright=0.0),
     ),
     (
+        "consistency-moves-depth",
+        "The consistency moves the depth to the normals, too.",
+        staged(lambda stage: replace(stage, hold_depth=False)),
+    ),
+    (
         "without-planes",
         "Large flat surfaces are not looked for.",
         priors(flat=False),
@@ -158,7 +163,11 @@ ABLATIONS_3DGS_DR = varied(
     (
         "consistent",
         "Flat Gaussians whose normals agree with the depth: what geometry gives without polarization.",
-        staged(lambda stage: replace(stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1))),
+        staged(
+            lambda stage: replace(
+                stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1), hold_depth=True
+            )
+        ),
     ),
     (
         "without-propagation",

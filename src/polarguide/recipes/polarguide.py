@@ -40,8 +40,9 @@ def _stages(
             on_enter=enter,
             # While the geometry forms; later what the layers mirror tells more of the normals than it misleads.
             hold_normals=hold_normals,
+            hold_depth=True,
         ),
-        Stage("guided", 0.35, reflection=True, weights=guided, repeats=(REFRESH,)),
+        Stage("guided", 0.35, reflection=True, weights=guided, repeats=(REFRESH,), hold_depth=True),
         Stage(
             "final",
             0.15,
@@ -49,6 +50,7 @@ def _stages(
             weights=final,
             on_enter=orient + enter,
             rate_factors=final_rates or {},
+            hold_depth=True,
         ),
     )
 

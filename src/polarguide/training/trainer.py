@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -228,6 +229,8 @@ class Trainer:
             held=stage.reflection and stage.hold_normals and stage.weights.layers,
             statistic=statistic,
         )
+        if stage.hold_depth and result.depth is not None:
+            result = replace(result, depth=result.depth.detach())
         shown = self._sizes.feed(state.step).shown(view)
         loss, photometric = step_loss(
             result,
