@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from polarguide.errors import PolarguideError
 from polarguide.evaluation.table import METRICS
 from polarguide.experiments.results import read_results
 
@@ -177,7 +178,10 @@ def main() -> None:
     controls = [f"{recipe}:unpolarized", f"{recipe}:unpolarized-without-consistency"]
     scenes: dict[str, Runs] = {}
     for path in options.records:
-        record = read_results(path)
+        try:
+            record = read_results(path)
+        except PolarguideError as error:
+            parser.error(str(error))
         for name in (known["name"] for known in record["scenes"]):
             runs = scene_runs(record, name)
             if recipe in runs:
