@@ -66,8 +66,9 @@ SURE_SHARE, FEWEST_SURE = 0.18, 10
 TOUCHING = 0.2
 # Share of the user's words from which on their contradictions are told.
 CONTRADICTED = 0.15
-# Neighbors whose brightness differs by this factor's logarithm are of another material, more or less.
-LIKE_BRIGHTNESS = 0.4
+# Neighbors whose brightness, or whose colors in proportion to it, differ by this factor's logarithm are of another
+# material, more or less.
+LIKE_BRIGHTNESS, LIKE_TINT = 0.4, 0.25
 ROUNDS = 12
 # Of how many views the gain of the light is taken, and where.
 GAIN_VIEWS, CLEAR_SHARE, LEAST_COVERED, MOST_GAIN = 10, 0.6, 0.003, 4.0
@@ -99,7 +100,7 @@ class Evidence(NamedTuple):
         misfit: [N] root of the mean E_dielectric of the neighborhood: how far from any dielectric.
         reflectance: [N, 3] of the metal that fits best.
         near: [N, K] int64 the neighborhoods, nearest first.
-        alike: [N, K] in [0, 1], how alike neighbors are turned, and how alike their brightness is: others belong to
+        alike: [N, K] in [0, 1], how alike neighbors are turned, and how alike their color is: others belong to
             another surface, such as the table under a pot, or are of another material, such as the tire around a wheel.
         brightness: [N] mean S0 of what is seen, over that of all that is seen.
         metal_misfit: [N] root of the mean E_metal of the neighborhood.
@@ -236,10 +237,11 @@ def evidence(
         gaussians["means"], gaussians["quaternions"], gaussians["log_scales"], total.new_zeros(3), None
     )
     alike = dot(axes[:, None], axes[near]) ** 4
-    shown = (seen.weight * seen.s0.mean(dim=2)).sum(dim=0) / total.clamp(min=1e-6)
-    brightness = shown.clamp(min=0) + DARK
-    like_bright = torch.exp(-0.5 * ((brightness[near] / brightness[:, None]).log() / LIKE_BRIGHTNESS) ** 2)
-    trust = (known + 1e-6)[near] * like_bright
+    color = (seen.weight[..., None] * seen.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
+    color = color.clamp(min=0) + DARK
+    brightness = color.mean(dim=1)
+    like_color = _like_color(color, near)
+    trust = (known + 1e-6)[near] * like_color
 
     def over_neighbors(values: Tensor) -> Tensor:
         return (values[near] * trust).sum(dim=1) / trust.sum(dim=1)
@@ -258,13 +260,22 @@ def evidence(
         over_neighbors(dielectric).sqrt(),
         reflectance,
         near,
-        alike * like_bright,
+        alike * like_color,
         brightness * known.sum() / (brightness * known).sum().clamp(min=1e-6),
         over_neighbors(metal).sqrt(),
         over_neighbors(oblique_light(seen)).sqrt(),
         support,
         said,
     )
+
+
+def _like_color(color: Tensor, near: Tensor) -> Tensor:
+    """How much the neighbors [N, K] of each Gaussian look like it, in [0, 1]; of colors [N, 3] over 0."""
+    brightness, logarithms = color.mean(dim=1).log(), color.log()
+    tint = logarithms - logarithms.mean(dim=1, keepdim=True)
+    brighter = (brightness[near] - brightness[:, None]) / LIKE_BRIGHTNESS
+    tinted = (tint[near] - tint[:, None]) / LIKE_TINT
+    return torch.exp(-0.5 * (brighter.square() + tinted.square().mean(dim=2)))
 
 
 def decide(found: Evidence, was: Tensor, allowed: Tensor) -> Tensor:
