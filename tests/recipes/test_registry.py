@@ -97,15 +97,7 @@ def test_ours_hold_normals_while_the_density_control_runs(name: str) -> None:
     assert all(stage.hold_normals for stage in layer_stages(f"{name}:layers-hold-normals"))
 
 
-@pytest.mark.parametrize("name", ["polarguide", "polarguide-stokes", "3dgs-dr:consistent"])
-def test_consistency_turns_normals_and_does_not_move_the_depth(name: str) -> None:
-    recipe = recipe_named(name)
-    assert isinstance(recipe, Recipe)
-    assert all(stage.hold_depth for stage in recipe.stages if stage.weights.consistency)
-
-
-def test_two_recipes_let_consistency_move_the_depth() -> None:
-    for name in ("ref-gs", "polarguide-stokes:consistency-moves-depth"):
-        recipe = recipe_named(name)
-        assert isinstance(recipe, Recipe)
-        assert not any(stage.hold_depth for stage in recipe.stages)
+@pytest.mark.parametrize("name", ["polarguide", "polarguide-stokes"])
+def test_consistency_moves_the_depth_unless_a_variation_holds_it(name: str) -> None:
+    assert not any(stage.hold_depth for stage in layer_stages(name))
+    assert all(stage.hold_depth for stage in layer_stages(f"{name}:consistency-holds-depth"))

@@ -116,9 +116,9 @@ _COMMON = (
         priors(bright=0.0),
     ),
     (
-        "consistency-moves-depth",
-        "The consistency moves the depth to the normals, too.",
-        staged(lambda stage: replace(stage, hold_depth=False)),
+        "consistency-holds-depth",
+        "The consistency turns normals to the depth, and does not move the depth.",
+        staged(lambda stage: replace(stage, hold_depth=True)),
     ),
     (
         "without-planes",
@@ -163,11 +163,7 @@ ABLATIONS_3DGS_DR = varied(
     (
         "consistent",
         "Flat Gaussians whose normals agree with the depth: what geometry gives without polarization.",
-        staged(
-            lambda stage: replace(
-                stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1), hold_depth=True
-            )
-        ),
+        staged(lambda stage: replace(stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1))),
     ),
     (
         "without-propagation",

@@ -40,9 +40,8 @@ def _stages(
             on_enter=enter,
             # While the geometry forms; later what the layers mirror tells more of the normals than it misleads.
             hold_normals=hold_normals,
-            hold_depth=True,
         ),
-        Stage("guided", 0.35, reflection=True, weights=guided, repeats=(REFRESH,), hold_depth=True),
+        Stage("guided", 0.35, reflection=True, weights=guided, repeats=(REFRESH,)),
         Stage(
             "final",
             0.15,
@@ -50,7 +49,6 @@ def _stages(
             weights=final,
             on_enter=orient + enter,
             rate_factors=final_rates or {},
-            hold_depth=True,
         ),
     )
 

@@ -126,8 +126,7 @@ class Stage:
         hold_normals: whether the terms on the layers reach the normals through Fresnel's equations alone, and not
             through what the layers mirror at them: the separated pictures are made with the normals of before, so that
             normals which follow them confirm their own errors.
-        hold_depth: whether the consistency turns normals to the depth, and does not move the depth to the normals: it
-            would bridge what lies behind one another.
+        hold_depth: whether the consistency turns normals to the depth, and does not move the depth to the normals.
     """
 
     name: str
