@@ -4,7 +4,8 @@ Each metric of a scene is compared with the row without polarization that is bes
 --against and the recipe's controls). A difference of means over seeds is a loss where it is below -0.15 dB (picture,
 foreground), -0.2 dB (layers) or above +0.3 degrees, even with twice its standard error over common seeds in its favor
 (at most 0.1 dB or 0.2 degrees, and that much of fewer than two common seeds). Scenes with metals are judged by object,
-metals by picture and normals alone. Then come the gains over all scenes, and views with haze or fog.
+metals by picture and normals alone. Then come the gains over all scenes, views with haze or fog, and views of which
+more is drawn from behind the true surface than in the best row without polarization.
 
     python benchmarks/accuracy/never_hurts.py benchmarks/results/bench/*.json
 
@@ -34,6 +35,7 @@ ALLOWED = {**PICTURE, **NORMALS, **LAYERS}
 LARGEST_ERROR = {"dB": 0.1, "deg": 0.2}
 MOST_HAZE = 0.01
 MOST_OUTSIDE = 0.01
+MORE_BEYOND = 0.03
 VIEW_LOSS = 2.0
 METALS = ("metal", "rough metal")
 BY_KEY = {metric.key: metric for metric in METRICS}
@@ -165,6 +167,23 @@ def bad_views(scene: str, rows: Runs, recipe: str) -> Iterator[str]:
                 yield f"{scene}, {view}: {scores['psnr']:.1f} dB where plain splatting has {max(peers):.1f}"
 
 
+def drawn_through(scene: str, rows: Runs, recipe: str, others: Sequence[str]) -> Iterator[str]:
+    """Views where more is drawn from behind the true surface than in the best other row, means over seeds."""
+
+    def beyond(name: str, view: str) -> float | None:
+        known = [run["views"][view].get("depth_beyond") for run in rows.get(name, {}).values()]
+        return statistics.fmean(known) if known and None not in known else None
+
+    for view in next(iter(rows[recipe].values()))["views"]:
+        ours = beyond(recipe, view)
+        theirs = {name: share for name in others if (share := beyond(name, view)) is not None}
+        if ours is None or not theirs:
+            continue
+        best = min(theirs, key=lambda name: theirs[name])
+        if ours > theirs[best] + MORE_BEYOND:
+            yield f"{scene}, {view}: depth beyond {100 * ours:.1f} % for {100 * theirs[best]:.1f} % of `{best}`"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -205,7 +224,10 @@ def main() -> None:
             print(mean_gains(scenes, recipe, other))
     print()
     for scene, rows in scenes.items():
-        for line in bad_views(scene, rows, recipe):
+        for line in (
+            *bad_views(scene, rows, recipe),
+            *drawn_through(scene, rows, recipe, [*options.against, *controls]),
+        ):
             print(line)
     sys.exit(1 if losses else 0)
 

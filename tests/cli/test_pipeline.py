@@ -96,6 +96,7 @@ def test_eval_writes_a_valid_record(
         "stokes_error",
         "depth_error_median_percent",
         "haze",
+        "depth_beyond",
         "mesh_fscore_1",
         "specular_psnr_dielectric",
     ):

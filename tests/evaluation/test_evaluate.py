@@ -65,6 +65,7 @@ def test_a_scene_without_ground_truth_has_its_stokes_error(changed: tuple[Path, 
     for key in (
         "depth_error_median_percent",
         "haze",
+        "depth_beyond",
         "mesh_fscore_1",
         "alpha_outside",
         "specular_psnr_dielectric",

@@ -86,6 +86,7 @@ def test_stokes_error_without_masks_is_over_the_whole_picture():
     for key in (
         "depth_error_median_percent",
         "haze",
+        "depth_beyond",
         "coverage_error",
         "alpha_outside",
         "specular_psnr_dielectric",
@@ -177,6 +178,23 @@ def test_haze_is_the_share_of_pixels_with_half_their_weight_in_front():
     counted = [float(in_front[p]) >= 0.5 for p in PIXELS if smooth[p]]
     assert 0 < sum(counted) < len(counted)
     assert score(view, facts)["haze"] == pytest.approx(sum(counted) / len(counted))
+
+
+def test_depth_beyond_counts_what_is_drawn_from_behind_the_surface():
+    scene = known_scene()
+    view, facts = scene.views[0], SceneFacts.of(scene)
+    result, *_ = rendered(view, 5)
+    true = view.ground_truth.depth
+    factor = torch.tensor(np.random.default_rng(6).uniform(0.5, 2.0, (HEIGHT, WIDTH)), dtype=true.dtype)
+    factor[3:5] = 1.2499
+    factor[7:9] = 1.2501
+    factor[:, 3] = 0.0  # nothing covers these
+    result.depth = factor * true
+    smooth = without_jumps(true) & ~view.invalid
+    counted = [float(factor[p]) > 1.25 or float(factor[p]) == 0.0 for p in PIXELS if smooth[p]]
+    assert 0 < sum(counted) < len(counted)
+    got = score_view(ViewTarget.of_view(view, facts, CPU), result)["depth_beyond"]
+    assert got == pytest.approx(sum(counted) / len(counted))
 
 
 def test_jumps_of_depth():

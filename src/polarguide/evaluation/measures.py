@@ -15,6 +15,8 @@ LEAST_POLARIZED = 1e-3
 """Where |S1| + |S2| is less than this share of S0, nothing was measured that a prediction could be compared with."""
 HAZE_DEPTH = 0.8
 """What hangs before a surface is nearer than this share of the surface's depth."""
+DEPTH_BEYOND = 1.25
+"""What is drawn behind a surface is farther than this many times the surface's depth."""
 
 
 def stokes_error(pred: Tensor, true: Tensor, keep: Selection, photograph: Tensor) -> Tensor:
@@ -42,6 +44,16 @@ def depth_error_percent(pred: Tensor, true: Tensor, keep: Selection, extent: flo
 def haze_share(in_front: Tensor, keep: Selection) -> Tensor:
     """Share of the pixels of which at least half the weight [H, W] lies in front; NaN where no pixel counts."""
     return (keep.pick(in_front) >= 0.5).to(torch.float64).mean()
+
+
+def beyond_share(pred: Tensor, true: Tensor, keep: Selection) -> Tensor:
+    """Share of the pixels drawn from behind the true surface, of depths [H, W]; NaN where no pixel counts.
+
+    Those are the ones farther than ``DEPTH_BEYOND`` times the true depth, and those that nothing covers (depth 0).
+    """
+    drawn = keep.pick(pred)
+    beyond = (drawn > DEPTH_BEYOND * keep.pick(true)) | (drawn <= 0)
+    return beyond.to(torch.float64).mean()
 
 
 def coverage_error(alpha: Tensor, mask: Tensor, keep: Selection) -> Tensor:

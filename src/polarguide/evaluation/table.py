@@ -13,6 +13,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from polarguide.evaluation.measures import (
+    beyond_share,
     coverage_error,
     depth_error_percent,
     haze_share,
@@ -201,6 +202,16 @@ METRICS: tuple[Metric, ...] = (
         2,
         "lower",
         measure=_of_layer(haze_share, "in_front", "smooth"),
+        shown="files",
+        factor=100.0,
+    ),
+    Metric(
+        "depth_beyond",
+        "depth beyond",
+        "%",
+        2,
+        "lower",
+        measure=_compared(beyond_share, "depth", "depth", "smooth"),
         shown="files",
         factor=100.0,
     ),
