@@ -52,6 +52,18 @@ void expect_permutation(const std::vector<int32_t> &permutation, int statistic_c
                                     std::to_string(statistic_channels));
 }
 
+// Which of the still channels each channel is; each at most once.
+std::vector<int32_t> inverse(const std::vector<int32_t> &still, int channels) {
+    std::vector<int32_t> of_channel(size_t(channels), -1);
+    for (size_t i = 0; i < still.size(); ++i) {
+        if (still[i] < 0 || still[i] >= channels || of_channel[size_t(still[i])] >= 0)
+            throw std::invalid_argument("still: expected different channels below " + std::to_string(channels) +
+                                        ", found " + std::to_string(still[i]));
+        of_channel[size_t(still[i])] = int32_t(i);
+    }
+    return of_channel;
+}
+
 constexpr int64_t nothing_drawn = -1;
 
 struct Wrapped {
@@ -120,8 +132,8 @@ void bind_raster(nb::module_ &module) {
             "backward",
             [](Wrapped &self, const Array &means, const Array &quaternions, const Array &scales, const Array &opacities,
                const Array &features, const Array &out, const Array &grad_out, const Array &grad_alpha, Array d_means,
-               Array d_quaternions, Array d_scales, Array d_opacities, Array d_features,
-               std::optional<Array> statistic) {
+               Array d_quaternions, Array d_scales, Array d_opacities, Array d_features, std::optional<Array> statistic,
+               const std::vector<int32_t> &still, std::optional<Array> grad_still) {
                 if (!self.rasterizer.kept()) throw std::invalid_argument("backward: no forward pass was kept for it");
                 GaussianInputs in = inputs(means, quaternions, scales, opacities, features);
                 if (self.drawn == nothing_drawn) throw std::invalid_argument("backward: expected a forward pass before it");
@@ -136,14 +148,20 @@ void bind_raster(nb::module_ &module) {
                 expect_shape(d_means, "d_means", {in.count, 3});
                 expect_shape(d_features, "d_features", {in.count, self.channels});
                 if (statistic) expect_shape(*statistic, "statistic", {in.count, 2});
+                Rasterizer::StillGradient held{nullptr, inverse(still, self.channels), int(still.size())};
+                if (grad_still) {
+                    expect_shape(*grad_still, "grad_still", {self.height, self.width, held.count});
+                    if (held.count) held.values = grad_still->data();
+                }
                 nb::gil_scoped_release release;
-                self.rasterizer.backward(in, out.data(), grad_out.data(), grad_alpha.data(),
+                self.rasterizer.backward(in, out.data(), grad_out.data(), grad_alpha.data(), held,
                                          {d_means.data(), d_quaternions.data(), d_scales.data(), d_opacities.data(),
                                           d_features.data(), statistic ? statistic->data() : nullptr});
             },
             nb::arg("means"), nb::arg("quaternions"), nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
             nb::arg("out"), nb::arg("grad_out"), nb::arg("grad_alpha"), nb::arg("d_means"), nb::arg("d_quaternions"),
-            nb::arg("d_scales"), nb::arg("d_opacities"), nb::arg("d_features"), nb::arg("statistic").none())
+            nb::arg("d_scales"), nb::arg("d_opacities"), nb::arg("d_features"), nb::arg("statistic").none(),
+            nb::arg("still") = std::vector<int32_t>{}, nb::arg("grad_still") = nb::none())
         .def_prop_ro("pairs", [](const Wrapped &self) { return self.rasterizer.pairs(); },
                      "Contributing pixel-Gaussian pairs of the last forward pass that counted them.")
         .def_prop_ro("instances", [](const Wrapped &self) { return self.rasterizer.instances(); },

@@ -63,6 +63,9 @@ struct RasterArgs {
     float surface_width;            // of what is blended around the median depth, in shares of that
     // Backward, in (out and transmittance are read)
     const float *grad_out, *grad_alpha; // [H,W,channels_real], [H,W]
+    const float *grad_still;            // [H,W,still_count] to the features alone; null: none
+    const int32_t *still;               // [channels_real] which channel of it each channel gets, -1: none
+    int still_count;
     int statistic_channels;
     float *grad_instances;          // [instances, channels + instance_extra]
 };

@@ -7,7 +7,9 @@ namespace {
 
 // Gradients of one block, loaded pixel-wise into lanes.
 template <int D> struct BlockGradients {
-    alignas(64) float g[D][16];
+    // To what is drawn, and to the features: what comes to these alone moves and fades no Gaussian.
+    alignas(64) float g[D][16], own[D][16];
+    const float (*features)[16];
     // Sum over what is not yet passed of weight * (feature . g): of all channels and the alpha output, and of those of
     // the statistic alone.
     alignas(64) float remaining[16], remaining_statistic[16];
@@ -15,6 +17,9 @@ template <int D> struct BlockGradients {
 template <int D>
 POLARGUIDE_INLINE void load_gradients(const RasterArgs &a, const Block &b, BlockGradients<D> *r) {
     for (int k = 0; k < D; ++k) store(r->g[k], vf{});
+    if (a.grad_still)
+        for (int k = 0; k < D; ++k) store(r->own[k], vf{});
+    r->features = a.grad_still ? r->own : r->g;
     store(r->remaining, vf{}), store(r->remaining_statistic, vf{});
     const int real = a.channels_real;
     const int rows = a.height - b.y < 4 ? a.height - b.y : 4, columns = a.width - b.x < 4 ? a.width - b.x : 4;
@@ -26,6 +31,10 @@ POLARGUIDE_INLINE void load_gradients(const RasterArgs &a, const Block &b, Block
             for (int k = 0; k < real; ++k) {
                 int channel = a.permutation[k];
                 r->g[k][4 * j + i] = g[channel];
+                if (a.grad_still) {
+                    const int still = a.still[channel];
+                    r->own[k][4 * j + i] = g[channel] + (still < 0 ? 0.0f : a.grad_still[pixel * a.still_count + still]);
+                }
                 sum += g[channel] * out[channel];
                 if (k + 1 == a.statistic_channels) r->remaining_statistic[4 * j + i] = sum;
             }
@@ -83,7 +92,7 @@ __attribute__((noinline)) void flush(Batch &batch, const BlockGradients<D> &grad
             for (int p = 0; p < 16; ++p) {
                 const reg w = reg_load(t + 16 * p + l);
                 for (int k = 0; k < step; ++k)
-                    if (k0 + k < D) acc[k] += w * gradients.g[k0 + k][p];
+                    if (k0 + k < D) acc[k] += w * gradients.features[k0 + k][p];
             }
             for (int k = 0; k < step; ++k)
                 if (k0 + k < D) reg_store(sums[k0 + k] + l, acc[k]);

@@ -196,11 +196,12 @@ void Rasterizer::surface(const GaussianInputs &in, float width, float *out) {
 }
 
 void Rasterizer::backward(const GaussianInputs &in, const float *out, const float *grad_out, const float *grad_alpha,
-                          const Gradients &gradients) {
+                          const StillGradient &still, const Gradients &gradients) {
     Buffer<float> rows;
     rows.resize(instance_count_ * (channels_ + instance_extra) + 16);
     RasterArgs args = raster_args(in);
     args.out = const_cast<float *>(out), args.grad_out = grad_out, args.grad_alpha = grad_alpha;
+    args.grad_still = still.values, args.still = still.of_channel.data(), args.still_count = still.count;
     args.grad_instances = rows.get();
     if (!gradients.statistic) args.statistic_channels = 0;
     for_tiles([&](int64_t tile, const RasterScratch &s) { POLARGUIDE_DISPATCH(raster_backward)(args, tile, s); });

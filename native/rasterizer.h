@@ -38,8 +38,14 @@ class Rasterizer {
     struct Gradients {
         float *means, *quaternions, *scales, *opacities, *features, *statistic; // statistic may be null
     };
+    // A gradient that reaches the features of some channels alone, [H,W,count]; none: `values` is null.
+    struct StillGradient {
+        const float *values;
+        std::vector<int32_t> of_channel; // [channels] which of them each channel gets, -1: none
+        int count;
+    };
     void backward(const GaussianInputs &in, const float *out, const float *grad_out, const float *grad_alpha,
-                  const Gradients &gradients);
+                  const StillGradient &still, const Gradients &gradients);
     int64_t pairs() const { return pairs_; }
     int64_t instances() const { return instance_count_; }
 

@@ -64,6 +64,8 @@ class Rasterizer:
         d_opacities: Tensor,
         d_features: Tensor,
         statistic: Tensor | None,
+        still: Sequence[int] = ...,
+        grad_still: Tensor | None = None,
     ) -> None: ...
     @property
     def pairs(self) -> int: ...

@@ -123,7 +123,13 @@ class _Return(torch.autograd.Function):
         return _values(grad)
 
 
-def rasterize(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
+def rasterize(
+    splats: Splats,
+    camera: Camera,
+    *,
+    statistic: ScreenStatistic | None = None,
+    still: tuple[int, ...] = (),
+) -> Rasterized:
     """The CPU's rasterizer for tensors there; pictures, gradients and the statistic are there, too."""
     assert all(isinstance(t, _There) for t in splats)
     here = Splats(*(_Bring.apply(t) for t in splats))
@@ -136,8 +142,8 @@ def rasterize(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | No
             statistic.gradient = _There(own.gradient)
 
         here[0].register_hook(fill)
-    found = rasterize_cpu(here, camera, statistic=own)
-    return Rasterized(*(_Return.apply(t) for t in found))
+    found = rasterize_cpu(here, camera, statistic=own, still=still)
+    return Rasterized(*(None if t is None else _Return.apply(t) for t in found))
 
 
 BACKEND = Backend(THERE, rasterize)

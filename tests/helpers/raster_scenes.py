@@ -98,16 +98,20 @@ def outcome(
     *,
     dtype: torch.dtype = torch.float32,
     seed: int = 7,
+    still: tuple[int, ...] = (),
 ) -> Outcome:
-    """Forward pass, and backward pass of random output gradients (the same for every dtype)."""
+    """Forward pass, and backward pass of random output gradients (the same for every dtype), to the still ones, too."""
     inputs = Splats(*(t.detach().to(dtype).requires_grad_() for t in splats))
     watched = ScreenStatistic(statistic) if statistic is not None else None
-    picture = rasterize(inputs, camera, statistic=watched)
+    picture = rasterize(inputs, camera, statistic=watched, still=still)
     generator = torch.Generator().manual_seed(seed)
     to_features = torch.randn(picture.features.shape, generator=generator)
     to_alpha = torch.randn(picture.alpha.shape, generator=generator)
     loss = (picture.features * to_features.to(picture.features)).sum()
     loss = loss + (picture.alpha * to_alpha.to(picture.alpha)).sum()
+    if picture.still is not None:
+        to_still = torch.randn(picture.still.shape, generator=generator)
+        loss = loss + (picture.still * to_still.to(picture.still)).sum()
     loss.backward()
     gradients = Splats(*(t.grad if t.grad is not None else torch.zeros_like(t) for t in inputs))
     return Outcome(

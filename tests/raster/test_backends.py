@@ -136,7 +136,7 @@ def test_a_picture_without_gradients_has_the_same_bits_and_nothing_to_go_back_to
     assert torch.equal(plain.alpha, expected.alpha)
     assert torch.equal(plain.radii, expected.radii)
     native = native_rasterizer(camera, 7, None)
-    inputs, picture = list(gaussians), [torch.empty_like(t) for t in plain]
+    inputs, picture = list(gaussians), [torch.empty_like(t) for t in plain[:3]]
     arguments = (*inputs, plain.features, plain.features, plain.alpha, *map(torch.empty_like, inputs), None)
     for forward in (lambda: None, lambda: native.forward(*inputs, *picture, for_backward=False)):
         forward()

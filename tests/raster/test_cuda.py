@@ -62,6 +62,20 @@ def test_a_statistic_costs_one_more_call_where_other_channels_are_there(
     assert len(gsplat_stand_in.calls) == len(blended) + 1
 
 
+@pytest.mark.parametrize("still", [(3, 4, 5), (6, 2)])
+@pytest.mark.parametrize("statistic", [None, (0, 1, 2)])
+def test_still_channels_as_in_the_reference(
+    still: tuple[int, ...], statistic: tuple[int, ...] | None
+) -> None:
+    camera = posed(23, 21)
+    gaussians = in_view(camera, 40, 7, seed=2)
+    found = outcome(rasterize_cuda, gaussians, camera, statistic, still=still)
+    expected = outcome(rasterize_reference, gaussians, camera, statistic, still=still, dtype=torch.float64)
+    worst = differences(found, expected)
+    worst.pop("radii")  # gsplat's are of another kind
+    assert max(worst.values()) < TOLERANCE, worst
+
+
 def test_a_camera_is_copied_once() -> None:
     camera, other = posed(16, 16), posed(16, 16)
     first = cuda._view(camera, torch.device("cpu"))

@@ -71,6 +71,15 @@ def test_statistic_over_channels_that_do_not_exist_is_refused(
         rasterize(round_gaussian(1.0, 0.5), looking_ahead(8, 8), statistic=ScreenStatistic(channels))
 
 
+@BOTH
+@pytest.mark.parametrize("channels", [(2,), (0, -1), (1, 1)])
+def test_still_channels_that_do_not_exist_are_refused(
+    rasterize: Rasterize, channels: tuple[int, ...]
+) -> None:
+    with pytest.raises(PolarguideError, match="still"):
+        rasterize(round_gaussian(1.0, 0.5), looking_ahead(8, 8), still=channels)
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64])
 def test_native_backend_refuses_other_number_types(dtype: torch.dtype) -> None:
     gaussians = round_gaussian(1.0, 0.5)

@@ -98,6 +98,7 @@ def test_ours_hold_normals_while_the_density_control_runs(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["polarguide", "polarguide-stokes"])
-def test_consistency_moves_the_depth_unless_a_variation_holds_it(name: str) -> None:
-    assert not any(stage.hold_depth for stage in layer_stages(name))
-    assert all(stage.hold_depth for stage in layer_stages(f"{name}:consistency-holds-depth"))
+def test_terms_on_normals_move_nothing_behind_the_subject(name: str) -> None:
+    assert all(stage.behind for stage in layer_stages(name))
+    assert all(stage.behind for stage in layer_stages(f"{name}:unpolarized"))
+    assert not any(stage.behind for stage in layer_stages(f"{name}:normals-move-all"))

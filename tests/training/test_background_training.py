@@ -164,10 +164,8 @@ def test_what_is_faint_in_all_views_goes_where_the_recipe_says_so(black_scene: S
 
 
 def test_all_stays_where_no_view_sees_anything(black_scene: Scene) -> None:
-    def nothing(splats, camera, *, statistic=None):  # type: ignore[no-untyped-def]
-        return rasterize_reference(
-            splats._replace(opacities=splats.opacities * 0), camera, statistic=statistic
-        )
+    def nothing(splats, camera, **asked):  # type: ignore[no-untyped-def]
+        return rasterize_reference(splats._replace(opacities=splats.opacities * 0), camera, **asked)
 
     made = Trainer(
         black_scene, RECIPES["3dgs"], TrainSettings(40, background="black"), Backend(BACKEND.device, nothing)

@@ -57,26 +57,33 @@ class _Splat(torch.autograd.Function):
     """Shapes and devices of a rasterizer, forward and backward."""
 
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
-        *tensors, camera, statistic = inputs
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        *tensors, camera, statistic, still = inputs
         assert all(t.device == META for t in tensors)
         ctx.save_for_backward(*tensors)
         ctx.statistic = statistic
         radii = tensors[0].new_empty(tensors[0].shape[0])
         ctx.mark_non_differentiable(radii)
         size = camera.height, camera.width
-        return tensors[4].new_empty(*size, tensors[4].shape[1]), tensors[4].new_empty(size), radii
+        again = tensors[4].new_empty(*size, len(still)) if still else None
+        return tensors[4].new_empty(*size, tensors[4].shape[1]), tensors[4].new_empty(size), radii, again
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        assert all(g.device == META for g in grads)
+        assert all(g is None or g.device == META for g in grads)
         if ctx.statistic is not None:
             ctx.statistic.gradient = ctx.saved_tensors[0].new_empty(ctx.saved_tensors[0].shape[0], 2)
-        return (*(torch.empty_like(t) for t in ctx.saved_tensors), None, None)
+        return (*(torch.empty_like(t) for t in ctx.saved_tensors), None, None, None)
 
 
-def stand_in(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
-    return Rasterized(*_Splat.apply(*splats, camera, statistic))
+def stand_in(
+    splats: Splats,
+    camera: Camera,
+    *,
+    statistic: ScreenStatistic | None = None,
+    still: tuple[int, ...] = (),
+) -> Rasterized:
+    return Rasterized(*_Splat.apply(*splats, camera, statistic, still))
 
 
 @pytest.fixture(autouse=True)

@@ -212,17 +212,18 @@ def test_a_loss_that_is_not_finite_stops_the_training(tiny_scene: Scene) -> None
 
 
 @pytest.mark.parametrize(("consistency", "moved"), [(0.1, True), (0.0, False)])
-def test_a_held_depth_is_not_moved_by_the_consistency(
+def test_behind_the_subject_the_consistency_moves_nothing(
     tiny_scene: Scene, consistency: float, moved: bool
 ) -> None:
     states = []
-    for held in (True, False):
+    for behind in ((1e-6, 2e-6), (1e6, 2e6)):
         stages = tuple(
             dataclasses.replace(
-                stage, weights=dataclasses.replace(stage.weights, consistency=consistency), hold_depth=held
+                stage, weights=dataclasses.replace(stage.weights, consistency=consistency), behind=behind
             )
             for stage in RECIPES["3dgs-dr"].stages
         )
         recipe = dataclasses.replace(RECIPES["3dgs-dr"], stages=stages)
         states.append(train(tiny_scene, recipe, steps=10)[0].state.tensors())
     assert ("gaussians.means" in different(*states)) == moved
+    assert ("gaussians.opacity_logits" in different(*states)) == moved

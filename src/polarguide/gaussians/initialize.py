@@ -43,7 +43,7 @@ def neighbor_distance(points: np.ndarray) -> np.ndarray:
     return np.sqrt((distance**2).mean(axis=1)).clip(min=1e-7)
 
 
-def _orbit(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, float]:
+def orbit(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, float]:
     """The median of the points [M, 3], and the distance from it within which nine tenths of the cameras [V, 3] are."""
     middle = np.median(points, axis=0)
     return middle, float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
@@ -51,7 +51,7 @@ def _orbit(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, float]:
 
 def far_away(means: Tensor, points: Tensor, centers: Tensor) -> Tensor:
     """Which of the positions [N, 3] lie farther from the middle of the points [M, 3] than the cameras [V, 3]; [N]."""
-    middle, radius = _orbit(points.double().numpy(), centers.double().numpy())
+    middle, radius = orbit(points.double().numpy(), centers.double().numpy())
     return (means.double() - torch.from_numpy(middle)).norm(dim=1) > radius
 
 
@@ -73,7 +73,7 @@ def initial_parameters(
     random = np.random.default_rng(seed)
     sfm = points.double().numpy()
     cameras = centers.double().numpy()
-    middle, radius = _orbit(sfm, cameras)
+    middle, radius = orbit(sfm, cameras)
     directions = random.normal(size=(settings.shell, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     near, far = (radius * r for r in settings.shell_radii)

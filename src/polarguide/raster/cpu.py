@@ -54,8 +54,12 @@ def finite(*splats: Tensor) -> list[Tensor]:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, camera: Camera, statistic: ScreenStatistic | None, *splats: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx: Any,
+        camera: Camera,
+        statistic: ScreenStatistic | None,
+        still: tuple[int, ...],
+        *splats: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         inputs = finite(*splats)
         count, channels = inputs[-1].shape
         rasterizer = native_rasterizer(camera, channels, statistic)
@@ -66,28 +70,36 @@ class _Rasterize(torch.autograd.Function):
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(*inputs, out)
         ctx.rasterizer = rasterizer
-        ctx.statistic = statistic
-        return out, alpha, radii
+        ctx.statistic, ctx.still = statistic, still
+        return out, alpha, radii, out[..., list(still)] if still else None
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_out: Tensor, grad_alpha: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: Any, grad_out: Tensor, grad_alpha: Tensor, _: Tensor, grad_still: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         *inputs, out = ctx.saved_tensors
         gradients = [torch.empty_like(t) for t in inputs]
         screen = torch.empty(inputs[0].shape[0], 2) if ctx.statistic else None
-        ctx.rasterizer.backward(
-            *inputs, out, grad_out.contiguous(), grad_alpha.contiguous(), *gradients, screen
-        )
+        pictures = out, grad_out.contiguous(), grad_alpha.contiguous()
+        still = None if grad_still is None else grad_still.contiguous()
+        ctx.rasterizer.backward(*inputs, *pictures, *gradients, screen, list(ctx.still), still)
         if ctx.statistic:
             ctx.statistic.gradient = screen
-        return (None, None, *gradients)
+        return (None, None, None, *gradients)
 
 
-def rasterize_cpu(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
+def rasterize_cpu(
+    splats: Splats,
+    camera: Camera,
+    *,
+    statistic: ScreenStatistic | None = None,
+    still: tuple[int, ...] = (),
+) -> Rasterized:
     """See ``polarguide.raster.interface``. CPU tensors, float32; deterministic for any number of threads."""
-    check_shapes(splats, statistic)
+    check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             found, remedy = f"{tensor.dtype} on {tensor.device}", "Convert it, or use rasterize_reference."
             raise refusal(name, "float32 on the CPU", found, remedy)
-    return Rasterized(*_Rasterize.apply(camera, statistic, *splats))
+    return Rasterized(*_Rasterize.apply(camera, statistic, still, *splats))

@@ -257,12 +257,24 @@ def _sorted_channels(picture: Tensor, channels: list[int]) -> Tensor:
     return torch.stack([picture[..., channels.index(k)] for k in range(len(channels))], dim=-1)
 
 
-def rasterize_cuda(splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None) -> Rasterized:
+def rasterize_cuda(
+    splats: Splats,
+    camera: Camera,
+    *,
+    statistic: ScreenStatistic | None = None,
+    still: tuple[int, ...] = (),
+) -> Rasterized:
     """See ``polarguide.raster.interface``, and the module for the differences. CUDA tensors, float32."""
-    check_shapes(splats, statistic)
+    check_shapes(splats, statistic, still)
     projected = _project(splats, camera)
     if statistic is not None and torch.is_grad_enabled() and projected.means2d.requires_grad:
         picture, alpha = _blend_with_statistic(projected, splats.features, camera, statistic)
     else:
         picture, alpha = _blend(projected, splats.features, camera)
-    return Rasterized(picture, alpha, projected.radii[0].amax(dim=-1).to(splats.means.dtype))
+    again = None
+    if still:
+        # A blend of its own, since gsplat's kernel has one gradient for all channels.
+        unmoved = _Projected(*(t.detach() for t in projected))
+        again, _ = _blend(unmoved, _channels(splats.features, list(still)), camera)
+    radii = projected.radii[0].amax(dim=-1).to(splats.means.dtype)
+    return Rasterized(picture, alpha, radii, again)

@@ -55,11 +55,14 @@ class Rasterized(NamedTuple):
         alpha: [H, W] in [0, 1], 1 - transmittance.
         radii: [N] pixels, three standard deviations of the wider axis of each projected Gaussian, or what the
             backend's module says; 0 where culled.
+        still: [H, W, S] the channels that were asked for once more, with a gradient on the Gaussians' features alone:
+            it changes what they show, and neither moves nor fades them. None: none was asked for.
     """
 
     features: Tensor
     alpha: Tensor
     radii: Tensor
+    still: Tensor | None = None
 
 
 @dataclass
@@ -85,6 +88,7 @@ class Rasterize(Protocol):
         splats: the Gaussians.
         camera: the view.
         statistic: filled by the backward pass, if given.
+        still: channels that the result has once more, see ``Rasterized``.
 
     Raises:
         PolarguideError: shapes that do not fit, or values that are not finite (checked only where that does not mean
@@ -92,12 +96,17 @@ class Rasterize(Protocol):
     """
 
     def __call__(
-        self, splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None
+        self,
+        splats: Splats,
+        camera: Camera,
+        *,
+        statistic: ScreenStatistic | None = None,
+        still: tuple[int, ...] = (),
     ) -> Rasterized: ...
 
 
-def check_shapes(splats: Splats, statistic: ScreenStatistic | None) -> None:
-    """Check that the shapes fit each other, and that the statistic's channels exist.
+def check_shapes(splats: Splats, statistic: ScreenStatistic | None, still: tuple[int, ...] = ()) -> None:
+    """Check that the shapes fit each other, and that the channels of the statistic and the still ones exist.
 
     Raises:
         PolarguideError: they do not.
@@ -111,10 +120,10 @@ def check_shapes(splats: Splats, statistic: ScreenStatistic | None) -> None:
             raise refusal(name, f"shape {list(shape)}", str(list(tensor.shape)), remedy)
     if not 1 <= channels <= 32:
         raise refusal("features", "1 to 32 channels", str(channels), "Split the channels.")
-    chosen = statistic.channels if statistic else ()
-    if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):
-        remedy = "Name channels that exist, each once."
-        raise refusal("statistic", f"different channels below {channels}", str(chosen), remedy)
+    for name, chosen in (("statistic", statistic.channels if statistic else ()), ("still", still)):
+        if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):
+            remedy = "Name channels that exist, each once."
+            raise refusal(name, f"different channels below {channels}", str(chosen), remedy)
 
 
 def not_finite(name: str, index: int) -> PolarguideError:

@@ -51,10 +51,14 @@ def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def rasterize_reference(
-    splats: Splats, camera: Camera, *, statistic: ScreenStatistic | None = None
+    splats: Splats,
+    camera: Camera,
+    *,
+    statistic: ScreenStatistic | None = None,
+    still: tuple[int, ...] = (),
 ) -> Rasterized:
     """See ``polarguide.raster.interface``; differentiable by autograd, exact but slow."""
-    check_shapes(splats, statistic)
+    check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         bad = (~torch.isfinite(tensor)).nonzero()
         if len(bad):
@@ -77,7 +81,9 @@ def rasterize_reference(
     alpha = torch.where(ended, torch.zeros_like(alpha), alpha)
     after = torch.cumprod(1 - alpha, dim=0)
     before = torch.cat((torch.ones_like(after[:1]), after[:-1]))
-    blended = (alpha * before).mT @ features[order]
+    weights = (alpha * before).mT
+    blended = weights @ features[order]
+    again = weights.detach() @ features[order][:, list(still)] if still else None
     coverage = 1 - after[-1] if len(order) else torch.zeros_like(pixels[:, 0])
     shape = (camera.height, camera.width)
     image = blended.reshape(*shape, features.shape[1])
@@ -91,7 +97,8 @@ def rasterize_reference(
         size = torch.tensor([camera.width, camera.height]).to(means)
         seen = visible & ((means2d + half > 0) & (means2d - half < size)).all(dim=1)
         radii = torch.where(seen, radii, torch.zeros_like(radii))
-    return Rasterized(image, coverage.reshape(shape), radii)
+    held = None if again is None else again.reshape(*shape, len(still))
+    return Rasterized(image, coverage.reshape(shape), radii, held)
 
 
 def _with_statistic(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> Tensor:

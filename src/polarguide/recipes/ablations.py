@@ -8,6 +8,7 @@ from typing import Any
 
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.recipes.polarguide import (
+    BEHIND,
     RECIPE_POLARGUIDE,
     RECIPE_POLARGUIDE_PAPER,
     RECIPE_POLARGUIDE_PAPER_KIND,
@@ -116,9 +117,9 @@ _COMMON = (
         priors(bright=0.0),
     ),
     (
-        "consistency-holds-depth",
-        "The consistency turns normals to the depth, and does not move the depth.",
-        staged(lambda stage: replace(stage, hold_depth=True)),
+        "normals-move-all",
+        "Terms on normals move what lies behind the subject, too.",
+        staged(lambda stage: replace(stage, behind=None)),
     ),
     (
         "without-planes",
@@ -163,7 +164,11 @@ ABLATIONS_3DGS_DR = varied(
     (
         "consistent",
         "Flat Gaussians whose normals agree with the depth: what geometry gives without polarization.",
-        staged(lambda stage: replace(stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1))),
+        staged(
+            lambda stage: replace(
+                stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1), behind=BEHIND
+            )
+        ),
     ),
     (
         "without-propagation",

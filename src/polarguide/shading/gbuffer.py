@@ -17,6 +17,7 @@ from polarguide.shading.native import split_native
 from polarguide.shading.result import RenderResult
 
 COLOR_CHANNELS = (0, 1, 2)
+NORMAL_CHANNELS = (3, 4, 5)
 NO_LIGHT: Light = MappingProxyType({})
 
 
@@ -31,6 +32,7 @@ def render(
     normals: bool = True,
     depth: bool = False,
     held: bool = False,
+    still: bool = False,
     surface: bool = False,
     statistic: ScreenStatistic | None = None,
 ) -> RenderResult:
@@ -44,6 +46,7 @@ def render(
         normals: also splat normals where the shading model does not need them.
         depth: also splat camera depth.
         held: also give the layers without a gradient on the normals, of a shading model that has them.
+        still: also give the blended normal with a gradient that turns Gaussians and neither moves nor fades them.
         surface: normals and depth are those around the median depth, without gradients; the layers are shaded as ever.
         statistic: see ``ScreenStatistic``; the color channels come first.
     """
@@ -59,7 +62,12 @@ def render(
     channels.insert(1, axes)
     if depth:
         channels.append(((means - center) @ pose.rotation[2])[:, None])
-    picture = rasterize(splats(gaussians, torch.cat(channels, dim=1)), camera, statistic=statistic)
+    picture = rasterize(
+        splats(gaussians, torch.cat(channels, dim=1)),
+        camera,
+        statistic=statistic,
+        still=NORMAL_CHANNELS if still and normals else (),
+    )
     features, normal, camera_depth = split(picture.features, picture.alpha, normals=normals, depth=depth)
     splatted = GBuffer(features, picture.alpha)
     if held and normals:
@@ -81,6 +89,7 @@ def render(
         alpha=picture.alpha,
         radii=picture.radii,
         held=again,
+        still_normal=picture.still,
         metal=layers.get("metal"),
         blended_normal=blended,
     )

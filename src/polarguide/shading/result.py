@@ -49,6 +49,8 @@ class RenderResult:
         radii: [N] pixels, of the projected Gaussians; 0 where culled; None where there are no Gaussians.
         held: ``specular``, ``diffuse`` and ``metal`` once more, without a gradient on the normals; None where not asked
             for.
+        still_normal: the blended normal once more, with a gradient that turns Gaussians and neither moves nor fades
+            them; None where not asked for.
         metal: what metals add to ``specular``; None where there is none.
         blended_normal: the blended normal, where ``normal`` is that of the surface.
     """
@@ -64,6 +66,7 @@ class RenderResult:
     alpha: Tensor
     radii: Tensor | None = None
     held: HeldLayers | None = None
+    still_normal: Tensor | None = None
     metal: MetalPixels | None = None
     metalness: Tensor | None = None
     blended_normal: Tensor | None = None
@@ -90,4 +93,5 @@ class RenderResult:
                     for new, old in zip((height, width), layer.shape[:2], strict=True)
                 )
                 found[name] = layer[rows][:, columns]
-        return replace(self, held=None, radii=None, metal=None, blended_normal=None, **found)
+        bare: dict[str, Any] = dict.fromkeys(("held", "still_normal", "radii", "metal", "blended_normal"))
+        return replace(self, **bare, **found)

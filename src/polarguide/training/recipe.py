@@ -126,7 +126,10 @@ class Stage:
         hold_normals: whether the terms on the layers reach the normals through Fresnel's equations alone, and not
             through what the layers mirror at them: the separated pictures are made with the normals of before, so that
             normals which follow them confirm their own errors.
-        hold_depth: whether the consistency turns normals to the depth, and does not move the depth to the normals.
+        behind: where, in shares of the distance of the cameras from the middle of the points (nine tenths are nearer),
+            terms on normals and depth begin to fade as movers of Gaussians, and from where on they only turn them
+            (``training.behind``): behind the subject, surfaces that agree with their normals in place of the pictures
+            have grown from there. None: they move everything.
     """
 
     name: str
@@ -139,7 +142,7 @@ class Stage:
     on_enter: tuple[Action, ...] = ()
     rate_factors: Mapping[str, float] = field(default_factory=dict)
     hold_normals: bool = False
-    hold_depth: bool = False
+    behind: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

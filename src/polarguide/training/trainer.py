@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -20,12 +19,13 @@ from polarguide.capture.smaller import smaller
 from polarguide.color import srgb_encode
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
-from polarguide.gaussians.initialize import far_away, scene_extent
+from polarguide.gaussians.initialize import far_away, orbit, scene_extent
 from polarguide.raster import Backend, ScreenStatistic
 from polarguide.shading.gbuffer import COLOR_CHANNELS, render
 from polarguide.shading.model import PLAIN
 from polarguide.shading.visibility import outward_directions, touched_pixels
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
+from polarguide.training.behind import turned_behind
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
 from polarguide.training.metals import CONTRADICTED, contradiction, decide, evidence, light_gain
@@ -92,6 +92,7 @@ class Trainer:
         self._rate = math.sqrt(settings.views_per_step)
         centers = torch.stack([view.camera.center for view in scene.train_views])
         self._extent = scene_extent(centers)
+        self._reach = orbit(scene.points.double().numpy(), centers.double().numpy())[1]
         self._middle = centers.mean(dim=0).float().to(self._device)
         empty = free_space(scene.points, [view.camera for view in scene.train_views])
         self._empty = empty.to(self._device)
@@ -217,6 +218,7 @@ class Trainer:
         shading = self.shading if stage.reflection else PLAIN
         statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
         priors = self._priors_of(view, stage)  # before there is a picture, which takes memory, too
+        turning = stage.behind is not None and stage.weights.normals
         result = render(
             state.gaussians,
             view.camera,
@@ -225,12 +227,15 @@ class Trainer:
             shading=shading,
             light=state.light,
             normals=stage.weights.normals,
-            depth=stage.weights.depth,
+            depth=stage.weights.depth or turning,
+            still=turning,
             held=stage.reflection and stage.hold_normals and stage.weights.layers,
             statistic=statistic,
         )
-        if stage.hold_depth and result.depth is not None:
-            result = replace(result, depth=result.depth.detach())
+        if turning:
+            assert stage.behind is not None
+            near, far = (share * self._reach for share in stage.behind)
+            result = turned_behind(result, near, far)
         shown = self._sizes.feed(state.step).shown(view)
         loss, photometric = step_loss(
             result,

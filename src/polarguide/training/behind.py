@@ -1,0 +1,39 @@
+"""What lies behind the subject: terms on normals turn the Gaussians there, and neither move nor fade them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from polarguide.shading.result import RenderResult
+
+
+def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult:
+    """The same pictures, whose normal and depth move no Gaussian far away.
+
+    Gradients of the normal and the depth reach everything up to ``near``; from there they fade, linearly in inverse
+    depth, and from ``far`` on the depth has none, and the normal one that turns Gaussians alone. A pixel is as far away
+    as the farthest of its 3 x 3 neighbors, since the normals of the depth look at these.
+
+    Args:
+        result: with ``normal``, ``still_normal`` and ``depth``.
+        near, far: camera depths, 0 < near < far.
+    """
+    assert result.normal is not None
+    assert result.still_normal is not None
+    assert result.depth is not None
+    held = result.depth.detach()
+    share = shares_before(held, near, far)
+    return replace(
+        result,
+        normal=result.still_normal.lerp(result.normal, share[..., None]),
+        depth=held.lerp(result.depth, share),
+    )
+
+
+def shares_before(depth: Tensor, near: float, far: float) -> Tensor:
+    """From 1 up to ``near`` to 0 from ``far`` on, of the farthest of the 3 x 3 neighbors; [H, W] like the depth."""
+    farthest = max_pool2d(depth[None], 3, 1, 1)[0].clamp(min=near)
+    return ((1 / farthest - 1 / far) / (1 / near - 1 / far)).clamp(min=0)
