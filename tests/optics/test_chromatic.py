@@ -47,6 +47,12 @@ def test_neutral_reflection_over_body_colors_gives_both_angles_exactly(
     assert torch.allclose(found.zenith, torch.tensor(zenith, dtype=F64), atol=1e-6)
     assert half_turn_distance(found.azimuth, 0.7).abs().max() < 1e-6
     assert bool((found.certainty > 100).all())
+    s0 = light[0]
+    middle = s0.mean(dim=-1)
+    among = ((s0 - middle[..., None]) ** 2).mean(dim=-1)
+    # Away from the border, where the window is whole, and on average over it.
+    window = (among[:5, :5].mean().sqrt() / middle[:5, :5].mean()).expand(())
+    assert float(found.contrast[2, 2]) == pytest.approx(float(window))
 
 
 def test_the_wrong_lobe_of_the_mixture_does_not_matter() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,6 +109,28 @@ def test_color_differences_find_the_plane_that_a_wrong_guide_misses(view: View) 
     assert float(distance[False][decided].mean()) > 0.5
     assert float(distance[True][decided].mean()) < 0.1
     assert torch.equal(distance[True][~decided], distance[False][~decided])
+
+
+def test_color_differences_of_gray_bodies_count_near_the_guide_alone(view: View) -> None:
+    rays, true = view.camera.world_rays(), guide_of(view)
+    loose, strict = (
+        replace(EXACT, chromatic=True, chromatic_within=within) for within in (None, (20.0, 40.0))
+    )
+    side = torch.nn.functional.normalize(torch.linalg.cross(rays, true), dim=-1)
+    # At 60 degrees the mirrored side of some rays is nearer.
+    for degrees, least, most in ((0, 0.9, 1.0), (30, 0.35, 0.65), (60, 0.0, 0.3)):
+        turn = math.radians(degrees)
+        guide = math.cos(turn) * true + math.sin(turn) * torch.linalg.cross(side, true)
+        free, held = (view_priors(view, guide, settings, INDEX) for settings in (loose, strict))
+        contrast = optics.chromatic_normals(view.stokes(), INDEX).contrast
+        assert torch.equal(held.chromatic_weight[contrast > 0.3], free.chromatic_weight[contrast > 0.3])
+        known = (contrast < 0.2) & (free.chromatic_weight > 0.5) & (true.norm(dim=-1) > 0.5)
+        # Where the turned guide faces the camera still: others are brought to grazing.
+        known &= (guide * rays).sum(-1) < -0.1
+        assert int(known.sum()) > 60
+        kept = float(held.chromatic_weight[known].sum() / free.chromatic_weight[known].sum())
+        assert least <= kept <= most, degrees
+        assert not bool((held.chromatic_weight > free.chromatic_weight).any())
 
 
 def test_shapes_ranges_and_units(view: View) -> None:

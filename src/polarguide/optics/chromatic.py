@@ -34,12 +34,14 @@ class ChromaticNormals(NamedTuple):
         certainty: [H, W] explained over unexplained polarization, a ratio of standard deviations; 0 where
             there is no color.
         decided: [H, W] bool, where diffuse light alone can explain the slope: see ``chromatic_normals``.
+        contrast: [H, W] standard deviation of S0 among the colors of the window, as a share of S0; 0 or more.
     """
 
     zenith: Tensor
     azimuth: Tensor
     certainty: Tensor
     decided: Tensor
+    contrast: Tensor
 
 
 @for_arrays
@@ -97,4 +99,5 @@ def chromatic_normals(
     decided = colored & (certainty >= minimum_certainty) & (degree < 0.95 * limit)
     decided = decided & (against | (dolp(mean) < pure_lobe_dolp))
     zenith = diffuse_zenith(degree.clamp(max=limit), refractive_index)
-    return ChromaticNormals(zenith, safe_atan2(slope2, slope1) / 2, certainty, decided)
+    contrast = variance.sqrt() / s0.clamp(min=least)
+    return ChromaticNormals(zenith, safe_atan2(slope2, slope1) / 2, certainty, decided, contrast)

@@ -106,6 +106,11 @@ _COMMON = (
         both(off("chromatic"), priors(chromatic=False)),
     ),
     (
+        "colour-unchecked",
+        "Normals of gray bodies' color differences count however far the Gaussians' normals are from them.",
+        priors(chromatic_within=None),
+    ),
+    (
         "without-easing",
         "Every term weighs as much in the final stage as before, and rotations learn as fast.",
         firm_to_the_end,

@@ -82,6 +82,7 @@ RECIPE_POLARGUIDE: Recipe = replace(
         azimuth_weight=1.0,
         snr=3.0,
         chromatic=True,
+        chromatic_within=(30.0, 45.0),
         azimuth_share=0.5,
         chromatic_share=0.1,
         bright=0.1,

@@ -29,6 +29,8 @@ MINIMUM_NORMAL = 0.3
 FULL_CERTAINTY = 3.0
 # Below this degree of polarization their plane takes the place of the AoLP's.
 CHROMATIC_PLANE_DOLP = 0.03
+# Contrasts among the colors between which a body goes over from gray to colorful.
+GRAY = (0.2, 0.3)
 # Cosine between a guide and the normal of a flat surface, under which the guide is wrong; it may know of ripples.
 ASTRAY = math.cos(math.radians(10))
 # Shares of metals between which a pixel goes over from a dielectric to a metal.
@@ -107,6 +109,7 @@ class Unguided(NamedTuple):
         degree: [H, W] DoLP, where the settings look at its noise without what that adds to it.
         zenith, azimuth: [H, W] radians, of the normals of the color differences; None where these are not asked for.
         certainty: [H, W] weight of these normals, in [0, 1], 0 where color decides nothing; None likewise.
+        colorful: [H, W] from 0 where the body is gray to 1 where it has a color; None likewise.
     """
 
     usable: Tensor
@@ -114,6 +117,7 @@ class Unguided(NamedTuple):
     zenith: Tensor | None = None
     azimuth: Tensor | None = None
     certainty: Tensor | None = None
+    colorful: Tensor | None = None
 
 
 @torch.no_grad()
@@ -198,9 +202,12 @@ def view_priors(
         astray = flat.where & ~(shown & (dot(guide, on_plane) > ASTRAY))
         guide, shown = torch.where(astray[..., None], on_plane, guide), shown | flat.where
     nearest_to = guide
-    zenith, azimuth, certainty = found
-    if zenith is not None and azimuth is not None and certainty is not None:
+    zenith, azimuth, certainty, colorful = found
+    if zenith is not None and azimuth is not None and certainty is not None and colorful is not None:
         chromatic, chromatic_weight = facing(zenith, azimuth, guide, rays), certainty * shown
+        if settings.chromatic_within is not None:
+            near = _within(chromatic, guide, *settings.chromatic_within)
+            chromatic_weight = chromatic_weight * torch.maximum(near, colorful)
         chromatic = torch.where(astray[..., None], on_plane, chromatic)
         chromatic_weight = torch.maximum(chromatic_weight, astray.to(chromatic_weight))
         nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
@@ -257,6 +264,12 @@ def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
     return -(luminance[1] * (x * x - y * y) + luminance[2] * (2 * x * y))
 
 
+def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
+    """1 up to ``full`` degrees between unit normals [H, W, 3], 0 from ``none`` on; [H, W]."""
+    off = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
+    return ((none - off) / (none - full)).clamp(0, 1)
+
+
 def _total(weight: Tensor, share: float) -> Tensor:
     return weight.sum().clamp(min=max(1.0, share * weight.numel()))
 
@@ -311,15 +324,21 @@ def facing_chromatic(
     Returns:
         [H, W, 3] unit, camera axes; [H, W] in [0, 1], 0 where color decides nothing.
     """
-    zenith, azimuth, weight = _chromatic_angles(stokes, refractive_index, good)
+    zenith, azimuth, weight, _ = _chromatic_angles(stokes, refractive_index, good)
     return facing(zenith, azimuth, guide, rays), weight
 
 
-def _chromatic_angles(stokes: Tensor, refractive_index: float, good: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Zenith, azimuth and weight in [0, 1] of the normals of the color differences, each [H, W]."""
+def _chromatic_angles(
+    stokes: Tensor, refractive_index: float, good: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Zenith, azimuth and weight in [0, 1] of the normals of the color differences, and how colorful the body is, each
+    [H, W].
+    """
     found = optics.chromatic_normals(stokes, refractive_index)
+    gray, color = GRAY
     return (
         found.zenith,
         found.azimuth,
         (found.certainty / FULL_CERTAINTY).clamp(max=1) * (found.decided & good),
+        ((found.contrast - gray) / (color - gray)).clamp(0, 1),
     )

@@ -160,6 +160,9 @@ class Priors:
         azimuth_weight: in [0, 1], how much the choice among candidates trusts azimuth over zenith.
         snr: ratio of the DoLP to its noise above which a pixel's normal is used; 0 switches the test off.
         chromatic: whether the polarization of color differences gives the plane where it is decided.
+        chromatic_within: degrees from the Gaussians' normal up to which that of the color differences of a gray body
+            counts fully, and from where on not at all: under colored light it is the light that differs, and it points
+            anywhere. None: it counts wherever it is.
         azimuth_share, chromatic_share: of the pixels, the least that the terms on directions are averaged over, so that
             a view whose few pixels are polarized does not pull as hard as one that is polarized all over.
         bright: S0/2 from which on consistency counts fully whatever the DoLP, and below in proportion: where a surface
@@ -175,6 +178,7 @@ class Priors:
     azimuth_weight: float = 0.5
     snr: float = 0.0
     chromatic: bool = False
+    chromatic_within: tuple[float, float] | None = None
     azimuth_share: float = 0.0
     chromatic_share: float = 0.0
     bright: float = 0.0
