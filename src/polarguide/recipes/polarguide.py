@@ -14,7 +14,7 @@ from polarguide.training.recipe import Action, Priors, Recipe, Repeat, Stage, We
 
 REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)
 
-# The subject ends before: on scenes photographed from around, 99 % of its pixels are nearer.
+# The subject ends before: on ten rendered scenes, 95 to 100 % of its pixels are nearer than the first.
 BEHIND = (1.15, 1.5)
 _PLAIN = Stage("plain", 0.1, reflection=False, densify=True)
 
