@@ -4,7 +4,8 @@ Baselines deserve the search that our recipes had. Each setting is trained at ha
 not trained again. A table for each recipe: PSNR / foreground / normal error / specular / diffuse, and the gain in the
 picture over the recipe as it is (mean over scenes, PSNR and foreground, in dB).
 
-    python benchmarks/accuracy/tune_baselines.py SCENE... --out FOLDER [--recipes 3dgs ...] [--steps 1500] [--jobs 2]
+    python benchmarks/accuracy/tune_baselines.py SCENE... --out FOLDER [--recipes 3dgs ...] [--last N] [--steps 1500]
+        [--jobs 2]
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from polarguide.recipes import recipe_named
 from polarguide.recipes.baselines import RESET
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
-from polarguide.training.recipe import Recipe, Stage, Weights
+from polarguide.training.recipe import Recipe, Repeat, Stage, Weights
 
 SHOWN = ("psnr", "psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
 AS_IT_IS = "as it is"
@@ -66,6 +67,16 @@ def resets(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=tuple(stages))
 
 
+def repeated(recipe: Recipe, repeat: Repeat, **values: Any) -> Recipe:
+    """What a recipe repeats, at other times."""
+
+    def changed(stage: Stage) -> Stage:
+        repeats = (replace(each, **values) if each == repeat else each for each in stage.repeats)
+        return replace(stage, repeats=tuple(repeats))
+
+    return replace(recipe, stages=tuple(map(changed, recipe.stages)))
+
+
 def weighted(recipe: Recipe, **values: Any) -> Recipe:
     """Other weights of the terms that are on."""
 
@@ -96,11 +107,11 @@ def lengths(recipe: Recipe, **fractions: float) -> Recipe:
     return replace(recipe, stages=tuple(stages))
 
 
-def settings_of(name: str) -> Mapping[str, Recipe]:
-    """The settings of a recipe by what they change."""
+def settings_of(name: str, part: slice = slice(None)) -> Mapping[str, Recipe]:
+    """A part of the settings of a recipe by what they change, and the recipe as it is."""
     base = recipe_named(name)
     assert isinstance(base, Recipe)
-    return {AS_IT_IS: base, **SETTINGS[name](base)}
+    return {AS_IT_IS: base, **dict([*SETTINGS[name](base).items()][part])}
 
 
 def _of_3dgs(base: Recipe) -> dict[str, Recipe]:
@@ -123,6 +134,12 @@ def _of_3dgs(base: Recipe) -> dict[str, Recipe]:
         "for 70 % of the steps": lengths(base, densify=0.7),
         "for 30 %": lengths(base, densify=0.3),
         "no resets": staged(base, repeats=()),
+        "resets half as often": repeated(base, RESET, fraction=0.2, minimum=1400),
+        "opacities twice as fast": rates(base, opacity_logits=2),
+        "base colors twice as fast": rates(base, sh_dc=2),
+        "harmonics ten times as fast": rates(base, sh_rest=10),
+        "means decay to three tenths": replace(base, means_decay=0.3),
+        "half the gradient, for 70 %": lengths(densify(base, gradient=1e-4), densify=0.7),
     }
 
 
@@ -145,6 +162,8 @@ def _of_3dgs_dr(base: Recipe) -> dict[str, Recipe]:
         "propagations without resets between them": replace(base, stages=propagate),
         "density control at half the gradient": densify(base, gradient=1e-4),
         "at twice the gradient": densify(base, gradient=4e-4),
+        "half the gradient, first strength 0.02": shaded(densify(base, gradient=1e-4), first_strength=0.02),
+        "environment of 64 texels": shaded(base, environment_resolution=64),
     }
 
 
@@ -163,6 +182,9 @@ def _of_ref_gs(base: Recipe) -> dict[str, Recipe]:
         "consistency 0.1, flatness 0.3": staged(base, weights=Weights(consistency=0.1, flatness=0.3)),
         "resets as 3dgs has them": resets(base),
         "density control at half the gradient": densify(base, gradient=1e-4),
+        "density control for 70 % of the steps": lengths(base, densify=0.7),
+        "consistency 0.02, flatness 0.05": staged(base, weights=Weights(consistency=0.02, flatness=0.05)),
+        "grid learns three times as fast": shaded(base, environment_rate=3e-2),
     }
 
 
@@ -186,6 +208,14 @@ def _of_paper_kind(base: Recipe) -> dict[str, Recipe]:
         "strength learns twice as fast": shaded(base, strength_rate=1.2e-2),
         "environment of 16 texels": shaded(base, environment_resolution=16),
         "density control at half the gradient": densify(base, gradient=1e-4),
+        "first strength 0.02": shaded(base, first_strength=0.02),
+        "first strength 0.1": shaded(base, first_strength=0.1),
+        "strength half as fast": shaded(base, strength_rate=3e-3),
+        "normal 0.002": weighted(base, normal=0.002),
+        "first strength 0.02, normal 0.002": shaded(weighted(base, normal=0.002), first_strength=0.02),
+        "normal 0.005, DoLP over 0.05, 16 texels": shaded(
+            priors(weighted(base, normal=0.005), threshold=0.05), environment_resolution=16
+        ),
     }
 
 
@@ -215,11 +245,11 @@ def train(job: tuple[Path, Path, str, str, int, int]) -> None:
     print(f"{scene.name}, {name}, {setting}", file=sys.stderr, flush=True)
 
 
-def table(out: Path, scenes: list[Path], name: str) -> str:
+def table(out: Path, scenes: list[Path], name: str, part: slice) -> str:
     """The settings of a recipe, and what each gives on each scene."""
     scores = {
         setting: [read_metrics(folder_of(out, scene, name, setting)) for scene in scenes]
-        for setting in settings_of(name)
+        for setting in settings_of(name, part)
     }
     lines = [
         f"| `{name}` | {' | '.join(s.name for s in scenes)} | gain |",
@@ -249,18 +279,22 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument(
+        "--last", type=int, default=0, help="this many of each recipe's settings alone; 0: all"
+    )
     options = parser.parse_args()
+    part = slice(-options.last, None) if options.last else slice(None)
     jobs = [
         (options.out, scene, name, setting, options.steps, options.downscale)
         for name in options.recipes
-        for setting in settings_of(name)
+        for setting in settings_of(name, part)
         for scene in options.scenes
     ]
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
         for _ in pool.imap_unordered(train, jobs):
             pass
     for name in options.recipes:
-        print(table(options.out, options.scenes, name) + "\n")
+        print(table(options.out, options.scenes, name, part) + "\n")
 
 
 if __name__ == "__main__":
