@@ -27,7 +27,7 @@ from polarguide.recipes import recipe_named
 from polarguide.recipes.baselines import RESET
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
-from polarguide.training.recipe import Recipe, Repeat, Stage, Weights
+from polarguide.training.recipe import Recipe, Stage, Weights
 
 SHOWN = ("psnr", "psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
 AS_IT_IS = "as it is"
@@ -67,16 +67,6 @@ def resets(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=tuple(stages))
 
 
-def repeated(recipe: Recipe, repeat: Repeat, **values: Any) -> Recipe:
-    """What a recipe repeats, at other times."""
-
-    def changed(stage: Stage) -> Stage:
-        repeats = (replace(each, **values) if each == repeat else each for each in stage.repeats)
-        return replace(stage, repeats=tuple(repeats))
-
-    return replace(recipe, stages=tuple(map(changed, recipe.stages)))
-
-
 def weighted(recipe: Recipe, **values: Any) -> Recipe:
     """Other weights of the terms that are on."""
 
@@ -107,11 +97,11 @@ def lengths(recipe: Recipe, **fractions: float) -> Recipe:
     return replace(recipe, stages=tuple(stages))
 
 
-def settings_of(name: str, part: slice = slice(None)) -> Mapping[str, Recipe]:
-    """A part of the settings of a recipe by what they change, and the recipe as it is."""
+def settings_of(name: str, last: int = 0) -> Mapping[str, Recipe]:
+    """The settings of a recipe by what they change, or the last of them alone, and the recipe as it is."""
     base = recipe_named(name)
     assert isinstance(base, Recipe)
-    return {AS_IT_IS: base, **dict([*SETTINGS[name](base).items()][part])}
+    return {AS_IT_IS: base, **dict([*SETTINGS[name](base).items()][-last:])}
 
 
 def _of_3dgs(base: Recipe) -> dict[str, Recipe]:
@@ -134,7 +124,7 @@ def _of_3dgs(base: Recipe) -> dict[str, Recipe]:
         "for 70 % of the steps": lengths(base, densify=0.7),
         "for 30 %": lengths(base, densify=0.3),
         "no resets": staged(base, repeats=()),
-        "resets half as often": repeated(base, RESET, fraction=0.2, minimum=1400),
+        "SSIM 0.3": replace(base, ssim_weight=0.3),
         "opacities twice as fast": rates(base, opacity_logits=2),
         "base colors twice as fast": rates(base, sh_dc=2),
         "harmonics ten times as fast": rates(base, sh_rest=10),
@@ -245,11 +235,11 @@ def train(job: tuple[Path, Path, str, str, int, int]) -> None:
     print(f"{scene.name}, {name}, {setting}", file=sys.stderr, flush=True)
 
 
-def table(out: Path, scenes: list[Path], name: str, part: slice) -> str:
+def table(out: Path, scenes: list[Path], name: str, last: int) -> str:
     """The settings of a recipe, and what each gives on each scene."""
     scores = {
         setting: [read_metrics(folder_of(out, scene, name, setting)) for scene in scenes]
-        for setting in settings_of(name, part)
+        for setting in settings_of(name, last)
     }
     lines = [
         f"| `{name}` | {' | '.join(s.name for s in scenes)} | gain |",
@@ -283,18 +273,17 @@ def main() -> None:
         "--last", type=int, default=0, help="this many of each recipe's settings alone; 0: all"
     )
     options = parser.parse_args()
-    part = slice(-options.last, None) if options.last else slice(None)
     jobs = [
         (options.out, scene, name, setting, options.steps, options.downscale)
         for name in options.recipes
-        for setting in settings_of(name, part)
+        for setting in settings_of(name, options.last)
         for scene in options.scenes
     ]
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
         for _ in pool.imap_unordered(train, jobs):
             pass
     for name in options.recipes:
-        print(table(options.out, options.scenes, name, part) + "\n")
+        print(table(options.out, options.scenes, name, options.last) + "\n")
 
 
 if __name__ == "__main__":
