@@ -104,5 +104,7 @@ def test_far_away_is_what_lies_beyond_the_cameras() -> None:
     middle = points.median(dim=0).values
     places = middle + torch.tensor([[0.0, 3.0, 0.0], [0.0, 0.0, -6.0], [5.5, 0.0, 0.0]])
     assert far_away(places, points, centers).tolist() == [False, True, True]
+    assert far_away(places, points, centers, 0.5).tolist() == [True, True, True]
+    assert far_away((places - middle) / 4 + middle, points, centers, 0.5).tolist() == [False, False, False]
     rows = initial_parameters(points, colors, centers, SETTINGS, seed=0)
     assert far_away(rows["means"], points, centers).tolist() == [False] * 30 + [True] * 40

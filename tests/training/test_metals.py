@@ -203,6 +203,7 @@ def said(count: int, **values: Tensor) -> Evidence:
         near=near,
         alike=torch.ones(count, 5),
         brightness=torch.ones(count),
+        tint=torch.ones(count),
         metal_misfit=torch.full((count,), 0.1),
         oblique=torch.zeros(count),
         support=torch.ones(count),
@@ -211,16 +212,36 @@ def said(count: int, **values: Tensor) -> Evidence:
     return given._replace(**values)
 
 
+def test_what_is_too_deeply_colored_is_no_metal_unless_the_user_says_so() -> None:
+    ratio, tint, words = torch.full((60,), 3.0), torch.full((60,), 0.3), torch.zeros(60, 2)
+    tint[20:] = 0.2
+    words[50:, 1] = 5.0
+    found = said(60, ratio=ratio, tint=tint, said=words)
+    nothing = torch.zeros(60, dtype=torch.bool)
+    assert decide(found, nothing, ~nothing).nonzero()[:, 0].tolist() == [*range(20), *range(50, 60)]
+    assert not bool(decide(found, ~nothing, ~nothing)[20:50].any())
+
+
+@pytest.mark.parametrize(("material", "least", "most"), [("gold", 0.4, 0.75), ("red", 0.0, 0.4)])
+def test_the_tint_is_that_of_the_material(material: str, least: float, most: float) -> None:
+    """Half of the ball is gray, and so in part is the mean: by itself gold has 0.39, red paint 0.1 under its gloss."""
+    half = gaussians_of_the_ball()
+    found = evidence(half, views_of(material, other="aluminium"), rasterize_cpu, 1.5)
+    x, _, z = half["means"].unbind(1)
+    assert least < float(found.tint[(z > 0.1) & (x > 0.1)].median()) < most
+    assert float(found.tint[(z > 0.1) & (x < -0.1)].median()) > 0.55
+
+
 def test_metal_grows_where_it_is_likely_and_stays_where_it_was() -> None:
     ratio = torch.zeros(80)
     ratio[5:19], ratio[19:25], ratio[40:44], ratio[44:60], ratio[70] = 3.0, 1.0, 1.0, 3.0, 3.0
     nothing, all_ = torch.zeros(80, dtype=torch.bool), torch.ones(80, dtype=torch.bool)
     metal = decide(said(80, ratio=ratio), nothing, all_)
     assert metal.nonzero()[:, 0].tolist() == [*range(5, 25), *range(40, 60)]  # one alone is none
-    ratio[30:40], was = 0.35, nothing.clone()
+    ratio[30:40], was = 0.35, nothing.clone()  # less than is likely
     was[30:40] = True
     again = decide(said(80, ratio=ratio), was, all_)
-    assert again.nonzero()[:, 0].tolist() == [*range(5, 25), *range(30, 60)]
+    assert again.nonzero()[:, 0].tolist() == [*range(5, 25), *range(40, 60)]
     other_way = torch.ones(80, 5)
     other_way[19:, 1:] = 0
     metal = decide(said(80, ratio=ratio, alike=other_way), nothing, all_)
@@ -228,11 +249,38 @@ def test_metal_grows_where_it_is_likely_and_stays_where_it_was() -> None:
     assert not bool(metal[19:25].any())
 
 
+@pytest.mark.parametrize(("evidence_left", "stays"), [(1.4, True), (1.0, False)])
+def test_where_growth_does_not_reach_metal_stays_only_with_much_evidence(
+    evidence_left: float, stays: bool
+) -> None:
+    """Each of a patch has one sure Gaussian among its 16 nearest: too few to join, enough to be of one piece."""
+    ratio, was = torch.zeros(80), torch.zeros(80, dtype=torch.bool)
+    ratio[:20], ratio[30:40], was[30:40] = 3.0, evidence_left, True
+    own = torch.arange(80)[:, None]
+    near = torch.cat((own, own + torch.tensor([1, -1, 2, -2]), torch.full((80, 11), 70)), dim=1).clamp(0, 79)
+    near[30:40, 1:4] = torch.tensor([[5, 33, 36]])
+    alike = torch.ones(80, 16)
+    alike[:30, 5:] = alike[40:, 5:] = 0
+    near[:, 4] = torch.where(torch.arange(80) // 10 == 3, 70, near[:, 4])
+    found = said(80, ratio=ratio, near=near, alike=alike)
+    expected = [*range(20), *(range(30, 40) if stays else ())]
+    assert decide(found, was, ~torch.zeros(80, dtype=torch.bool)).nonzero()[:, 0].tolist() == expected
+
+
+def test_what_lies_among_metal_joins_unless_a_dielectric_is_clearly_better() -> None:
+    ratio, tint = torch.full((90,), -1.0), torch.ones(90)
+    ratio[5:80] = 3.0
+    ratio[20:22], ratio[40:42], ratio[60:62], tint[60:62] = -0.5, -0.9, -0.5, 0.1
+    nothing = torch.zeros(90, dtype=torch.bool)
+    metal = decide(said(90, ratio=ratio, tint=tint), nothing, ~nothing).nonzero()[:, 0].tolist()
+    assert metal == [*range(5, 40), *range(42, 60), *range(62, 80)]
+
+
 def test_pieces_of_which_little_is_sure_are_none() -> None:
     """As a plate in polarized light looks: a few Gaussians just beyond the limit, and many that are likely."""
     ratio = torch.zeros(300)
-    ratio[10:22], ratio[22:100] = 2.3, 1.2
-    ratio[150:170], ratio[170:220] = 2.3, 1.2
+    ratio[10:22], ratio[22:100] = 2.3, 1.4
+    ratio[150:170], ratio[170:220] = 2.3, 1.4
     ratio[250:256] = 4.0  # too few to be told
     nothing, all_ = torch.zeros(300, dtype=torch.bool), torch.ones(300, dtype=torch.bool)
     found, was = said(300, ratio=ratio), nothing.clone()

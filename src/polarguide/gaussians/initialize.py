@@ -49,10 +49,13 @@ def orbit(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, float]:
     return middle, float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
 
 
-def far_away(means: Tensor, points: Tensor, centers: Tensor) -> Tensor:
-    """Which of the positions [N, 3] lie farther from the middle of the points [M, 3] than the cameras [V, 3]; [N]."""
+def far_away(means: Tensor, points: Tensor, centers: Tensor, share: float = 1.0) -> Tensor:
+    """Which of the positions [N, 3] lie farther from the middle of the points [M, 3] than the cameras [V, 3]; [N].
+
+    Or than this share of the cameras' distance.
+    """
     middle, radius = orbit(points.double().numpy(), centers.double().numpy())
-    return (means.double() - torch.from_numpy(middle)).norm(dim=1) > radius
+    return (means.double() - torch.from_numpy(middle)).norm(dim=1) > share * radius
 
 
 def initial_parameters(

@@ -40,6 +40,9 @@ from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.training.priors import guide_normals
 from polarguide.vectors import dot
 
+# Share of the cameras' distance from the middle of the points within which metals are looked for: what is farther away
+# is behind the subject in all views from the other side.
+REACH = 0.5
 MOST_VIEWS = 32
 # A view counts if the Gaussian shows at least this share of what it shows in its best view.
 LEAST_SHARE = 0.3
@@ -57,19 +60,25 @@ DARK = 0.02
 # Mean squares of relative residuals below this count as this.
 LEAST_RESIDUAL = 2e-4
 # Evidence from which on a neighborhood begins to be metal, and goes on where enough of the nearest are.
-BEGIN, CONTINUE, STAY = 2.2, 0.4, 0.3
+BEGIN, CONTINUE, STAY = 2.2, 0.4, 1.3
 BEGIN_MISFIT, CONTINUE_MISFIT = 0.05, 0.02
 CROWD, ALONE = 0.12, 0.2
+# Evidence down to which what lies among metal joins it, and from which share of its nearest on: what mirrors something
+# even could be either.
+AMONG, MAJORITY = -0.7, 0.4
 # Of a piece that hangs together, the share, and how many, that have to be surely metal. True ones had 0.25 to 0.56, a
 # plate in polarized light 0.02 to 0.13. Neighbors hang together from this likeness of their normals on.
 SURE_SHARE, FEWEST_SURE = 0.18, 10
 TOUCHING = 0.2
 # Share of the user's words from which on their contradictions are told.
 CONTRADICTED = 0.15
+# No metal reflects one color less than about 0.38 times another (gold, blue and red). A body whose colors, over those
+# of the scene, differ by more than this is none.
+LEAST_TINT = 0.25
 # Neighbors whose brightness, or whose colors in proportion to it, differ by this factor's logarithm are of another
 # material, more or less.
 LIKE_BRIGHTNESS, LIKE_TINT = 0.4, 0.25
-ROUNDS = 12
+ROUNDS, FILLING = 12, 40
 # Of how many views the gain of the light is taken, and where.
 GAIN_VIEWS, CLEAR_SHARE, LEAST_COVERED, MOST_GAIN = 10, 0.6, 0.003, 4.0
 
@@ -103,6 +112,8 @@ class Evidence(NamedTuple):
         alike: [N, K] in [0, 1], how alike neighbors are turned, and how alike their color is: others belong to
             another surface, such as the table under a pot, or are of another material, such as the tire around a wheel.
         brightness: [N] mean S0 of what is seen, over that of all that is seen.
+        tint: [N] in [0, 1], what is seen in the weakest over that in the strongest color, each over the scene's mean,
+            of the neighborhood: of a metal no less than its reflectances are apart.
         metal_misfit: [N] root of the mean E_metal of the neighborhood.
         oblique: [N] root of the mean square of what is polarized at 45 degrees to the plane of incidence, of the
             neighborhood, relative like the residuals.
@@ -116,6 +127,7 @@ class Evidence(NamedTuple):
     near: Tensor
     alike: Tensor
     brightness: Tensor
+    tint: Tensor
     metal_misfit: Tensor
     oblique: Tensor
     support: Tensor
@@ -237,8 +249,10 @@ def evidence(
         gaussians["means"], gaussians["quaternions"], gaussians["log_scales"], total.new_zeros(3), None
     )
     alike = dot(axes[:, None], axes[near]) ** 4
-    color = (seen.weight[..., None] * seen.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
-    color = color.clamp(min=0) + DARK
+    color = ((seen.weight[..., None] * seen.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]).clamp(min=0)
+    mean = (color * known[:, None]).sum(dim=0) / known.sum().clamp(min=1e-6)
+    tints = color / mean.clamp(min=1e-6)
+    color = color + DARK
     brightness = color.mean(dim=1)
     like_color = _like_color(color, near)
     trust = (known + 1e-6)[near] * like_color
@@ -254,6 +268,7 @@ def evidence(
             target = torch.stack((kinds == 1, kinds == 2), dim=-1).float()
             said += shares(gaussians, view, target, rasterize)
     reflectance = torch.stack([over_neighbors(r) for r in reflectance.unbind(1)], dim=1)
+    tints = torch.stack([over_neighbors(t) for t in tints.unbind(1)], dim=1)
     support = (known > LEAST_SEEN).float()[near].mean(dim=1)
     return Evidence(
         over_neighbors(ratio),
@@ -262,6 +277,7 @@ def evidence(
         near,
         alike * like_color,
         brightness * known.sum() / (brightness * known).sum().clamp(min=1e-6),
+        tints.amin(dim=1) / tints.amax(dim=1).clamp(min=1e-6),
         over_neighbors(metal).sqrt(),
         over_neighbors(oblique_light(seen)).sqrt(),
         support,
@@ -282,16 +298,18 @@ def decide(found: Evidence, was: Tensor, allowed: Tensor) -> Tensor:
     """Which Gaussians are metals, [N] bool.
 
     What is surely metal begins; what is likely joins where enough of its nearest neighbors are. What was metal before
-    stays until the evidence is gone. Single ones are none, and neither are pieces of which little is sure: a metal is
-    plainly one over much of its surface. What the user says of a Gaussian is so.
+    and still is rather plainly begins, too; the rest of it has to join again, or a metal would creep on over what lies
+    beside it. Single ones are none, and neither are pieces of which little is sure: a metal is plainly one over much of
+    its surface. What lies among metal joins even where a dielectric explains it a little better. What the user says of
+    a Gaussian is so.
 
     Args:
         was: [N] bool, metal until now. allowed: [N] bool, those that may be.
     """
-    able = allowed & (found.misfit > CONTINUE_MISFIT) & (found.support > LEAST_SUPPORT)
     told = found.said.sum(dim=1) > LEAST_SEEN
     told_metal = told & (found.said[:, 1] > found.said[:, 0])
-    able &= ~told
+    allowed = allowed & ~told & (found.tint > LEAST_TINT)
+    able = allowed & (found.misfit > CONTINUE_MISFIT) & (found.support > LEAST_SUPPORT)
     no_dielectric = found.misfit > BEGIN_MISFIT
     surely = told_metal | (able & no_dielectric & (found.ratio > BEGIN))
     begun = surely | (able & was & (found.ratio > STAY))
@@ -299,7 +317,7 @@ def decide(found: Evidence, was: Tensor, allowed: Tensor) -> Tensor:
     surely = able & no_dielectric & _obliquely(found, BEGIN_OBLIQUELY)
     likely = able & _obliquely(found, CONTINUE_OBLIQUELY)
     metal |= _pieces(found, surely, surely | (was & likely), likely)
-    return told_metal | metal
+    return told_metal | _grown(found, metal, allowed & (found.ratio > AMONG), MAJORITY, FILLING)
 
 
 def _obliquely(found: Evidence, limits: Limits) -> Tensor:
@@ -310,19 +328,26 @@ def _obliquely(found: Evidence, limits: Limits) -> Tensor:
 
 def _pieces(found: Evidence, surely: Tensor, metal: Tensor, likely: Tensor) -> Tensor:
     """What is metal [N] where ``metal`` begins and ``likely`` joins, in pieces of which enough is sure."""
-    nearest, counts = found.near[:, :NEAREST], found.alike[:, :NEAREST]
+    metal = _grown(found, metal, likely, CROWD, ROUNDS)
+    metal = metal & (_share_of_nearest(found, metal) > ALONE)
+    touching = found.alike[:, :NEAREST] > TOUCHING
+    return metal & _sure_enough(found.near[:, :NEAREST], touching, metal, surely)
 
-    def among(metal: Tensor) -> Tensor:
-        """Share of metals among the nearest of each."""
-        return (metal[nearest] * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1e-6)
 
-    for _ in range(ROUNDS):
-        grown = metal | (likely & (among(metal) > CROWD))
+def _share_of_nearest(found: Evidence, metal: Tensor) -> Tensor:
+    """Share [N] of metals among the nearest of each, by how alike they are."""
+    counts = found.alike[:, :NEAREST]
+    return (metal[found.near[:, :NEAREST]] * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1e-6)
+
+
+def _grown(found: Evidence, metal: Tensor, likely: Tensor, share: float, rounds: int) -> Tensor:
+    """``metal`` [N], and what is ``likely`` and has more than this share of metals among its nearest, over and over."""
+    for _ in range(rounds):
+        grown = metal | (likely & (_share_of_nearest(found, metal) > share))
         if bool((grown == metal).all()):
             break
         metal = grown
-    metal = metal & (among(metal) > ALONE)
-    return metal & _sure_enough(nearest, counts > TOUCHING, metal, surely)
+    return metal
 
 
 def _sure_enough(nearest: Tensor, touching: Tensor, metal: Tensor, surely: Tensor) -> Tensor:

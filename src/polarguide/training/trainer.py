@@ -28,7 +28,7 @@ from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_o
 from polarguide.training.behind import turned_behind
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
-from polarguide.training.metals import CONTRADICTED, contradiction, decide, evidence, light_gain
+from polarguide.training.metals import CONTRADICTED, REACH, contradiction, decide, evidence, light_gain
 from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Action, Recipe, Stage
@@ -355,7 +355,7 @@ class Trainer:
                 "in another. The larger part counts; look at the files."
             )
         centers = torch.stack([view.camera.center for view in self.scene.train_views])
-        near = ~far_away(gaussians["means"].detach().cpu(), self.scene.points, centers)
+        near = ~far_away(gaussians["means"].detach().cpu(), self.scene.points, centers, REACH)
         was = gaussians["metalness"] > 0
         metal, reflectance = decide(found, was, near.to(self._device)).float(), found.reflectance
         for values in (metal, reflectance):
