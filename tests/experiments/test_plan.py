@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from heard import Heard
 
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.evaluate import evaluate
 from polarguide.evaluation.sources import scoring_digest
 from polarguide.experiments import plan as plans
 from polarguide.experiments.ablate import ablated
+from polarguide.experiments.collect import collect
 from polarguide.experiments.compare import compare
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
@@ -120,6 +122,31 @@ def planned(trained: Path, demo_scene: Path, tmp_path: Path) -> PlannedRun:
     (only,) = plan_runs(question, scene_entries(question))
     shutil.copytree(trained, only.folder)
     return only
+
+
+def test_truth_that_some_views_lack_is_said_before_anything_is_trained(
+    demo_scene: Path, tmp_path: Path
+) -> None:
+    scene = tmp_path / "partial"
+    shutil.copytree(demo_scene, scene)
+    told = json.loads((scene / "split.json").read_text())["test"]
+    (scene / "gt" / f"{told[0]}.npz").unlink()
+    question = asked(
+        scenes=(scene,), recipes=(recipe_named("3dgs"),), seeds=1, downscale=4, out=tmp_path / "out"
+    )
+    reporter = Heard()
+    entries = scene_entries(question, reporter)
+    counts = f"of {len(told) - 1} of {len(told)} test views: scores against it are means over these alone."
+    (said,) = [text for text in reporter.said if counts in text]
+    assert said.startswith("partial: The ground truth gives ")
+    record = collect(question, entries, plan_runs(question, entries), {})
+    assert record["scenes"][0]["warnings"] == [text.removeprefix("partial: ") for text in reporter.said]
+
+
+def test_of_a_whole_scene_a_record_has_no_warnings(demo_scene: Path, tmp_path: Path) -> None:
+    question = asked(scenes=(demo_scene,), downscale=4, out=tmp_path)
+    entries = scene_entries(question)
+    assert "warnings" not in collect(question, entries, plan_runs(question, entries), {})["scenes"][0]
 
 
 def test_how_far_a_run_is(planned: PlannedRun, tmp_path: Path) -> None:

@@ -151,6 +151,14 @@ def test_notes_name_what_failed() -> None:
     assert not any("LPIPS" in note for note in said)
 
 
+def test_notes_name_the_scene_whose_truth_is_not_complete() -> None:
+    record = results([run("x", "a", 0, psnr=30.0), run("y", "a", 0, psnr=30.0)])
+    record["scenes"][1]["warnings"] = ["The ground truth gives normals of 1 of 2 test views."]
+    assert "y: The ground truth gives normals of 1 of 2 test views." in notes(record)
+    assert not any(note.startswith("x:") for note in notes(record))
+    assert "normals of 1 of 2" in markdown(record)
+
+
 @pytest.mark.parametrize("write", [markdown, latex, csv_text])
 def test_terminals_obey_no_name_in_a_file(write: Callable[[Results], str]) -> None:
     text = write(results([run("s\x1b[2J", "a\x1b]0;mine\x07", 0, psnr=30.0)]))

@@ -17,6 +17,7 @@ from polarguide.experiments.results import (
     FORMAT,
     RecipeRecord,
     Results,
+    SceneRecord,
     differences_of,
     validate_results,
     write_results,
@@ -64,16 +65,7 @@ def collect(
             "background": comparison.settings.background,
             "materials": comparison.settings.materials,
         },
-        scenes=[
-            {
-                "name": s.name,
-                "digest": s.digest,
-                "views": s.views,
-                "test_views": list(s.test_views),
-                "black_share": s.black_share,
-            }
-            for s in scenes
-        ],
+        scenes=[_scene_record(scene) for scene in scenes],
         recipes=[_recipe_record(row) for row in comparison.rows],
         runs=runs,
         table=aggregate(runs, [scene.name for scene in scenes], recipes),
@@ -81,6 +73,19 @@ def collect(
     )
     record["differences"] = differences_of(record)
     return validate_results(record)
+
+
+def _scene_record(scene: SceneEntry) -> SceneRecord:
+    record = SceneRecord(
+        name=scene.name,
+        digest=scene.digest,
+        views=scene.views,
+        test_views=list(scene.test_views),
+        black_share=scene.black_share,
+    )
+    if scene.warnings:
+        record["warnings"] = list(scene.warnings)
+    return record
 
 
 def _recipe_record(row: TableRow) -> RecipeRecord:

@@ -19,6 +19,7 @@ from polarguide.capture import View
 from polarguide.capture.background import without_surroundings
 from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
+from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import field_digest, model_digest, scoring_digest, training_digest
 from polarguide.experiments.options import CompareOptions
@@ -130,7 +131,11 @@ class Comparison:
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """A scene as far as the record needs it."""
+    """A scene as far as the record needs it.
+
+    Attributes:
+        warnings: what its scores do not mean because something of the ground truth is missing, a sentence each.
+    """
 
     path: Path
     name: str
@@ -138,6 +143,7 @@ class SceneEntry:
     views: int
     test_views: tuple[str, ...]
     black_share: float | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -201,7 +207,7 @@ class PlannedRun:
 
 
 def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[SceneEntry]:
-    """Read every scene once: its digest and its test views.
+    """Read every scene once: its digest and its test views; says what its scores will not mean.
 
     Raises:
         PolarguideError: a scene that cannot be read, has no test views, or is called like another.
@@ -223,7 +229,11 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
                 path, expected="test views", found="none", remedy="Name some in split.json to score on."
             )
         share = black_share(scene.test_views[0])
-        entries.append(SceneEntry(path, scene.name, scene.digest, len(scene.views), scene.test_names, share))
+        facts = SceneFacts.of(scene)
+        for warning in facts.warnings:
+            reporter.warn(f"{scene.name}: {warning}")
+        count, names = len(scene.views), scene.test_names
+        entries.append(SceneEntry(path, scene.name, scene.digest, count, names, share, facts.warnings))
     return entries
 
 

@@ -49,17 +49,22 @@ class Settings(TypedDict):
     materials: str
 
 
-class SceneRecord(TypedDict):
-    """A scene: the digest of its files, how many views it has, and the names of those that scores are means over.
-
-    ``black_share`` is the share of black pixels in its first test view, None where that is not known.
-    """
-
+class _Scene(TypedDict):
     name: str
     digest: str
     views: Annotated[int, msgspec.Meta(ge=0)]
     test_views: list[str]
     black_share: Annotated[float, msgspec.Meta(ge=0, le=1)] | None
+
+
+class SceneRecord(_Scene, total=False):
+    """A scene: the digest of its files, how many views it has, and the names of those that scores are means over.
+
+    ``black_share`` is the share of black pixels in its first test view, None where that is not known.
+    ``warnings``, only where there are some, are what its scores do not mean because ground truth is missing.
+    """
+
+    warnings: list[str]
 
 
 class _Recipe(TypedDict):

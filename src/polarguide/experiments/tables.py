@@ -150,6 +150,7 @@ def notes(results: Results) -> list[str]:
         said.append(
             "Mean over scenes: over those where any recipe has a value of the column, with one weight each."
         )
+    said += [f"{scene['name']}: {text}" for scene in results["scenes"] for text in scene.get("warnings", ())]
     done = [run for run in results["runs"] if run["state"] == "done"]
     for label, reasons in (
         ("LPIPS", (run["lpips_reason"] for run in done)),
