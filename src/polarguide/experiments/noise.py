@@ -15,11 +15,11 @@ from polarguide.experiments.intervals import (
 
 KNOWN_SCATTER: Mapping[str, float] = {
     "psnr": 0.23,
-    "psnr_foreground": 0.133,
-    "psnr_reflective": 0.195,
-    "ssim": 0.0016,
+    "psnr_foreground": 0.113,
+    "psnr_reflective": 0.143,
+    "ssim": 0.00126,
     "normal_mae_deg": 0.46,
-    "normal_within_11": 0.0098,
+    "normal_within_11": 0.0093,
     "specular_psnr": 0.28,
     "diffuse_psnr": 0.28,
     "specular_psnr_aligned": 0.28,
