@@ -54,6 +54,26 @@ def test_a_row_for_every_object_and_a_column_for_every_recipe() -> None:
     assert rows(section, 1) == {("x", "ball", "metal"): ["", "20.00"]}
 
 
+def test_what_is_taken_for_metal_is_told_of_those_that_know_metals() -> None:
+    runs = [
+        seen(
+            "x",
+            "r",
+            0,
+            ball=ball(psnr=30.0, metal_share=0.815),
+            vase=part("plastic", psnr=25.0, metal_share=0.0),
+        ),
+        seen("x", "3dgs", 0, ball=ball(psnr=30.0), vase=part("plastic", psnr=25.0)),
+    ]
+    section = object_section(results(runs))
+    assert section is not None
+    assert section.blocks[1].title == "taken for metal (%)"
+    assert rows(section, 1) == {("x", "ball", "metal"): ["81.5", ""], ("x", "vase", "plastic"): ["0.0", ""]}
+    table = parts_csv(results(runs))
+    assert table is not None
+    assert next(csv.DictReader(io.StringIO(table)))["metal_share"] == "0.815"
+
+
 def test_materials_are_means_over_the_scenes_that_have_them() -> None:
     runs = [
         seen("x", "r", 0, ball=ball(psnr=30.0), vase=part("plastic", psnr=25.0)),

@@ -39,6 +39,19 @@ def page(name: str = "cup") -> str:
     return report_html(record, [view], {name: [curve]}, [name])
 
 
+@pytest.mark.parametrize("found", [True, False])
+def test_metalness_can_be_chosen_where_a_run_has_found_metal(found: bool) -> None:
+    shown = {**pictures(), "metalness": pictures()["final"]}
+    tiles = [Tile("truth", shown, {}), Tile("r", shown if found else pictures(), {})]
+    view, _ = embed("cup", "v0", tiles, 10**6)
+    assert view is not None
+    reader = Reader()
+    reader.feed(report_html(results([run("cup", "r", 0, psnr=30.0)]), [view], {}))
+    layers = next(json.loads(text) for text in reader.scripts if text.startswith('{"final"'))
+    assert ("metalness" in layers) is found
+    assert list(layers)[:2] == ["final", "diffuse"]
+
+
 class Reader(HTMLParser):
     """Collects tags, attributes and the text of scripts."""
 

@@ -108,15 +108,28 @@ def test_a_step_after_append_is_the_step_of_the_untouched_rows() -> None:
 
 def test_overwrite_zeroes_the_moments_of_that_tensor_alone() -> None:
     rows = trained()
-    before = rows.state()
+    before = {name: tensor.clone() for name, tensor in rows.state().items()}
     values = torch.full((COUNT,), 2.5)
     rows.overwrite("opacity_logits", values)
     assert torch.equal(rows["opacity_logits"].detach(), values)
     for name, tensor in rows.state().items():
         if name in ("adam.opacity_logits.exp_avg", "adam.opacity_logits.exp_avg_sq"):
             assert not tensor.any()
-        elif name != "rows.opacity_logits":
+        elif name != "gaussians.opacity_logits":
             assert torch.equal(tensor, before[name]), name
+
+
+def test_overwrite_of_some_leaves_the_others() -> None:
+    rows = trained()
+    before = {name: tensor.clone() for name, tensor in rows.state().items()}
+    chosen = torch.arange(COUNT) % 2 == 0
+    rows.overwrite("means", torch.full((COUNT, 3), 2.5), chosen)
+    after = rows.state()
+    assert torch.equal(after["gaussians.means"][~chosen], before["gaussians.means"][~chosen])
+    assert bool((after["gaussians.means"][chosen] == 2.5).all())
+    for key in ("adam.means.exp_avg", "adam.means.exp_avg_sq"):
+        assert torch.equal(after[key][~chosen], before[key][~chosen])
+        assert not after[key][chosen].any()
 
 
 def test_overwrite_before_the_first_step() -> None:

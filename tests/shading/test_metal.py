@@ -19,7 +19,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.conversion import convert, mirror_base, scale_light, spread_directions
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
-from polarguide.shading.metal import any_metal, metal_pixels, reflectance, reflectance_logits
+from polarguide.shading.metal import FIRST_ROUGHNESS, any_metal, metal_pixels, reflectance, reflectance_logits
 from polarguide.shading.model import mirrored
 from polarguide.shading.native import conductor_native
 from polarguide.shading.result import RenderResult
@@ -274,6 +274,27 @@ def test_old_and_new_metals_are_told_apart() -> None:
     assert torch.equal(values["reflectance_logits"][:5], logits[:5])
     torch.testing.assert_close(reflectance(values["reflectance_logits"][5:8]), torch.full((3, 3), 0.5))
     assert not bool(convert(values, torch.arange(COUNT) < 8, torch.full((COUNT, 3), 0.7)).any())
+
+
+def test_what_stays_keeps_all_that_was_learned_of_it() -> None:
+    """Metals 3 and 4 become dielectrics again, 5 becomes a metal: nothing else changes, nor do Adam's moments."""
+    names = ("local_dc", "local_rest", "reflectance_logits", "roughness_logits")
+    values = Gaussians(gaussians(metals=5), dict.fromkeys(names, 0.01))
+    sum(values[name].square().sum() for name in names).backward()
+    values.step()
+    before = {name: value.clone() for name, value in values.state().items()}
+    metal = torch.tensor([k in (0, 1, 2, 5) for k in range(COUNT)])
+    fresh = convert(values, metal, torch.full((COUNT, 3), 0.5))
+    mirror_base(values, torch.zeros(6, RESOLUTION, RESOLUTION, 3), fresh, torch.exp)
+    kept = torch.tensor([k not in (3, 4, 5) for k in range(COUNT)])
+    for name, value in values.state().items():
+        if value.ndim and name != "gaussians.metalness":
+            assert torch.equal(value[kept], before[name][kept]), name
+    assert not bool(values["local_dc"][3:5].any())
+    assert not bool(values["local_rest"][3:5].any())
+    for name in ("sh_dc", "strength_logits", "reflectance_logits", "roughness_logits"):
+        assert torch.equal(values[name][3:5], before[f"gaussians.{name}"][3:5])
+    assert torch.sigmoid(values["roughness_logits"][5]).item() == pytest.approx(FIRST_ROUGHNESS)
 
 
 def test_the_native_conductor_is_the_one_of_the_optics() -> None:

@@ -19,7 +19,11 @@ from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.shading.conversion import spread_directions
 from polarguide.shading.metal import any_metal
-from polarguide.training.metals import Evidence, Seen, contradiction, decide, evidence, residuals
+from polarguide.training.metals.decision import decide
+from polarguide.training.metals.evidence import Evidence, evidence
+from polarguide.training.metals.explanations import residuals
+from polarguide.training.metals.looks import Seen
+from polarguide.training.metals.words import contradicted, said_by
 from polarguide.training.trainer import Trainer, TrainSettings
 from tests.helpers.glossy_ball import ball, camera_at
 
@@ -299,8 +303,6 @@ def test_what_the_user_says_counts() -> None:
     found = said(60, ratio=ratio, said=words)
     nothing = torch.zeros(60, dtype=torch.bool)
     assert decide(found, nothing, ~nothing).nonzero()[:, 0].tolist() == [*range(5, 18), 50, 51, 52]
-    assert contradiction(found) == pytest.approx(3 / float(words.sum()))
-    assert contradiction(said(4)) == 0
 
 
 def with_materials(scene: Scene, kind: int) -> Scene:
@@ -345,13 +347,55 @@ def test_dielectric_turns_the_search_off(tiny_scene: Scene) -> None:
     assert not any_metal(trainer.state.gaussians["metalness"])
 
 
-def test_contradicting_words_are_told_of(tiny_scene: Scene) -> None:
-    dielectric, heard = with_materials(tiny_scene, 1), []
+def test_contradicting_files_are_named_once(tiny_scene: Scene) -> None:
+    scene, heard = with_materials(tiny_scene, 2), []
+    wrong = scene.train_views[1]
     views = tuple(
-        a if k % 2 else b
-        for k, (a, b) in enumerate(zip(dielectric.views, with_materials(tiny_scene, 2).views, strict=True))
+        dataclasses.replace(view, materials=torch.ones_like(view.materials))
+        if view.name == wrong.name and view.materials is not None
+        else view
+        for view in scene.views
     )
-    trainer = trainer_of(dataclasses.replace(tiny_scene, views=views), TrainSettings(60, 3), heard)
-    trainer.run(lambda _: None, until=30)
-    assert heard
-    assert "materials/ contradicts itself" in heard[0]
+    trainer = trainer_of(dataclasses.replace(scene, views=views), TrainSettings(60, 3), heard)
+    trainer.run(lambda _: None)
+    assert len(heard) == 1
+    assert f"materials/{wrong.name}.png" in heard[0]
+    assert "in one view, metal in another" in heard[0]
+
+
+def test_who_contradicts_whom() -> None:
+    """Of a ball that is metal in all files: one calls its right half dielectric, another says nothing."""
+    views = [
+        dataclasses.replace(view, materials=torch.where(view.invalid, 0, 2).to(torch.uint8))
+        for view in views_of("gold")
+    ]
+    half = views[3].materials
+    assert half is not None
+    half[:, half.shape[1] // 2 :][half[:, half.shape[1] // 2 :] == 2] = 1
+    views[4] = dataclasses.replace(views[4], materials=None)
+    of_the_ball = gaussians_of_the_ball()
+    found = contradicted(of_the_ball, views, rasterize_cpu, said_by(of_the_ball, views, rasterize_cpu))
+    assert list(found) == ["v03"]
+    assert 0.35 < found["v03"] < 0.65
+
+
+def test_the_users_words_need_no_polarization(tiny_scene: Scene) -> None:
+    """Single pictures do not determine the Stokes vector; what the user calls metal is one all the same."""
+    views = [
+        dataclasses.replace(
+            view,
+            codes=view.codes[:1],
+            exposures=view.exposures[:1],
+            materials=torch.where(view.invalid, 0, 2).to(torch.uint8),
+        )
+        for view in views_of("gold")[:6]
+    ]
+    assert not any(view.is_determined for view in views)
+    found = evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5)
+    nothing = torch.zeros(900, dtype=torch.bool)
+    metal = decide(found, nothing, ~nothing)
+    assert float(metal[gaussians_of_the_ball()["means"][:, 2] > 0.3].float().mean()) > 0.9
+    views = [dataclasses.replace(view, materials=None) for view in views]
+    assert not bool(
+        decide(evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5), nothing, ~nothing).any()
+    )

@@ -256,6 +256,10 @@ RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")
 """Those that belong to a run. Each may be null."""
 COLUMNS = tuple(metric for metric in METRICS if metric.shown != "record")
 """Those that comparisons collect."""
+METAL_SHARE = Metric("metal_share", "taken for metal", "%", 1, None, factor=100.0)
+"""Share of a part's pixels that are more than half metal, of recipes that know metals."""
+PART_METRICS = (*(metric for metric in COLUMNS if metric.of == "view"), METAL_SHARE)
+"""Those that an object or a class of material may have."""
 
 
 def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from polarguide import __version__
 from polarguide.evaluation.sources import commit, scoring_digest
-from polarguide.evaluation.table import COLUMNS
+from polarguide.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.experiments.aggregate import PartScores, RunRecord, aggregate
 from polarguide.experiments.forms import csv_text, differences_csv, latex, markdown, parts_csv
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, TableRow
@@ -130,7 +130,7 @@ def _parts(found: Mapping[str, Mapping[str, Any]] | None) -> dict[str, PartScore
             "material": scores.get("material"),
             "pixels": scores["pixels"],
             "views": scores["views"],
-            "metrics": {m.key: scores[m.key] for m in COLUMNS if m.key in scores},
+            "metrics": {m.key: scores[m.key] for m in PART_METRICS if m.key in scores},
         }
         for name, scores in (found or {}).items()
     }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from polarguide.evaluation.table import COLUMNS
+from polarguide.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.experiments.aggregate import NO_VALUE, PartScores, cell_of
 from polarguide.experiments.difference_tables import against_section, control_section
-from polarguide.experiments.part_tables import PART_METRICS, material_section, object_section
+from polarguide.experiments.part_tables import material_section, object_section
 from polarguide.experiments.results import Results
 from polarguide.experiments.shown import MINUS, Label, Section, ShownCell
 from polarguide.experiments.tables import scores_section

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from polarguide.evaluation.table import COLUMNS, Metric
+from polarguide.evaluation.table import PART_METRICS, Metric
 from polarguide.experiments.aggregate import PartScores
 from polarguide.experiments.controls import controlled
 from polarguide.experiments.difference_tables import difference_text
@@ -14,8 +14,6 @@ from polarguide.experiments.results import Results
 from polarguide.experiments.shown import MINUS, Block, Label, Row, Section, ShownCell, formatted
 from polarguide.experiments.tables import leaders
 
-PART_METRICS = tuple(column for column in COLUMNS if column.of == "view")
-"""The metrics that an object may have."""
 ByRecipe = dict[str, dict[int, dict[str, float]]]
 _HOW = (
     "Scores on the pixels of a part, means over seeds. Bold: as above, but no scatter is known of parts, so that with "

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import torch
 from torch import Tensor
 
-from polarguide.capture import View
+from polarguide.capture import Scene, View
 from polarguide.evaluation.metrics import normal_angles_deg
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash, read_curve
@@ -61,6 +61,7 @@ NORMAL_ERROR_HIGH = 45.0
 LEGEND = {
     "error": f"mean absolute difference over the channels, 0 to {ERROR_HIGH:g} of white",
     "normal_error": f"angle to the true normal, 0 to {NORMAL_ERROR_HIGH:g} degrees",
+    "metalness": "share of metal, 0 to 1",
 }
 """What the colors of false-color layers say."""
 
@@ -122,14 +123,19 @@ def _scene_views(
     scores = [(run.metrics() or {})["views"] for run in runs]
     for name in names:
         view = scene.view(name)
-        tiles = [_ground_truth_tile(view)]
+        tiles = [_ground_truth_tile(scene, view)]
         rows = zip(runs, opened, scores, strict=True)
         tiles += [_tile(planned.row.name, run, view, s.get(name, {})) for planned, run, s in rows]
         yield embed(entry.name, name, tiles, limit)
 
 
-def _ground_truth_tile(view: View) -> Tile:
+def _ground_truth_tile(scene: Scene, view: View) -> Tile:
     pictures = {key: value for key, value in ground_truth_pictures(view).items() if key in LAYER_METRICS}
+    ids = None if view.ground_truth is None else view.ground_truth.object_ids
+    metals = [item.id for item in scene.objects if item.material.kind in ("metal", "rough metal")]
+    if ids is not None and metals:
+        truly = torch.isin(ids, torch.tensor(metals, dtype=ids.dtype))
+        pictures["metalness"] = figures.scalar_to_rgb(truly.float(), 0.0, 1.0, "inferno")
     return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
 
 
@@ -141,6 +147,8 @@ def _tile(name: str, run: OpenedRun, view: View, scores: Mapping[str, float | No
         picture = layer_picture(result, layer, view.camera)
         if picture is not None:
             pictures[layer] = picture
+    if result.metalness is not None and bool(result.metalness.any()):
+        pictures["metalness"] = figures.scalar_to_rgb(result.metalness, 0.0, 1.0, "inferno")
     pictures["error"] = figures.error_to_rgb(result.final, view.photograph(), ERROR_HIGH)
     ground_truth = view.ground_truth
     if ground_truth is not None and ground_truth.normal is not None and result.normal is not None:
@@ -196,11 +204,17 @@ def report_html(
         gradient=figures.color_gradient("inferno"),
         legend=script_json(LEGEND),
         data=script_json([vars(view) for view in views]),
-        layers=script_json(LAYERS),
+        layers=script_json(_layers(views)),
         curves=_curves(results, curves),
         recipes=_recipes(results),
         provenance=_provenance(results),
     )
+
+
+def _layers(views: Sequence[EmbeddedView]) -> dict[str, str]:
+    """Layers that one can choose; metalness only where a run has found some."""
+    metal = any("metalness" in pictures for view in views for _, pictures, _ in view.tiles[1:])
+    return {key: label for key, label in LAYERS.items() if metal or key != "metalness"}
 
 
 def _summary(results: Results) -> str:

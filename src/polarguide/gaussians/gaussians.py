@@ -142,13 +142,20 @@ class Gaussians(Trained):
         return {name: t.detach().clone() for name, t in self._tensors.items()}
 
     @torch.no_grad()
-    def overwrite(self, name: str, values: Tensor) -> None:
-        """Replace a tensor's values and zero its moments, as 3DGS does at every reset."""
-        self._tensors[name].copy_(values)
-        state = self._optimizer.state.get(self._tensors[name], {})
+    def overwrite(self, name: str, values: Tensor, rows: Tensor | None = None) -> None:
+        """Replace a tensor's values and zero its moments, as 3DGS does at every reset.
+
+        Args:
+            values: of all Gaussians, also where ``rows`` chooses among them.
+            rows: [N] bool, those whose values are replaced and whose moments are zeroed; all, if not given.
+        """
+        tensor = self._tensors[name]
+        state = self._optimizer.state.get(tensor, {})
+        chosen = slice(None) if rows is None else rows
+        tensor[chosen] = values[chosen]
         for key in ("exp_avg", "exp_avg_sq"):
             if key in state:
-                state[key].zero_()
+                state[key][chosen] = 0
 
     def keep(self, index: Tensor) -> None:
         """Keep only the Gaussians that ``index`` (a mask or indices) selects."""

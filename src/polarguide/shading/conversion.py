@@ -17,7 +17,7 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import sh_basis
 from polarguide.shading.cubemap import cubemap_lookup
-from polarguide.shading.metal import reflectance, reflectance_logits
+from polarguide.shading.metal import FIRST_ROUGHNESS, reflectance, reflectance_logits
 
 MOST_STRENGTH = 0.98
 # Directions in which functions are compared, and Gaussians at a time.
@@ -26,7 +26,8 @@ DIRECTIONS, CHUNK = 128, 4096
 
 @torch.no_grad()
 def convert(gaussians: Gaussians, metal: Tensor, reflectances: Tensor) -> Tensor:
-    """Set which Gaussians are metals. Those that are new have no light of their own at first.
+    """Set which Gaussians are metals. Those that change have no light of their own at first; what is a dielectric again
+    has the base color and the strength that it had before. Nothing is changed of the others.
 
     Args:
         metal: [N] bool. reflectances: [N, 3] at normal incidence, of new ones.
@@ -34,22 +35,22 @@ def convert(gaussians: Gaussians, metal: Tensor, reflectances: Tensor) -> Tensor
     Returns:
         [N] bool, the new ones.
     """
-    was = gaussians["metalness"] > 0
-    fresh = metal & ~was
-    if bool((metal != was).any()):
+    changed = metal != (gaussians["metalness"] > 0)
+    fresh = metal & changed
+    if bool(changed.any()):
         gaussians.overwrite("metalness", metal.float())
-        logits = torch.where(
-            fresh[:, None], reflectance_logits(reflectances), gaussians["reflectance_logits"]
-        )
-        gaussians.overwrite("reflectance_logits", logits)
-        _keep_local(gaussians, ~fresh)
+        gaussians.overwrite("reflectance_logits", reflectance_logits(reflectances), fresh)
+        rough = torch.logit(torch.full_like(gaussians["roughness_logits"], FIRST_ROUGHNESS))
+        gaussians.overwrite("roughness_logits", rough, fresh)
+        for name, own in _local(gaussians):
+            gaussians.overwrite(name, torch.zeros_like(own), changed)
     return fresh
 
 
-def _keep_local(gaussians: Gaussians, factor: Tensor) -> None:
-    for name in ("local_dc", "local_rest"):
-        if (own := gaussians.get(name)) is not None:
-            gaussians.overwrite(name, own * factor.to(own).view(-1, *[1] * (own.ndim - 1)))
+def _local(gaussians: Gaussians) -> list[tuple[str, Tensor]]:
+    """Names and values of the light of their own, if they have some."""
+    found = ((name, gaussians.get(name)) for name in ("local_dc", "local_rest"))
+    return [(name, own) for name, own in found if own is not None]
 
 
 @torch.no_grad()
@@ -58,7 +59,8 @@ def scale_light(gaussians: Gaussians, texels: Tensor, gain: float) -> None:
     texels.add_(math.log(gain))
     strength = (torch.sigmoid(gaussians["strength_logits"]) / gain).clamp(max=MOST_STRENGTH)
     gaussians.overwrite("strength_logits", torch.logit(strength))
-    _keep_local(gaussians, torch.full_like(strength, gain))
+    for name, own in _local(gaussians):
+        gaussians.overwrite(name, gain * own)
 
 
 @torch.no_grad()
@@ -88,7 +90,7 @@ def mirror_base(
         local = solve @ target
         found[0][chosen], found[1][chosen] = local[:, 0], local[:, 1:]
     for name, values in zip(("local_dc", "local_rest"), found, strict=True):
-        gaussians.overwrite(name, values)
+        gaussians.overwrite(name, values, fresh)
 
 
 def spread_directions(count: int) -> Tensor:

@@ -14,7 +14,7 @@ from polarguide.color import srgb_encode
 from polarguide.raster import Backend
 from polarguide.shading.gbuffer import render
 from polarguide.training.flat import Flat, flat_surfaces
-from polarguide.training.metals import metalness_share
+from polarguide.training.metals.looks import metalness_share
 from polarguide.training.packing import (
     Entry,
     Packed,

@@ -7,7 +7,7 @@ there and asks nothing back.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.capture.background import has_black_background
 from polarguide.capture.smaller import smaller
+from polarguide.capture.view import listed
 from polarguide.color import srgb_encode
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
@@ -28,7 +29,10 @@ from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_o
 from polarguide.training.behind import turned_behind
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
-from polarguide.training.metals import CONTRADICTED, REACH, contradiction, decide, evidence, light_gain
+from polarguide.training.metals.decision import REACH, decide
+from polarguide.training.metals.evidence import evidence
+from polarguide.training.metals.gain import light_gain
+from polarguide.training.metals.words import contradicted
 from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Action, Recipe, Stage
@@ -85,6 +89,7 @@ class Trainer:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
         self.ranks, self._device = ranks, backend.device
         self._warn = warn
+        self._contradictions_told = False
         self.whole = True
         self.shading = recipe.shading.bind(settings.refractive_index)
         self.black = is_black(scene, settings)
@@ -344,24 +349,31 @@ class Trainer:
     @torch.no_grad()
     def _find_metals(self) -> None:
         """Decide which Gaussians are metals, and begin with what was measured of those that are new."""
-        gaussians, views = self.state.gaussians, [v for v in self._views if v.is_determined]
-        if not views:
+        gaussians, views = self.state.gaussians, self._views
+        if not any(view.is_determined or view.materials is not None for view in views):
             return
         rasterize, index = self.backend.rasterize, self.settings.refractive_index
         found = evidence(gaussians, views, rasterize, index)
-        if (share := contradiction(found)) > CONTRADICTED:
-            self._warn(
-                f"materials/ contradicts itself on {100 * share:.0f} % of what it shows: dielectric in one view, metal "
-                "in another. The larger part counts; look at the files."
-            )
+        self._tell_contradictions(contradicted(gaussians, views, rasterize, found.said))
         centers = torch.stack([view.camera.center for view in self.scene.train_views])
         near = ~far_away(gaussians["means"].detach().cpu(), self.scene.points, centers, REACH)
         was = gaussians["metalness"] > 0
         metal, reflectance = decide(found, was, near.to(self._device)).float(), found.reflectance
         for values in (metal, reflectance):
             self.ranks.broadcast(values)
-        gain = partial(light_gain, gaussians, self.state.light, views, rasterize, self.shading)
+        shown = [view for view in views if view.is_determined]
+        gain = partial(light_gain, gaussians, self.state.light, shown, rasterize, self.shading)
         self.shading.become_metal(gaussians, self.state.light, metal > 0, reflectance, gain)
+
+    def _tell_contradictions(self, found: Mapping[str, float]) -> None:
+        """Say once which of the user's masks contradict others. found: share by view."""
+        if found and not self._contradictions_told:
+            self._contradictions_told = True
+            names = listed([f"materials/{name}.png" for name in found])
+            self._warn(
+                f"other views contradict {names} on {100 * max(found.values()):.0f} % of what is said there, at most: "
+                "dielectric in one view, metal in another. The larger part counts; look at these files."
+            )
 
     def _view_of(self, place: int) -> View:
         """The view at a place in the sequence of all views ever trained on.

@@ -21,6 +21,7 @@ LAYERS: dict[str, str] = {
     "normal": "normal",
     "error": "error of final",
     "normal_error": "normal error",
+    "metalness": "metalness",
 }
 """Layers of the report, in order: key and label."""
 LOSSLESS = ("normal",)

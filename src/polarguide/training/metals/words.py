@@ -1,0 +1,57 @@
+"""What the user says of materials: ``materials/`` of the scene, by Gaussian."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.raster import Rasterize
+from polarguide.shading.model import Parameters
+from polarguide.training.metals.looks import shares
+
+# Weight of pixels, over all views, from which on something is known of a Gaussian.
+LEAST_SEEN = 0.3
+# Share of a view's words from which on it is told that other views contradict them.
+CONTRADICTED = 0.15
+
+
+def said_by(gaussians: Parameters, views: Sequence[View], rasterize: Rasterize) -> Tensor:
+    """Weight [N, 2] of the pixels that the user calls dielectric and metal, over the views."""
+    means = gaussians["means"].detach()
+    said = means.new_zeros(len(means), 2)
+    for view in views:
+        if view.materials is not None:
+            said += _said_in(gaussians, view, view.materials, rasterize)
+    return said
+
+
+def contradicted(
+    gaussians: Parameters, views: Sequence[View], rasterize: Rasterize, said: Tensor
+) -> dict[str, float]:
+    """Views whose words the other views contradict, the most contradicted first, with the share of those words of
+    which others say anything.
+
+    Args:
+        said: by all views, as of ``said_by``.
+    """
+    found = {}
+    for view in views:
+        if view.materials is None:
+            continue
+        own = _said_in(gaussians, view, view.materials, rasterize)
+        others = (said - own).clamp(min=0)
+        own = own * (others.sum(dim=1, keepdim=True) > LEAST_SEEN)
+        opposed = (own * (others.flip(1) > others)).sum()
+        share = float(opposed / own.sum().clamp(min=1e-6))
+        if share > CONTRADICTED:
+            found[view.name] = share
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _said_in(gaussians: Parameters, view: View, materials: Tensor, rasterize: Rasterize) -> Tensor:
+    kinds = materials.to(gaussians["means"].device)
+    target = torch.stack((kinds == 1, kinds == 2), dim=-1).float()
+    return shares(gaussians, view, target, rasterize)
