@@ -80,6 +80,16 @@ def test_test_views_far_from_training_are_a_warning(capture: TinyCapture) -> Non
     assert re.search(r"\d of 6 test views are far from every training view \(v000, .*split\.json", warning)
 
 
+def test_a_ring_that_is_held_out_as_a_whole_is_a_warning(
+    capture: TinyCapture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("polarguide.capture.reader.held_out_band", lambda _, tests: list(tests))
+    capture.write_json("split.json", {"test": list(NAMES[:2])})
+    (warning,) = load_scene(capture.root).warnings
+    assert "2 of 2 test views are all views of a band of heights, such as a ring (v000, v001)" in warning
+    assert warning.endswith("name others in split.json.")
+
+
 def test_a_split_that_there_is_not_is_refused(capture: TinyCapture) -> None:
     with pytest.raises(PolarguideError, match="split: expected one of directions, every-8th"):
         load_scene(capture.root, split="odd")  # type: ignore[arg-type]

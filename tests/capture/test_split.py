@@ -7,7 +7,7 @@ import math
 import pytest
 
 from polarguide.camera import Camera, look_at
-from polarguide.capture.split import TEST_EVERY, chosen_views, far_from_training
+from polarguide.capture.split import TEST_EVERY, chosen_views, far_from_training, held_out_band
 
 RINGS, STOPS = 8, 12
 
@@ -36,6 +36,26 @@ def test_no_ring_is_held_out_as_a_whole_where_every_eighth_would() -> None:
     assert len(chosen) == len(cameras) / TEST_EVERY
     assert max([name[-1] for name in chosen].count(ring) for ring in map(str, range(RINGS))) < STOPS / 2
     assert len({name[:3] for name in chosen}) > STOPS / 3
+
+
+@pytest.mark.parametrize("ring", range(RINGS))
+def test_a_ring_that_is_held_out_as_a_whole_is_found(ring: int) -> None:
+    cameras = dome()
+    tests = [name for name in cameras if name.endswith(str(ring))]
+    assert held_out_band(cameras, tests) == sorted(tests)
+    assert held_out_band(cameras, tests[:-1]) == [], "one of the ring is trained on"
+    # Cameras are held by hand: no two of a ring have quite the same height.
+    shaken = {name: at(5 + 9 * int(name[-1]) + k % 5, 30 * int(name[1:3])) for k, name in enumerate(cameras)}
+    assert held_out_band(shaken, tests) == sorted(tests)
+
+
+def test_no_band_is_held_out_where_tests_are_spread() -> None:
+    cameras = dome()
+    assert held_out_band(cameras, chosen_views(cameras, "every-8th")) != []
+    assert held_out_band(cameras, chosen_views(cameras, "directions")) == []
+    turntable = {f"v{k}": at(20, 5 * k) for k in range(72)}
+    assert held_out_band(turntable, chosen_views(turntable, "every-8th")) == []
+    assert held_out_band({}, []) == held_out_band(turntable, list(turntable)) == []
 
 
 def test_every_held_out_view_has_training_views_near_it_and_none_is_far_from_all_held_out() -> None:

@@ -23,7 +23,7 @@ from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.memory import check_memory, stated_size
 from polarguide.capture.metadata import held_out, mount_of, refractive_index_of
 from polarguide.capture.objects import objects_of
-from polarguide.capture.split import chosen_views, far_from_training
+from polarguide.capture.split import chosen_views, far_from_training, held_out_band
 from polarguide.capture.stored_view import StoredView, ViewFiles
 from polarguide.capture.unseen_points import unseen_points
 from polarguide.capture.view import GroundTruth, Scene, listed
@@ -171,22 +171,26 @@ def _held_out(
     split: Split,
     asked: Sequence[str] | None,
 ) -> tuple[tuple[str, ...], list[str]]:
-    """The names of the test views, and a warning where some are far from all that is trained on."""
+    """The names of the test views, and a warning where some are far from what is trained on, or a ring of them is."""
     check_choice("split", split, get_args(Split))
     data, posed = files.read_if_there(path), frozenset(model.names)
     cameras = {name: model.camera(name) for name in layout.names if name in posed}
+    if asked is not None:  # whoever asks has been told
+        return tuple(name for name in sorted(asked) if name in layout.names), []
     tests = chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)
-    if asked is not None:
-        tests = tuple(name for name in sorted(asked) if name in layout.names)
-    far = far_from_training(cameras, tests)
-    if asked is not None or not far:  # whoever asks has been told
-        return tests, []
     other = (
         "take --split directions" if data is None and split != "directions" else "name others in split.json"
     )
+    far, band = far_from_training(cameras, tests), held_out_band(cameras, tests)
+    found = []
+    if far:
+        found.append(f"are far from every training view ({listed(far)})")
+    elif band:
+        found.append(f"are all views of a band of heights, such as a ring ({listed(band)})")
     return tests, [
-        f"{len(far)} of {len(tests)} test views are far from every training view ({listed(far)}): scores on them "
-        f"measure extrapolation. If that is not meant, {other}."
+        f"{len(far or band)} of {len(tests)} test views {what}: scores on them measure extrapolation. If that is not "
+        f"meant, {other}."
+        for what in found
     ]
 
 

@@ -15,6 +15,10 @@ TEST_EVERY = 8
 FAR = 2.5
 """A held-out view is far from training if its nearest training view is this many times as far as views usually are from
 each other."""
+FEWEST_IN_BAND = 4
+"""Views from which on a band of heights counts as one."""
+SAME_HEIGHT = 1e-3
+"""Heights that differ by less than this share of how far they spread are those of one ring."""
 _ROUNDS = 10
 
 
@@ -45,6 +49,35 @@ def far_from_training(cameras: Mapping[str, Camera], tests: Sequence[str]) -> li
     others = apart + np.diag(np.full(len(names), np.inf))
     usual = float(np.median(others.min(axis=1)))
     return [name for k, name in enumerate(names) if name in tests and apart[k, trains].min() > FAR * usual]
+
+
+def held_out_band(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[str]:
+    """The held-out views of a band of heights in which no view is trained on, such as a whole ring; empty if none.
+
+    Told are bands of at least ``FEWEST_IN_BAND`` views and half of those that are held out. Heights are along the mean
+    of what is up in the pictures.
+    """
+    names = sorted(cameras)
+    if not names:
+        return []
+    up = -np.stack([cameras[name].rotation[1].double().numpy() for name in names]).mean(axis=0)
+    heights = np.stack([cameras[name].center.double().numpy() for name in names]) @ up
+    apart = max(SAME_HEIGHT * float(np.ptp(heights)), 1e-12)
+    rings: list[list[int]] = []
+    for k in (int(place) for place in np.argsort(heights, kind="stable")):
+        if rings and heights[k] - heights[rings[-1][-1]] < apart:
+            rings[-1].append(k)
+        else:
+            rings.append([k])
+    bands: list[list[str]] = [[]]
+    for ring in rings:
+        if all(names[k] in tests for k in ring):
+            bands[-1] += [names[k] for k in ring]
+        else:
+            bands.append([])
+    longest = max(bands, key=len)
+    enough = len(longest) >= FEWEST_IN_BAND and 2 * len(longest) >= len(tests) and len(tests) < len(names)
+    return sorted(longest) if enough else []
 
 
 def _distances(cameras: Sequence[Camera]) -> NDArray[np.float64]:
