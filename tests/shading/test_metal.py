@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+from random_runs import random_state
 from torch import Tensor
 
 from polarguide import optics
@@ -14,8 +16,10 @@ from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
+from polarguide.gaussians.ply import read_ply
 from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.runs.point_cloud import shown_colors, write_run_ply
 from polarguide.shading.conversion import convert, mirror_base, scale_light, spread_directions
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
@@ -126,6 +130,37 @@ def test_rough_metals_read_a_blurred_light() -> None:
         clear = result.metal.share > 0.5
         spread.append(float((result.metal.specular / result.metal.share[:, None])[clear].std()))
     assert spread[1] < 0.5 * spread[0]
+
+
+def test_metals_mirror_another_environment() -> None:
+    """Twice the light from afar is twice what metals show, where they have no light of their own."""
+    values = gaussians(metals=COUNT)
+    del values["local_dc"], values["local_rest"]
+    shading, here = DeferredShading("fresnel", metal=True), light()
+    twice = {"texels": here["texels"] + math.log(2)}
+    once, again = (
+        render(values, camera(), rasterize_cpu, shading=shading, light=seen) for seen in (here, twice)
+    )
+    torch.testing.assert_close(again.final, 2 * once.final, rtol=1e-4, atol=1e-5)
+
+
+def test_the_point_cloud_says_what_metals_are(tmp_path: Path) -> None:
+    state, shading = random_state("polarguide-stokes", 40)
+    metal = torch.arange(40) < 15
+    state.gaussians.overwrite("metalness", metal.float())
+    write_run_ply(tmp_path / "run.ply", state, shading)
+    read = read_ply(tmp_path / "run.ply")["extra"]
+    assert torch.equal(read["metalness"] > 0, metal)
+    expected = reflectance(state.gaussians["reflectance_logits"]).detach()
+    torch.testing.assert_close(read["reflectance"], expected)
+    torch.testing.assert_close(read["roughness"], torch.sigmoid(state.gaussians["roughness_logits"]).detach())
+    # Ordinary viewers show what the metals mirror, not the base color that does not count.
+    directions = spread_directions(12)
+    shown = shown_colors(state, shading, directions)
+    state.gaussians.overwrite("sh_dc", state.gaussians["sh_dc"] + 1.0)
+    after = shown_colors(state, shading, directions)
+    assert torch.equal(after[metal], shown[metal])
+    assert not torch.equal(after[~metal], shown[~metal])
 
 
 def test_polarization_of_a_metal_is_that_of_a_conductor() -> None:

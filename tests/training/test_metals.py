@@ -323,11 +323,13 @@ def trainer_of(scene: Scene, settings: TrainSettings, warn: list[str]) -> Traine
     return Trainer(scene, recipe, settings, choose_backend("cpu"), warn=warn.append)
 
 
-def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path: Path) -> None:
+@pytest.mark.parametrize("until", [32, 45])
+def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path: Path, until: int) -> None:
+    """And goes on from between two looks, or from after the last, with the same bits."""
     scene, heard = with_materials(tiny_scene, 2), []
     settings = TrainSettings(60, 3)
     whole = trainer_of(scene, settings, heard)
-    whole.run(lambda _: None, until=45)
+    whole.run(lambda _: None, until=until)
     assert any_metal(whole.state.gaussians["metalness"])
     assert not heard
     save_checkpoint(tmp_path, whole.state)
