@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from instruction_sets import instruction_sets, selected
 from random_runs import random_state
 from torch import Tensor
 
@@ -25,7 +26,6 @@ from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import FIRST_ROUGHNESS, any_metal, metal_pixels, reflectance, reflectance_logits
 from polarguide.shading.model import mirrored
-from polarguide.shading.native import conductor_native
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
 
@@ -332,23 +332,8 @@ def test_what_stays_keeps_all_that_was_learned_of_it() -> None:
     assert torch.sigmoid(values["roughness_logits"][5]).item() == pytest.approx(FIRST_ROUGHNESS)
 
 
-def test_the_native_conductor_is_the_one_of_the_optics() -> None:
-    generator = torch.Generator().manual_seed(4)
-    cosine, values = torch.rand(200, generator=generator), torch.rand(200, 3, generator=generator)
-    weights = [torch.randn(200, 3, generator=generator) for _ in range(2)]
-    found = []
-    for conductor, dtype in ((conductor_native, torch.float32), (optics.conductor, torch.float64)):
-        c, r = (t.to(dtype).clone().requires_grad_() for t in (cosine, values))
-        mean, slope = conductor(c if dtype == torch.float32 else c[:, None], r)
-        (mean * weights[0] + slope * weights[1]).sum().backward()
-        assert c.grad is not None
-        assert r.grad is not None
-        found.append([t.detach().double() for t in (mean, slope, c.grad, r.grad)])
-    for ours, exact in zip(*found, strict=True):
-        torch.testing.assert_close(ours, exact, rtol=2e-3, atol=2e-3)
-
-
-def test_the_native_polarization_term_knows_metals() -> None:
+@pytest.mark.parametrize("instructions", instruction_sets())
+def test_the_native_polarization_term_knows_metals(instructions: str) -> None:
     generator = torch.Generator().manual_seed(5)
     measured = 0.3 * torch.randn(2, 20, 24, 3, generator=generator)
     weight = torch.rand(20, 24, generator=generator)
@@ -361,7 +346,8 @@ def test_the_native_polarization_term_knows_metals() -> None:
         result = rendered(SHADING, values)
         if native:
             term = Polarization(measured, S1_AND_S2, weight, 0.7, SHADING.refractive_index)
-            loss = pixel_terms(result, camera(), Terms(term, [], None))
+            with selected(instructions):
+                loss = pixel_terms(result, camera(), Terms(term, [], None))
         else:
             predicted = SHADING.predicted_stokes(result, camera())[1:]
             loss = 0.7 * (weight[..., None] * (predicted - measured).abs()).sum()
