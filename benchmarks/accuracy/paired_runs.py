@@ -1,0 +1,99 @@
+"""What one setting is worth, by object: runs with it less runs without it, paired by scene and seed.
+
+    python benchmarks/accuracy/paired_runs.py --runs RUN... --less RUN... [--record FILE]
+    python benchmarks/accuracy/paired_runs.py --record FILE
+
+Runs have been scored (``polarguide eval``). Printed are, for each scene as a whole and each of its objects, means of
+the differences with twice their standard error over seeds, the layers' scores, and the share of the object's pixels
+that is called metal in each run. ``--record`` keeps the scores, and prints of them where no runs are given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polarguide.experiments.shown import MINUS
+
+METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
+WHOLE = "all"
+DIELECTRICS = "layers without metals"
+ONE_PERCENT = 1.0
+Scores = dict[str, dict[str, float | None]]
+"""By object, and of the whole scene."""
+
+
+def scores_of(run: Path) -> tuple[str, str, Scores]:
+    """Scene and seed of a run, and its scores."""
+    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    configuration = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    keys = (*METRICS, "metal_share")
+    layers = {key: metrics.get(f"{key}_dielectric") for key in METRICS[2:]}
+    parts = {WHOLE: metrics, DIELECTRICS: layers, **metrics["objects"]}
+    scores = {name: {key: part.get(key) for key in keys} for name, part in parts.items()}
+    return Path(configuration["scene"]).name, str(configuration["settings"]["seed"]), scores
+
+
+def collected(runs: Sequence[Path]) -> dict[str, dict[str, Scores]]:
+    """Scores by scene and seed."""
+    found: dict[str, dict[str, Scores]] = {}
+    for run in runs:
+        scene, seed, scores = scores_of(run)
+        found.setdefault(scene, {})[seed] = scores
+    return found
+
+
+def difference(having: Sequence[Any], lacking: Sequence[Any]) -> str:
+    """Mean of the paired differences, and twice their standard error where there are two or more."""
+    if None in (*having, *lacking):
+        return ""
+    apart = np.subtract(having, lacking)
+    error = f" ± {2 * apart.std(ddof=1) / len(apart) ** 0.5:.1f}" if len(apart) > 1 else ""
+    return f"{apart.mean() + 0.0:+.1f}{error}".replace("-", MINUS)
+
+
+def table(having: dict[str, Scores], lacking: dict[str, Scores]) -> list[str]:
+    """The lines of one scene's table, of the seeds that both have."""
+    seeds = sorted(having.keys() & lacking.keys())
+    lines = [
+        "| | PSNR | normals | specular | diffuse | specular / diffuse | called metal (%) |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for name in having[seeds[0]] if seeds else ():
+        a, b = ([by[seed][name] for seed in seeds] for by in (having, lacking))
+        cells = [difference([s[key] for s in a], [s[key] for s in b]) for key in METRICS]
+        layers = [[s[key] for s in a] for key in METRICS[2:]]
+        shown = "" if any(None in of for of in layers) else " / ".join(f"{np.mean(of):.1f}" for of in layers)
+        shares = [100 * s["metal_share"] for s in a if s["metal_share"] is not None]
+        metal = ", ".join(f"{share:.0f}" if share >= ONE_PERCENT else f"{share:.1f}" for share in shares)
+        lines.append(f"| {' | '.join((name, *cells, shown, metal))} |")
+    return [f"{len(seeds)} seeds", "", *lines] if seeds else ["no seed that both have"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", nargs="+", type=Path, default=[])
+    parser.add_argument("--less", nargs="+", type=Path, default=[])
+    parser.add_argument("--record", type=Path, default=None)
+    options = parser.parse_args()
+    if options.runs:
+        record = {"runs": collected(options.runs), "less": collected(options.less)}
+        if options.record is not None:
+            options.record.write_text(json.dumps(record, separators=(",", ":")) + "\n", encoding="utf-8")
+    elif options.record is not None:
+        record = json.loads(options.record.read_text(encoding="utf-8"))
+    else:
+        parser.error("give --runs and --less, or a --record")
+    for scene, having in record["runs"].items():
+        print(f"\n{scene}: " + "\n".join(table(having, record["less"].get(scene, {}))))
+
+
+if __name__ == "__main__":
+    main()
