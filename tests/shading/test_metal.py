@@ -215,7 +215,7 @@ def test_gradients_of_pixels_follow_finite_differences() -> None:
     features = torch.cat((share * (0.3 + 0.6 * uniform(40, 3)), share, share * uniform(40, 1)), dim=1)
 
     def loss(features: Tensor, normals: Tensor, light: Tensor, local: Tensor) -> Tensor:
-        metal = metal_pixels(features, rays, normals, light, local)
+        metal = metal_pixels(torch.cat((local, features), dim=1), 3, rays, normals, light, 0)
         return metal.specular.sin().sum() + (metal.slope * metal.specular).sum()
 
     finite_differences(loss, [features, normals, 0.5 + uniform(6, 8, 8, 3), uniform(40, 3)])

@@ -270,11 +270,12 @@ class DeferredShading(ShadingModel):
         if metal is None and features.shape[-1] >= first + CHANNELS:
             rays = camera.world_rays(dtype=features.dtype, device=features.device)
             metal = metal_pixels(
-                features[..., first : first + CHANNELS].flatten(0, 1),
+                features.flatten(0, 1),
+                first,
                 rays.flatten(0, 1),
                 splatted.normal.flatten(0, 1),
                 self.radiance(texels),
-                features[..., 7:10].flatten(0, 1) if self.local else None,
+                7 if self.local else None,
             )
         found = layers if metal is None else with_metal(layers, metal)
         return {**found, "metalness": metalness_picture(metal, features), "metal": metal}

@@ -93,23 +93,27 @@ def metal_mips(light: Tensor) -> list[Tensor]:
 
 
 def metal_pixels(
-    features: Tensor, rays: Tensor, normal: Tensor, light: Tensor, local: Tensor | None
+    features: Tensor, first: int, rays: Tensor, normal: Tensor, light: Tensor, local: int | None
 ) -> MetalPixels:
     """Shade what shows metal.
 
     Args:
-        features: [P, 5] blended ``metal_channels``. rays: [P, 3] unit, world. normal: [P, 3] blended, world.
-        light: [6, R, R, 3] radiance from afar. local: [P, 3] light of the Gaussians' own.
+        features: [P, C] blended. first: of its channels the one where ``metal_channels`` begin.
+        rays: [P, 3] unit, world. normal: [P, 3] blended, world.
+        light: [6, R, R, 3] radiance from afar.
+        local: the channel where the three of the light of the Gaussians' own begin; None: there is none.
     """
-    pixels = (features[:, 3].detach() > MINIMUM_SHARE).nonzero()[:, 0]
-    metal, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
+    pixels = (features[:, first + 3].detach() > MINIMUM_SHARE).nonzero()[:, 0]
+    # All channels at once: each part taken by itself would send back a picture of all of them.
+    shown, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
+    metal = shown[:, first : first + CHANNELS]
     share = metal[:, 3]
     along = dot(rays, facing)[:, None]
     inverse = 1 / share.clamp(min=MINIMUM_SHARE)
     level = BLUR * metal[:, 4] * inverse
     seen = mip_lookup(metal_mips(light), (rays - 2 * along * facing).contiguous(), level)
     if local is not None:
-        seen = (seen + local[pixels]).clamp(min=0)
+        seen = (seen + shown[:, local : local + 3]).clamp(min=0)
     reflectances = metal[:, :3] * inverse[:, None]
     if fits(metal):
         mean, slope = conductor_native(-along[:, 0], reflectances)
