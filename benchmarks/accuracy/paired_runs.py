@@ -54,7 +54,7 @@ def difference(having: Sequence[Any], lacking: Sequence[Any]) -> str:
         return ""
     apart = np.subtract(having, lacking)
     error = f" ± {2 * apart.std(ddof=1) / len(apart) ** 0.5:.1f}" if len(apart) > 1 else ""
-    return f"{apart.mean() + 0.0:+.1f}{error}".replace("-", MINUS)
+    return f"{round(float(apart.mean()), 1) + 0.0:+.1f}{error}".replace("-", MINUS)
 
 
 def table(having: dict[str, Scores], lacking: dict[str, Scores]) -> list[str]:
@@ -83,14 +83,14 @@ def main() -> None:
     parser.add_argument("--less", nargs="+", type=Path, default=[])
     parser.add_argument("--record", type=Path, default=None)
     options = parser.parse_args()
-    if options.runs:
+    if options.runs and options.less:
         record = {"runs": collected(options.runs), "less": collected(options.less)}
         if options.record is not None:
             options.record.write_text(json.dumps(record, separators=(",", ":")) + "\n", encoding="utf-8")
-    elif options.record is not None:
+    elif options.record is not None and not options.runs and not options.less:
         record = json.loads(options.record.read_text(encoding="utf-8"))
     else:
-        parser.error("give --runs and --less, or a --record")
+        parser.error("give both --runs and --less, or a --record alone")
     for scene, having in record["runs"].items():
         print(f"\n{scene}: " + "\n".join(table(having, record["less"].get(scene, {}))))
 

@@ -86,7 +86,7 @@ def test_a_ring_that_is_held_out_as_a_whole_is_a_warning(
     monkeypatch.setattr("polarguide.capture.reader.held_out_band", lambda _, tests: list(tests))
     capture.write_json("split.json", {"test": list(NAMES[:2])})
     (warning,) = load_scene(capture.root).warnings
-    assert "2 of 2 test views are all views of a band of heights, such as a ring (v000, v001)" in warning
+    assert "2 of 2 test views are all of a band of heights, such as a ring (v000, v001)" in warning
     assert warning.endswith("name others in split.json.")
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from polarguide import optics
 
 # n and k in green light.
-METALS = {"aluminium": (0.96, 6.40), "silver": (0.14, 3.10), "chromium": (3.10, 3.30), "iron": (2.90, 2.90)}
+METALS = {"aluminum": (0.96, 6.40), "silver": (0.14, 3.10), "chromium": (3.10, 3.30), "iron": (2.90, 2.90)}
 
 
 def amplitudes(i: float, index: complex) -> tuple[float, float]:

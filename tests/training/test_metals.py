@@ -27,7 +27,7 @@ from polarguide.training.metals.words import contradicted, said_by
 from polarguide.training.trainer import Trainer, TrainSettings
 from tests.helpers.glossy_ball import ball, camera_at
 
-METALS = {"gold": (0.95, 0.78, 0.37), "aluminium": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
+METALS = {"gold": (0.95, 0.78, 0.37), "aluminum": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
 BODIES = {
     "white": (0.6, 0.6, 0.6),
     "red": (0.5, 0.1, 0.05),
@@ -172,7 +172,7 @@ def test_polarized_light_shows_metals_and_makes_none(
 
 
 @pytest.mark.parametrize(
-    ("material", "other", "most"), [("aluminium", "black", 0.02), ("chromium", "red", 0.005)]
+    ("material", "other", "most"), [("aluminum", "black", 0.02), ("chromium", "red", 0.005)]
 )
 def test_a_neighbor_of_a_metal_is_none(material: str, other: str, most: float) -> None:
     """The two halves of a ball meet; what is near the seam is judged by neighbors of like brightness and tint."""
@@ -230,7 +230,7 @@ def test_what_is_too_deeply_colored_is_no_metal_unless_the_user_says_so() -> Non
 def test_the_tint_is_that_of_the_material(material: str, least: float, most: float) -> None:
     """Half of the ball is gray, and so in part is the mean: by itself gold has 0.39, red paint 0.1 under its gloss."""
     half = gaussians_of_the_ball()
-    found = evidence(half, views_of(material, other="aluminium"), rasterize_cpu, 1.5)
+    found = evidence(half, views_of(material, other="aluminum"), rasterize_cpu, 1.5)
     x, _, z = half["means"].unbind(1)
     assert least < float(found.tint[(z > 0.1) & (x > 0.1)].median()) < most
     assert float(found.tint[(z > 0.1) & (x < -0.1)].median()) > 0.55

@@ -181,17 +181,13 @@ def _held_out(
     other = (
         "take --split directions" if data is None and split != "directions" else "name others in split.json"
     )
-    far, band = far_from_training(cameras, tests), held_out_band(cameras, tests)
-    found = []
-    if far:
-        found.append(f"are far from every training view ({listed(far)})")
-    elif band:
-        found.append(f"are all views of a band of heights, such as a ring ({listed(band)})")
-    return tests, [
-        f"{len(far or band)} of {len(tests)} test views {what}: scores on them measure extrapolation. If that is not "
-        f"meant, {other}."
-        for what in found
-    ]
+    if far := far_from_training(cameras, tests):
+        what = f"{len(far)} of {len(tests)} test views are far from every training view ({listed(far)})"
+    elif band := held_out_band(cameras, tests):
+        what = f"{len(band)} of {len(tests)} test views are all of a band of heights, such as a ring ({listed(band)})"
+    else:
+        return tests, []
+    return tests, [f"{what}: scores on them measure extrapolation. If that is not meant, {other}."]
 
 
 def read_views(

@@ -65,7 +65,7 @@ def held_out_band(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[s
     apart = max(SAME_HEIGHT * float(np.ptp(heights)), 1e-12)
     rings: list[list[int]] = []
     for k in (int(place) for place in np.argsort(heights, kind="stable")):
-        if rings and heights[k] - heights[rings[-1][-1]] < apart:
+        if rings and heights[k] - heights[rings[-1][0]] < apart:
             rings[-1].append(k)
         else:
             rings.append([k])

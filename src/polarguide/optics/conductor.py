@@ -72,7 +72,7 @@ def conductor_dolp_slope(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
 def conductor_index(reflectance: Tensor) -> tuple[Tensor, Tensor]:
     """An index (n, k) of a metal with this reflectance at normal incidence.
 
-    ``n = 2.1 - 1.9 r``, a line through copper, gold, silver, aluminium, chromium, iron, nickel and titanium, and the
+    ``n = 2.1 - 1.9 r``, a line through copper, gold, silver, aluminum, chromium, iron, nickel and titanium, and the
     ``k^2 = ((n + 1)^2 r - (n - 1)^2) / (1 - r)`` that then gives r (Gulbrandsen 2014, Eq. 2). Degrees of polarization
     are right to 0.01 at 45 degrees, to 0.08 at 60 and to 0.4 beyond 70.
 

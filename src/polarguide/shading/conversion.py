@@ -55,7 +55,13 @@ def _local(gaussians: Gaussians) -> list[tuple[str, Tensor]]:
 
 @torch.no_grad()
 def scale_light(gaussians: Gaussians, texels: Tensor, gain: float) -> None:
-    """Make all light brighter, and strengths as much smaller. texels: logarithms, changed in place."""
+    """Make all light brighter, and strengths as much smaller, with Adam's moments of both at zero; 1 changes nothing.
+
+    Args:
+        texels: logarithms, changed in place.
+    """
+    if gain == 1:
+        return
     texels.add_(math.log(gain))
     strength = (torch.sigmoid(gaussians["strength_logits"]) / gain).clamp(max=MOST_STRENGTH)
     gaussians.overwrite("strength_logits", torch.logit(strength))

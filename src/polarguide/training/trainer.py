@@ -354,7 +354,8 @@ class Trainer:
             return
         rasterize, index = self.backend.rasterize, self.settings.refractive_index
         found = evidence(gaussians, views, rasterize, index)
-        self._tell_contradictions(contradicted(gaussians, views, rasterize, found.said))
+        if not self._contradictions_told:
+            self._tell_contradictions(contradicted(gaussians, views, rasterize, found.said))
         centers = torch.stack([view.camera.center for view in self.scene.train_views])
         near = ~far_away(gaussians["means"].detach().cpu(), self.scene.points, centers, REACH)
         was = gaussians["metalness"] > 0
@@ -367,7 +368,7 @@ class Trainer:
 
     def _tell_contradictions(self, found: Mapping[str, float]) -> None:
         """Say once which of the user's masks contradict others. found: share by view."""
-        if found and not self._contradictions_told:
+        if found:
             self._contradictions_told = True
             names = listed([f"materials/{name}.png" for name in found])
             self._warn(

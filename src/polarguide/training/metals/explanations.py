@@ -8,7 +8,7 @@ At a Gaussian, a view measures S0 and, per color, the polarization P across the 
 
 Either has one unknown per color, which all views share, and one per color and view. Compared are their residuals E
 across the line of what the free light can explain, as log(E_dielectric / E_metal) over a neighborhood. That a metal
-fits better counts only where no dielectric fits: a matte white body under an even sky could as well be aluminium. And a
+fits better counts only where no dielectric fits: a matte white body under an even sky could as well be aluminum. And a
 metal's color is that of the light it mirrors times r, so that r follows the color that it shows.
 
 In polarized light neither fits. A metal then shows light that is polarized at 45 degrees to the plane of incidence, of
