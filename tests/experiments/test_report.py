@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import hashlib
 import itertools
 import json
@@ -14,12 +15,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from browsers import chromium
 from comparison_records import part, results, run, unfinished
 
+from polarguide.capture import GroundTruth, Scene
+from polarguide.capture.objects import Material, SceneObject
 from polarguide.experiments.curves import Curve, curves_svg, read_curve, smoothed, ticks
 from polarguide.experiments.forms import sections
-from polarguide.experiments.report import report_html
+from polarguide.experiments.report import _ground_truth_tile, report_html
 from polarguide.visualization.embedded import Tile, chosen_views, data_uri, embed
 
 FREE = ("r:unpolarized", "r:unpolarized-without-consistency")
@@ -50,6 +54,21 @@ def test_metalness_can_be_chosen_where_a_run_has_found_metal(found: bool) -> Non
     layers = next(json.loads(text) for text in reader.scripts if text.startswith('{"final"'))
     assert ("metalness" in layers) is found
     assert list(layers)[:2] == ["final", "diffuse"]
+
+
+def test_the_truth_of_metalness_is_that_of_the_objects(tiny_scene: Scene) -> None:
+    view = tiny_scene.views[0]
+    ids = torch.zeros(view.invalid.shape, dtype=torch.int32)
+    ids[:4], ids[4:8], ids[8:12] = 1, 2, 3
+    kinds = ("metal", "plastic", "roughconductor")
+    objects = tuple(SceneObject(k + 1, kind, True, Material(kind)) for k, kind in enumerate(kinds))
+    view = dataclasses.replace(view, ground_truth=GroundTruth(object_ids=ids))
+    tile = _ground_truth_tile(dataclasses.replace(tiny_scene, objects=objects), view)
+    shown = tile.pictures["metalness"].astype(int).sum(axis=2)
+    assert bool((shown[:4] > 600).all())
+    assert bool((shown[8:12] > 600).all())
+    assert bool((shown[4:8] < 20).all())
+    assert "metalness" not in _ground_truth_tile(tiny_scene, view).pictures, "no object is known to be metal"
 
 
 class Reader(HTMLParser):
