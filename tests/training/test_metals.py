@@ -349,6 +349,23 @@ def test_dielectric_turns_the_search_off(tiny_scene: Scene) -> None:
     assert not any_metal(trainer.state.gaussians["metalness"])
 
 
+@pytest.mark.parametrize("minimum", [1, 1000])
+def test_too_few_steps_to_heed_materials_are_told_of(tiny_scene: Scene, minimum: int) -> None:
+    heard: list[str] = []
+    stages = tuple(
+        dataclasses.replace(s, repeats=tuple(dataclasses.replace(r, minimum=minimum) for r in s.repeats))
+        for s in RECIPE.stages
+    )
+    recipe, scene = dataclasses.replace(RECIPE, stages=stages), with_materials(tiny_scene, 2)
+    for given in (scene, tiny_scene):
+        Trainer(given, recipe, TrainSettings(60, 3), choose_backend("cpu"), warn=heard.append)
+    if minimum == 1:
+        assert not heard
+    else:
+        (words,) = heard
+        assert words.startswith("materials/ is heeded between 40 and 72 % of the steps")
+
+
 def test_contradicting_files_are_named_once(tiny_scene: Scene) -> None:
     scene, heard = with_materials(tiny_scene, 2), []
     wrong = scene.train_views[1]

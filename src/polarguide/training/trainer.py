@@ -103,6 +103,14 @@ class Trainer:
         self._empty = empty.to(self._device)
         self._store = store or ViewStore()
         self._set_up()
+        said = any(view.materials is not None for view in scene.train_views)
+        said &= any(repeat.action == "refresh_priors" for stage in recipe.stages for repeat in stage.repeats)
+        if said and self._seeks_metals and not any(map(self._looks_at, range(self._steps))):
+            warn(
+                f"materials/ is heeded between {100 * recipe.metals[0]:.0f} and {100 * recipe.metals[1]:.0f} % of the "
+                f"steps, at refreshes of the priors, of which {self._steps:,} steps have none there: everything is "
+                "taken for dielectric. Take more steps."
+            )
 
     def _set_up(self) -> None:
         """What depends on the pictures and the number of steps: those of the search for angles, or of the training."""
@@ -339,12 +347,22 @@ class Trainer:
             self.ranks.broadcast(outward)
             gaussians.overwrite("outward", outward)
         else:
-            first, last = self.recipe.metals
-            sought = self.shading.knows_metals and self.settings.materials == "auto"
-            if sought and first <= self.state.step / self._steps < last:
+            if self._seeks_metals and self._may_look(self.state.step):
                 self._find_metals()
             self.state.frozen = self.state.gaussians.snapshot()
             self._sizes.refresh_priors()
+
+    @property
+    def _seeks_metals(self) -> bool:
+        return self.shading.knows_metals and self.settings.materials == "auto"
+
+    def _may_look(self, step: int) -> bool:
+        """Whether a refresh of the priors at this step looks for metals, too."""
+        first, last = self.recipe.metals
+        return first <= step / self._steps < last
+
+    def _looks_at(self, step: int) -> bool:
+        return self._may_look(step) and "refresh_priors" in self.schedule.at(step).actions
 
     @torch.no_grad()
     def _find_metals(self) -> None:
