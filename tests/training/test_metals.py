@@ -363,7 +363,9 @@ def test_too_few_steps_to_heed_materials_are_told_of(tiny_scene: Scene, minimum:
         assert not heard
     else:
         (words,) = heard
-        assert words.startswith("materials/ is heeded between 40 and 72 % of the steps")
+        assert words.startswith(
+            "materials/ is heeded at refreshes of the priors between 40 and 72 % of the steps"
+        )
 
 
 def test_contradicting_files_are_named_once(tiny_scene: Scene) -> None:

@@ -7,8 +7,7 @@ there and asks nothing back.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
@@ -16,11 +15,10 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.capture.background import has_black_background
 from polarguide.capture.smaller import smaller
-from polarguide.capture.view import listed
 from polarguide.color import srgb_encode
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
-from polarguide.gaussians.initialize import far_away, orbit, scene_extent
+from polarguide.gaussians.initialize import orbit, scene_extent
 from polarguide.raster import Backend, ScreenStatistic
 from polarguide.shading.gbuffer import COLOR_CHANNELS, render
 from polarguide.shading.model import PLAIN
@@ -29,10 +27,7 @@ from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_o
 from polarguide.training.behind import turned_behind
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.losses import step_loss
-from polarguide.training.metals.decision import REACH, decide
-from polarguide.training.metals.evidence import evidence
-from polarguide.training.metals.gain import light_gain
-from polarguide.training.metals.words import contradicted
+from polarguide.training.metals.search import MetalSearch
 from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Action, Recipe, Stage
@@ -88,8 +83,6 @@ class Trainer:
     ) -> None:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
         self.ranks, self._device = ranks, backend.device
-        self._warn = warn
-        self._contradictions_told = False
         self.whole = True
         self.shading = recipe.shading.bind(settings.refractive_index)
         self.black = is_black(scene, settings)
@@ -103,14 +96,8 @@ class Trainer:
         self._empty = empty.to(self._device)
         self._store = store or ViewStore()
         self._set_up()
-        said = any(view.materials is not None for view in scene.train_views)
-        said &= any(repeat.action == "refresh_priors" for stage in recipe.stages for repeat in stage.repeats)
-        if said and self._seeks_metals and not any(map(self._looks_at, range(self._steps))):
-            warn(
-                f"materials/ is heeded between {100 * recipe.metals[0]:.0f} and {100 * recipe.metals[1]:.0f} % of the "
-                f"steps, at refreshes of the priors, of which {self._steps:,} steps have none there: everything is "
-                "taken for dielectric. Take more steps."
-            )
+        self._metals = MetalSearch(scene, recipe, settings, self.shading, backend, ranks, warn)
+        self._metals.warn_if_never(self._refreshes())
 
     def _set_up(self) -> None:
         """What depends on the pictures and the number of steps: those of the search for angles, or of the training."""
@@ -347,52 +334,17 @@ class Trainer:
             self.ranks.broadcast(outward)
             gaussians.overwrite("outward", outward)
         else:
-            if self._seeks_metals and self._may_look(self.state.step):
-                self._find_metals()
+            if self._metals.is_due(self.state.step / self._steps):
+                self._metals.look(self.state, self._views)
             self.state.frozen = self.state.gaussians.snapshot()
             self._sizes.refresh_priors()
 
-    @property
-    def _seeks_metals(self) -> bool:
-        return self.shading.knows_metals and self.settings.materials == "auto"
-
-    def _may_look(self, step: int) -> bool:
-        """Whether a refresh of the priors at this step looks for metals, too."""
-        first, last = self.recipe.metals
-        return first <= step / self._steps < last
-
-    def _looks_at(self, step: int) -> bool:
-        return self._may_look(step) and "refresh_priors" in self.schedule.at(step).actions
-
-    @torch.no_grad()
-    def _find_metals(self) -> None:
-        """Decide which Gaussians are metals, and begin with what was measured of those that are new."""
-        gaussians, views = self.state.gaussians, self._views
-        if not any(view.is_determined or view.materials is not None for view in views):
-            return
-        rasterize, index = self.backend.rasterize, self.settings.refractive_index
-        found = evidence(gaussians, views, rasterize, index)
-        if not self._contradictions_told:
-            self._tell_contradictions(contradicted(gaussians, views, rasterize, found.said))
-        centers = torch.stack([view.camera.center for view in self.scene.train_views])
-        near = ~far_away(gaussians["means"].detach().cpu(), self.scene.points, centers, REACH)
-        was = gaussians["metalness"] > 0
-        metal, reflectance = decide(found, was, near.to(self._device)).float(), found.reflectance
-        for values in (metal, reflectance):
-            self.ranks.broadcast(values)
-        shown = [view for view in views if view.is_determined]
-        gain = partial(light_gain, gaussians, self.state.light, shown, rasterize, self.shading)
-        self.shading.become_metal(gaussians, self.state.light, metal > 0, reflectance, gain)
-
-    def _tell_contradictions(self, found: Mapping[str, float]) -> None:
-        """Say once which of the user's masks contradict others. found: share by view."""
-        if found:
-            self._contradictions_told = True
-            names = listed([f"materials/{name}.png" for name in found])
-            self._warn(
-                f"other views contradict {names} on {100 * max(found.values()):.0f} % of what is said there, at most: "
-                "dielectric in one view, metal in another. The larger part counts; look at these files."
-            )
+    def _refreshes(self) -> Iterator[float]:
+        """Shares of the steps after which the priors are refreshed again and again."""
+        repeats = any(r.action == "refresh_priors" for stage in self.recipe.stages for r in stage.repeats)
+        for step in range(self._steps if repeats else 0):
+            if "refresh_priors" in self.schedule.at(step).actions:
+                yield step / self._steps
 
     def _view_of(self, place: int) -> View:
         """The view at a place in the sequence of all views ever trained on.
