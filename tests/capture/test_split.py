@@ -60,9 +60,9 @@ def test_no_band_is_held_out_where_tests_are_spread() -> None:
 
 def test_a_band_of_many_views_is_found() -> None:
     """Their heights are so dense that each is within a ring's tolerance of the next."""
-    cameras = {f"v{k:04d}": at(90 * k / 2000, 137.5 * k) for k in range(2000)}
-    tests = [f"v{k:04d}" for k in range(900, 1100)]
-    assert len(held_out_band(cameras, tests)) > 180
+    cameras = {f"v{k:04d}": at(60 * k / 4000, 137.5 * k) for k in range(4000)}
+    tests = [f"v{k:04d}" for k in range(1800, 2200)]
+    assert len(held_out_band(cameras, tests)) > 360
 
 
 def test_every_held_out_view_has_training_views_near_it_and_none_is_far_from_all_held_out() -> None:

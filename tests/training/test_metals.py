@@ -1,73 +1,17 @@
-"""Metals are found by what all views measured, and by what the user says of them."""
+"""Metals are found by what all views measured."""
 
 from __future__ import annotations
-
-import dataclasses
-import math
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from polarguide import optics
-from polarguide.capture import Scene, View
-from polarguide.polarizer import ANGLES
-from polarguide.raster import choose_backend
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.recipes import RECIPES
-from polarguide.runs.folder import load_checkpoint, save_checkpoint
-from polarguide.shading.conversion import spread_directions
-from polarguide.shading.metal import any_metal
 from polarguide.training.metals.decision import decide
 from polarguide.training.metals.evidence import Evidence, evidence
 from polarguide.training.metals.explanations import residuals
 from polarguide.training.metals.looks import Seen
-from polarguide.training.metals.words import contradicted, said_by
-from polarguide.training.trainer import Trainer, TrainSettings
-from tests.helpers.glossy_ball import ball, camera_at
-
-METALS = {"gold": (0.95, 0.78, 0.37), "aluminum": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
-BODIES = {
-    "white": (0.6, 0.6, 0.6),
-    "red": (0.5, 0.1, 0.05),
-    "gray": (0.2, 0.2, 0.2),
-    "black": (0.02, 0.02, 0.02),
-}
-RECIPE = RECIPES["polarguide-stokes"]
-
-
-def light(directions: Tensor) -> Tensor:
-    """Radiance [..., 3] of a room: a window, a dark floor and something between."""
-    x, _, z = directions.double().unbind(-1)
-    window = torch.sigmoid(12 * (x - 0.5)) * torch.sigmoid(12 * (z + 0.2))
-    gray = 0.15 + 0.35 * torch.sigmoid(4 * z) + 0.25 * torch.sin(5 * directions[..., 1].double())
-    return (gray.clamp(min=0.03) + 1.2 * window)[..., None].expand(*directions.shape[:-1], 3) / 2
-
-
-def measured(
-    material: str, cosine: Tensor, light: Tensor, polarized: tuple[Tensor, Tensor] | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """S0, polarization across the plane of incidence and at 45 degrees to it [..., 3] of a smooth surface.
-
-    Args:
-        light: [..., 3]. polarized: its shares [..., 1] that are polarized across that plane and at 45 degrees to it.
-    """
-    c = cosine[..., None]
-    sine2 = 1 - c * c
-    body, under = torch.zeros_like(light), torch.zeros_like(c)
-    if material in METALS:
-        mean, slope = optics.conductor(c, torch.tensor(METALS[material], dtype=c.dtype))
-        over = slope * sine2
-    else:
-        s, p = optics.reflectances_from_cosine(c)
-        mean = 0.5 * (s + p)
-        over, under = (slope * sine2 for slope in optics.dolp_slopes(c))
-        body = torch.tensor(BODIES[material], dtype=c.dtype).expand_as(light) / 2
-    across, oblique = (torch.zeros_like(c), torch.zeros_like(c)) if polarized is None else polarized
-    mirrored = mean * light
-    s0 = mirrored * (1 + over * across) + body
-    return s0, mirrored * (over + across) - under * body, -mirrored * (1 - over**2).sqrt() * oblique
+from tests.helpers.metal_balls import BODIES, METALS, gaussians_of_the_ball, measured, views_of
 
 
 @pytest.mark.parametrize("material", [*METALS, *BODIES])
@@ -84,64 +28,6 @@ def test_the_right_explanation_leaves_less(material: str) -> None:
     else:
         assert float(dielectric.max()) < 1e-6
         assert bool((metal > dielectric).all())
-
-
-def polarized_light(coming_from: Tensor, normal: Tensor, degree: float) -> tuple[Tensor, Tensor]:
-    """Light that vibrates as level as it can: across the plane of incidence and at 45 degrees to it [..., 1]."""
-    up = torch.tensor([0.3, 0.1, 1.0]).expand_as(normal)
-    vibration = torch.nn.functional.normalize(torch.linalg.cross(coming_from, up), dim=-1)
-    across = torch.nn.functional.normalize(torch.linalg.cross(coming_from, normal), dim=-1)
-    along = torch.linalg.cross(coming_from, across)
-    s, p = (vibration * across).sum(-1, keepdim=True), (vibration * along).sum(-1, keepdim=True)
-    return degree * (s * s - p * p), 2 * degree * s * p
-
-
-def views_of(material: str, degree: float = 0.0, other: str | None = None) -> list[View]:
-    """A ball in the room, from all around; the light has a degree of polarization.
-
-    Args:
-        other: material where x is negative; the same, if not given.
-    """
-    found = []
-    for k in range(16):
-        camera = camera_at(2 * math.pi * k / 16, (0.15, 0.5, 0.75)[k % 3], 0.0)
-        normal, _, hit = ball(camera)
-        rays = camera.rays()
-        cosine = -(normal * rays).sum(dim=-1).clamp(-1, 0)
-        mirrored = camera.to_world(rays + 2 * cosine[..., None] * normal)
-        polarized = polarized_light(mirrored, camera.to_world(normal), degree)
-        one, two = (
-            measured(m, cosine.double(), light(mirrored), polarized) for m in (material, other or material)
-        )
-        here = camera.to_world(normal)[..., :1] > 0
-        s0, across, oblique = (torch.where(here, a, b) for a, b in zip(one, two, strict=True))
-        x_ref, up_ref = optics.lens_frame(rays)
-        x, y = (normal * x_ref).sum(-1), (normal * up_ref).sum(-1)
-        sine2 = (x * x + y * y).clamp(min=1e-9)
-        cosine2, sine = ((x * x - y * y) / sine2)[..., None], (2 * x * y / sine2)[..., None]
-        s1, s2 = -across * cosine2 - oblique * sine, -across * sine + oblique * cosine2
-        stokes = torch.stack((s0, s1, s2)) * hit[..., None]
-        codes = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in ANGLES])
-        codes = (codes.clamp(0, 1) * 65535).round().to(torch.uint16)
-        nowhere = torch.zeros(hit.shape, dtype=torch.bool)
-        found.append(View(f"v{k:02d}", camera, codes, ~hit, nowhere))
-    return found
-
-
-def gaussians_of_the_ball(count: int = 900) -> dict[str, Tensor]:
-    """Flat, opaque Gaussians on the unit ball."""
-    normals = spread_directions(count)
-    z = torch.tensor([0.0, 0.0, 1.0])
-    # The rotation that takes z to the normal.
-    quaternions = torch.cat((1 + normals[:, 2:], torch.linalg.cross(z.expand_as(normals), normals)), dim=1)
-    return {
-        "means": normals.clone(),
-        "quaternions": torch.nn.functional.normalize(quaternions, dim=1),
-        "log_scales": torch.tensor([0.07, 0.07, 0.003]).log().expand(count, 3).clone(),
-        "opacity_logits": torch.full((count,), 3.0),
-        "sh_dc": torch.zeros(count, 3),
-        "sh_rest": torch.zeros(count, 15, 3),
-    }
 
 
 @pytest.mark.parametrize(
@@ -303,120 +189,3 @@ def test_what_the_user_says_counts() -> None:
     found = said(60, ratio=ratio, said=words)
     nothing = torch.zeros(60, dtype=torch.bool)
     assert decide(found, nothing, ~nothing).nonzero()[:, 0].tolist() == [*range(5, 18), 50, 51, 52]
-
-
-def with_materials(scene: Scene, kind: int) -> Scene:
-    """The scene with everything of one material."""
-    views = tuple(
-        dataclasses.replace(view, materials=torch.full(view.invalid.shape, kind, dtype=torch.uint8))
-        for view in scene.views
-    )
-    return dataclasses.replace(scene, views=views)
-
-
-def trainer_of(scene: Scene, settings: TrainSettings, warn: list[str]) -> Trainer:
-    repeats = tuple(
-        dataclasses.replace(stage, repeats=tuple(dataclasses.replace(r, minimum=1) for r in stage.repeats))
-        for stage in RECIPE.stages
-    )
-    recipe = dataclasses.replace(RECIPE, stages=repeats)
-    return Trainer(scene, recipe, settings, choose_backend("cpu"), warn=warn.append)
-
-
-@pytest.mark.parametrize("until", [32, 45])
-def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path: Path, until: int) -> None:
-    """And goes on from between two looks, or from after the last, with the same bits."""
-    scene, heard = with_materials(tiny_scene, 2), []
-    settings = TrainSettings(60, 3)
-    whole = trainer_of(scene, settings, heard)
-    whole.run(lambda _: None, until=until)
-    assert any_metal(whole.state.gaussians["metalness"])
-    assert not heard
-    save_checkpoint(tmp_path, whole.state)
-    whole.run(lambda _: None)
-    state = load_checkpoint(tmp_path, RECIPE)
-    resumed = trainer_of(scene, settings, heard)
-    resumed.state = state
-    resumed.run(lambda _: None)
-    expected, found = whole.state.tensors(), resumed.state.tensors()
-    assert expected.keys() == found.keys()
-    assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
-
-
-def test_dielectric_turns_the_search_off(tiny_scene: Scene) -> None:
-    trainer = trainer_of(with_materials(tiny_scene, 2), TrainSettings(60, 3, materials="dielectric"), [])
-    trainer.run(lambda _: None)
-    assert not any_metal(trainer.state.gaussians["metalness"])
-
-
-@pytest.mark.parametrize("minimum", [1, 1000])
-def test_too_few_steps_to_heed_materials_are_told_of(tiny_scene: Scene, minimum: int) -> None:
-    heard: list[str] = []
-    stages = tuple(
-        dataclasses.replace(s, repeats=tuple(dataclasses.replace(r, minimum=minimum) for r in s.repeats))
-        for s in RECIPE.stages
-    )
-    recipe, scene = dataclasses.replace(RECIPE, stages=stages), with_materials(tiny_scene, 2)
-    for given in (scene, tiny_scene):
-        Trainer(given, recipe, TrainSettings(60, 3), choose_backend("cpu"), warn=heard.append)
-    if minimum == 1:
-        assert not heard
-    else:
-        (words,) = heard
-        assert words.startswith(
-            "materials/ is heeded at refreshes of the priors between 40 and 72 % of the steps"
-        )
-
-
-def test_contradicting_files_are_named_once(tiny_scene: Scene) -> None:
-    scene, heard = with_materials(tiny_scene, 2), []
-    wrong = scene.train_views[1]
-    views = tuple(
-        dataclasses.replace(view, materials=torch.ones_like(view.materials))
-        if view.name == wrong.name and view.materials is not None
-        else view
-        for view in scene.views
-    )
-    trainer = trainer_of(dataclasses.replace(scene, views=views), TrainSettings(60, 3), heard)
-    trainer.run(lambda _: None)
-    assert len(heard) == 1
-    assert f"materials/{wrong.name}.png" in heard[0]
-    assert "in one view, metal in another" in heard[0]
-
-
-def test_who_contradicts_whom() -> None:
-    """Of a ball that is metal in all files: one calls its right half dielectric, another says nothing."""
-    views = [
-        dataclasses.replace(view, materials=torch.where(view.invalid, 0, 2).to(torch.uint8))
-        for view in views_of("gold")
-    ]
-    half = views[3].materials
-    assert half is not None
-    half[:, half.shape[1] // 2 :][half[:, half.shape[1] // 2 :] == 2] = 1
-    views[4] = dataclasses.replace(views[4], materials=None)
-    of_the_ball = gaussians_of_the_ball()
-    found = contradicted(of_the_ball, views, rasterize_cpu, said_by(of_the_ball, views, rasterize_cpu))
-    assert list(found) == ["v03"]
-    assert 0.35 < found["v03"] < 0.65
-
-
-def test_the_users_words_need_no_polarization(tiny_scene: Scene) -> None:
-    """Single pictures do not determine the Stokes vector; what the user calls metal is one all the same."""
-    views = [
-        dataclasses.replace(
-            view,
-            codes=view.codes[:1],
-            exposures=view.exposures[:1],
-            materials=torch.where(view.invalid, 0, 2).to(torch.uint8),
-        )
-        for view in views_of("gold")[:6]
-    ]
-    assert not any(view.is_determined for view in views)
-    found = evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5)
-    nothing = torch.zeros(900, dtype=torch.bool)
-    metal = decide(found, nothing, ~nothing)
-    assert float(metal[gaussians_of_the_ball()["means"][:, 2] > 0.3].float().mean()) > 0.9
-    views = [dataclasses.replace(view, materials=None) for view in views]
-    assert not bool(
-        decide(evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5), nothing, ~nothing).any()
-    )

@@ -15,6 +15,7 @@ ROUGH = 0.15
 """GGX roughness above which a surface is called rough: its lobe is wider than some nine degrees to each side."""
 LARGEST_ID = 65535
 MaterialClass = Literal["metal", "rough metal", "dielectric", "rough dielectric", "matte"]
+METAL_CLASSES: tuple[MaterialClass, ...] = ("metal", "rough metal")
 METALS = ("metal", "conductor", "roughconductor")
 DIELECTRICS = ("plastic", "pplastic", "roughplastic", "dielectric", "roughdielectric", "principled")
 MATTE = ("matte", "diffuse")

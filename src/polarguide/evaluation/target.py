@@ -12,6 +12,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
 from polarguide.capture import View
+from polarguide.capture.objects import METAL_CLASSES
 from polarguide.evaluation.facts import SceneFacts, outside
 from polarguide.evaluation.metrics import Selection, has_direction, reflective_mask, window_centers
 
@@ -123,7 +124,7 @@ class ViewTarget:
             owner = torch.full_like(known.object_ids, len(facts.objects), dtype=torch.int64)
             for place, item in enumerate(facts.objects):
                 owner[known.object_ids == item.id] = place
-            plain = [item.material.kind not in (None, "metal", "rough metal") for item in facts.objects]
+            plain = [item.material.kind not in (None, *METAL_CLASSES) for item in facts.objects]
             dielectric = torch.tensor([*plain, False])[owner] & ~view.invalid
             if known.mask is not None:
                 dielectric &= known.mask

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
+from polarguide.capture.objects import METAL_CLASSES
 from polarguide.evaluation.metrics import normal_angles_deg
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash, read_curve
@@ -132,7 +133,7 @@ def _scene_views(
 def _ground_truth_tile(scene: Scene, view: View) -> Tile:
     pictures = {key: value for key, value in ground_truth_pictures(view).items() if key in LAYER_METRICS}
     ids = None if view.ground_truth is None else view.ground_truth.object_ids
-    metals = [item.id for item in scene.objects if item.material.kind in ("metal", "rough metal")]
+    metals = [item.id for item in scene.objects if item.material.kind in METAL_CLASSES]
     if ids is not None and metals:
         truly = torch.isin(ids, torch.tensor(metals, dtype=ids.dtype))
         pictures["metalness"] = figures.scalar_to_rgb(truly.float(), 0.0, 1.0, "inferno")

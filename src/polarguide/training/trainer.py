@@ -340,11 +340,9 @@ class Trainer:
             self._sizes.refresh_priors()
 
     def _refreshes(self) -> Iterator[float]:
-        """Shares of the steps after which the priors are refreshed again and again."""
-        repeats = any(r.action == "refresh_priors" for stage in self.recipe.stages for r in stage.repeats)
-        for step in range(self._steps if repeats else 0):
-            if "refresh_priors" in self.schedule.at(step).actions:
-                yield step / self._steps
+        """Shares of the training's steps, search for angles apart, after which the priors are refreshed."""
+        steps, schedule = self.settings.steps, Schedule(self.recipe, self.settings.steps)
+        return (step / steps for step in range(steps) if "refresh_priors" in schedule.at(step).actions)
 
     def _view_of(self, place: int) -> View:
         """The view at a place in the sequence of all views ever trained on.

@@ -55,7 +55,7 @@ class MetalSearch:
     def warn_if_never(self, refreshes: Iterable[float]) -> None:
         """Say so where the user names materials and no refresh is due, of those after these shares of the steps.
 
-        A recipe that never refreshes its priors reads nothing of what it was not told to read.
+        Nothing is said of recipes that never refresh their priors, such as controls: they look for no metal.
         """
         if not self._on or all(view.materials is None for view in self._scene.train_views):
             return
