@@ -10,6 +10,7 @@
 namespace polarguide {
 
 using Array = nanobind::ndarray<float, nanobind::c_contig, nanobind::device::cpu>;
+using Indices = nanobind::ndarray<int64_t, nanobind::ndim<1>, nanobind::c_contig, nanobind::device::cpu>;
 
 // Raises ValueError unless the array has this shape.
 inline void expect_shape(const Array &array, const char *name, std::initializer_list<int64_t> shape) {
@@ -23,6 +24,18 @@ inline void expect_shape(const Array &array, const char *name, std::initializer_
     if (same) return;
     for (size_t i = 0; i < array.ndim(); ++i) found += (i ? ", " : "") + std::to_string(array.shape(i));
     throw std::invalid_argument(std::string(name) + ": expected shape [" + wanted + "], found [" + found + "]");
+}
+
+// Raises ValueError unless the indices ascend within [0, count).
+inline void expect_ascending(const Indices &indices, const char *name, int64_t count) {
+    int64_t least = 0;
+    for (size_t i = 0; i < indices.shape(0); ++i) {
+        const int64_t index = indices.data()[i];
+        if (index < least || index >= count)
+            throw std::invalid_argument(std::string(name) + ": expected ascending indices below " + std::to_string(count) +
+                                        ", found " + std::to_string(index) + " at " + std::to_string(i));
+        least = index + 1;
+    }
 }
 
 } // namespace polarguide

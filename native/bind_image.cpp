@@ -4,6 +4,7 @@
 
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <memory>
@@ -11,6 +12,7 @@
 #include <stdexcept>
 #include <string>
 #include <tuple>
+#include <vector>
 
 namespace nb = nanobind;
 using namespace polarguide;
@@ -83,9 +85,9 @@ CubemapArgs cubemap_args(const Array &texture, const Array &directions) {
 
 // The gradient of the texels is summed in slices of the directions, which are then added in order: the number of slices
 // follows from the sizes alone, so that the result does not depend on the number of threads. A slice costs a pass over
-// the texels: worth it only where it brings at least as many taps.
-void sum_texture_gradient(const CubemapArgs &a, int64_t count, float *gradient) {
-    const int64_t texels = int64_t(6) * a.resolution * a.resolution, size = texels * a.channels;
+// the texels: worth it only where it brings at least as many taps. `add(begin, end, sums)` adds what some directions bring.
+template <class Add> void sum_texture_gradient(int64_t texels, int64_t channels, int64_t count, float *gradient, Add add) {
+    const int64_t size = texels * channels;
     const int64_t worth = std::min(count / 16384, 4 * count / texels), slices = std::clamp<int64_t>(worth, 1, 8);
     const int64_t share = (count + slices - 1) / slices;
     std::unique_ptr<float[]> others(new float[size_t(size) * size_t(slices - 1)]);
@@ -93,8 +95,7 @@ void sum_texture_gradient(const CubemapArgs &a, int64_t count, float *gradient) 
     auto slice = [&](int64_t b, int64_t e, int) {
         for (int64_t i = b; i < e; ++i) {
             std::fill_n(sums(i), size, 0.0f);
-            POLARGUIDE_DISPATCH(cubemap_backward_texture)
-            (a, std::min(count, i * share), std::min(count, (i + 1) * share), sums(i));
+            add(std::min(count, i * share), std::min(count, (i + 1) * share), sums(i));
         }
     };
     parallel_chunks(slices, 1, slice);
@@ -105,6 +106,30 @@ void sum_texture_gradient(const CubemapArgs &a, int64_t count, float *gradient) 
         }
     };
     if (slices > 1) parallel_chunks(size, merge_chunk, merge);
+}
+
+MipArgs mip_args(const std::vector<Array> &textures, const Array &directions, const Array &level) {
+    MipArgs a{};
+    if (textures.empty() || textures.size() > most_mip_levels)
+        throw std::invalid_argument("textures: expected 1 to " + std::to_string(most_mip_levels) + " levels");
+    const int64_t count = rows(directions);
+    expect_shape(level, "level", {count});
+    int64_t texels = 0;
+    for (const Array &texture : textures) {
+        const CubemapArgs one = cubemap_args(texture, directions);
+        a.channels = a.levels ? a.channels : one.channels;
+        if (one.channels != a.channels || a.channels < 1 || a.channels > largest_mip_channels)
+            throw std::invalid_argument("textures: expected the same 1 to " + std::to_string(largest_mip_channels) + " channels");
+        a.resolution[a.levels] = one.resolution, a.textures[a.levels] = one.texture, a.begin[a.levels] = texels * a.channels;
+        texels += int64_t(6) * one.resolution * one.resolution, ++a.levels;
+    }
+    a.directions = directions.data(), a.level = level.data();
+    return a;
+}
+
+int64_t texels_of(const MipArgs &a) {
+    const int64_t last = a.resolution[a.levels - 1];
+    return a.begin[a.levels - 1] / a.channels + 6 * last * last;
 }
 
 HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &center, const Array &dc, const Array &rest) {
@@ -150,10 +175,41 @@ void bind_image(nb::module_ &module) {
             nb::gil_scoped_release release;
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(cubemap_backward_directions)(a, b, e); };
             if (grad_directions) parallel_chunks(count, item_chunk, body);
-            if (grad_texture) sum_texture_gradient(a, count, grad_texture->data());
+            auto add = [&](int64_t b, int64_t e, float *to) { POLARGUIDE_DISPATCH(cubemap_backward_texture)(a, b, e, to); };
+            if (grad_texture) sum_texture_gradient(6 * side * side, a.channels, count, grad_texture->data(), add);
         },
         nb::arg("texture"), nb::arg("directions"), nb::arg("grad_out"), nb::arg("grad_texture").none(),
         nb::arg("grad_directions").none(), "Fills the gradients that are not None.");
+    module.def(
+        "mips_forward",
+        [](const std::vector<Array> &textures, const Array &directions, const Array &level, Array out) {
+            MipArgs a = mip_args(textures, directions, level);
+            const int64_t count = rows(directions);
+            expect_shape(out, "out", {count, a.channels});
+            a.out = out.data();
+            nb::gil_scoped_release release;
+            auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(mips_forward)(a, b, e); };
+            parallel_chunks(count, item_chunk, body);
+        },
+        nb::arg("textures"), nb::arg("directions"), nb::arg("level"), nb::arg("out"), "Look-up between mip levels.");
+    module.def(
+        "mips_backward",
+        [](const std::vector<Array> &textures, const Array &directions, const Array &level, const Array &grad_out,
+           std::optional<Array> grad_textures, Array grad_directions, Array grad_level) {
+            MipArgs a = mip_args(textures, directions, level);
+            const int64_t count = rows(directions), texels = texels_of(a);
+            expect_shape(grad_out, "grad_out", {count, a.channels}), expect_shape(grad_level, "grad_level", {count});
+            expect_shape(grad_directions, "grad_directions", {count, 3});
+            if (grad_textures) expect_shape(*grad_textures, "grad_textures", {texels * a.channels});
+            a.grad_out = grad_out.data(), a.grad_directions = grad_directions.data(), a.grad_level = grad_level.data();
+            nb::gil_scoped_release release;
+            auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(mips_backward)(a, b, e); };
+            parallel_chunks(count, item_chunk, body);
+            auto add = [&](int64_t b, int64_t e, float *to) { POLARGUIDE_DISPATCH(mips_backward_textures)(a, b, e, to); };
+            if (grad_textures) sum_texture_gradient(texels, a.channels, count, grad_textures->data(), add);
+        },
+        nb::arg("textures"), nb::arg("directions"), nb::arg("level"), nb::arg("grad_out"), nb::arg("grad_textures").none(),
+        nb::arg("grad_directions"), nb::arg("grad_level"), "Gradients; those of the textures in a row, if not None.");
     module.def(
         "harmonics_forward",
         [](int degree, const Array &means, const Array &center, const Array &dc, const Array &rest, Array out) {

@@ -27,19 +27,7 @@ ReflectArgs reflect_args(const Array &features, const Array &rays, bool fresnel,
     return a;
 }
 
-void run(void (*kernel)(const ReflectArgs &, int64_t, int64_t), const ReflectArgs &a, int64_t count) {
-    nb::gil_scoped_release release;
-    auto body = [&](int64_t b, int64_t e, int) { kernel(a, b, e); };
-    parallel_chunks(count, item_chunk, body);
-}
-
-void run(void (*kernel)(const ConductorArgs &, int64_t, int64_t), const ConductorArgs &a, int64_t count) {
-    nb::gil_scoped_release release;
-    auto body = [&](int64_t b, int64_t e, int) { kernel(a, b, e); };
-    parallel_chunks(count, item_chunk, body);
-}
-
-void run(void (*kernel)(const GBufferArgs &, int64_t, int64_t), const GBufferArgs &a, int64_t count) {
+template <class Args> void run(void (*kernel)(const Args &, int64_t, int64_t), const Args &a, int64_t count) {
     nb::gil_scoped_release release;
     auto body = [&](int64_t b, int64_t e, int) { kernel(a, b, e); };
     parallel_chunks(count, item_chunk, body);
@@ -60,38 +48,90 @@ const float *optional_rows(const MaybeArray &array, const char *name, int64_t n)
     return array->data();
 }
 
+MetalArgs metal_args(const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share,
+                     float blur) {
+    const ReflectArgs all = reflect_args(features, rays, true, false, 1.5f);
+    if (first < 7 || first + 5 > all.channels || local < -1 || local + 3 > all.channels)
+        throw std::invalid_argument("features: expected the channels of metals behind those of dielectrics");
+    expect_ascending(pixels, "pixels", int64_t(features.shape(0)));
+    MetalArgs a{};
+    a.channels = all.channels, a.first = first, a.local = local, a.least_share = least_share, a.blur = blur;
+    a.features = features.data(), a.rays = rays.data(), a.pixels = pixels.data();
+    return a;
+}
+
+void bind_metal(nb::module_ &module) {
+    module.def(
+        "metal_directions",
+        [](const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share, float blur,
+           Array directions, Array level) {
+            MetalArgs a = metal_args(features, rays, pixels, first, local, least_share, blur);
+            const int64_t n = int64_t(pixels.shape(0));
+            expect_shape(directions, "directions", {n, 3}), expect_shape(level, "level", {n});
+            a.directions = directions.data(), a.level = level.data();
+            run(POLARGUIDE_DISPATCH(metal_directions), a, n);
+        },
+        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("local"), nb::arg("least_share"),
+        nb::arg("blur"), nb::arg("directions"), nb::arg("level"), "Mirrored rays and mip levels of metals.");
+    module.def(
+        "metal_layers",
+        [](const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share, float blur,
+           const Array &seen, Array share, Array reflected, Array slope, Array final_picture, Array specular) {
+            MetalArgs a = metal_args(features, rays, pixels, first, local, least_share, blur);
+            const int64_t n = int64_t(pixels.shape(0)), p = int64_t(rays.shape(0));
+            expect_shape(seen, "seen", {n, 3}), expect_shape(share, "share", {n});
+            expect_shape(reflected, "reflected", {n, 3}), expect_shape(slope, "slope", {n, 3});
+            expect_shape(final_picture, "final", {p, 3}), expect_shape(specular, "specular", {p, 3});
+            a.seen = seen.data(), a.share = share.data(), a.reflected = reflected.data(), a.slope = slope.data();
+            a.final_picture = final_picture.data(), a.specular = specular.data();
+            run(POLARGUIDE_DISPATCH(metal_layers), a, n);
+        },
+        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("local"), nb::arg("least_share"),
+        nb::arg("blur"), nb::arg("seen"), nb::arg("share"), nb::arg("reflected"), nb::arg("slope"), nb::arg("final"),
+        nb::arg("specular"), "What metals reflect, which is added to two layers.");
+    module.def(
+        "metal_backward_layers",
+        [](const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share, float blur,
+           const Array &seen, MaybeArray grad_final, MaybeArray grad_specular, MaybeArray grad_held,
+           MaybeArray grad_reflected, MaybeArray grad_slope, Array grad_seen, Array grad_features) {
+            MetalArgs a = metal_args(features, rays, pixels, first, local, least_share, blur);
+            const int64_t n = int64_t(pixels.shape(0)), p = int64_t(rays.shape(0));
+            expect_shape(seen, "seen", {n, 3}), expect_shape(grad_seen, "grad_seen", {n, 3});
+            expect_shape(grad_features, "grad_features", {p, a.channels});
+            a.grad_layers[0] = optional_rows(grad_final, "grad_final", p);
+            a.grad_layers[1] = optional_rows(grad_specular, "grad_specular", p);
+            a.grad_layers[2] = optional_rows(grad_held, "grad_held", p);
+            a.grad_reflected = optional_rows(grad_reflected, "grad_reflected", n);
+            a.grad_slope = optional_rows(grad_slope, "grad_slope", n);
+            a.seen = seen.data(), a.grad_seen = grad_seen.data(), a.grad_features = grad_features.data();
+            run(POLARGUIDE_DISPATCH(metal_backward_layers), a, n);
+        },
+        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("local"), nb::arg("least_share"),
+        nb::arg("blur"), nb::arg("seen"), nb::arg("grad_final").none(), nb::arg("grad_specular").none(),
+        nb::arg("grad_held").none(), nb::arg("grad_reflected").none(), nb::arg("grad_slope").none(), nb::arg("grad_seen"),
+        nb::arg("grad_features"),
+        "Fills the gradient by the look-up, and adds that by the features but for what comes through the look-up.");
+    module.def(
+        "metal_backward_directions",
+        [](const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share, float blur,
+           const Array &grad_directions, const Array &grad_level, Array grad_features) {
+            MetalArgs a = metal_args(features, rays, pixels, first, local, least_share, blur);
+            const int64_t n = int64_t(pixels.shape(0)), p = int64_t(rays.shape(0));
+            expect_shape(grad_directions, "grad_directions", {n, 3}), expect_shape(grad_level, "grad_level", {n});
+            expect_shape(grad_features, "grad_features", {p, a.channels});
+            a.grad_directions = grad_directions.data(), a.grad_level = grad_level.data();
+            a.grad_features = grad_features.data();
+            run(POLARGUIDE_DISPATCH(metal_backward_directions), a, n);
+        },
+        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("local"), nb::arg("least_share"),
+        nb::arg("blur"), nb::arg("grad_directions"), nb::arg("grad_level"), nb::arg("grad_features"),
+        "Adds what comes through the look-up by the features.");
+}
+
 } // namespace
 
 void bind_reflect(nb::module_ &module) {
-    module.def(
-        "conductor_values",
-        [](const Array &cosine, const Array &reflectance, Array mean, Array slope, std::optional<Array> derivatives) {
-            const int64_t n = cosine.ndim() == 1 ? int64_t(cosine.shape(0)) : 0;
-            expect_shape(cosine, "cosine", {n}), expect_shape(reflectance, "reflectance", {n, 3});
-            expect_shape(mean, "mean", {n, 3}), expect_shape(slope, "slope", {n, 3});
-            if (derivatives) expect_shape(*derivatives, "derivatives", {n, 3, 4});
-            ConductorArgs a{};
-            a.cosine = cosine.data(), a.reflectance = reflectance.data(), a.mean = mean.data(), a.slope = slope.data();
-            a.derivatives = derivatives ? derivatives->data() : nullptr;
-            run(POLARGUIDE_DISPATCH(conductor_values), a, n);
-        },
-        nb::arg("cosine"), nb::arg("reflectance"), nb::arg("mean"), nb::arg("slope"), nb::arg("derivatives").none(),
-        "Reflectance and polarization of metals.");
-    module.def(
-        "conductor_backward",
-        [](Array derivatives, const MaybeArray &grad_mean, const MaybeArray &grad_slope, Array grad_cosine,
-           Array grad_reflectance) {
-            const int64_t n = grad_cosine.ndim() == 1 ? int64_t(grad_cosine.shape(0)) : 0;
-            expect_shape(derivatives, "derivatives", {n, 3, 4}), expect_shape(grad_cosine, "grad_cosine", {n});
-            expect_shape(grad_reflectance, "grad_reflectance", {n, 3});
-            ConductorArgs a{};
-            a.derivatives = derivatives.data(), a.grad_mean = optional_rows(grad_mean, "grad_mean", n);
-            a.grad_slope = optional_rows(grad_slope, "grad_slope", n);
-            a.grad_cosine = grad_cosine.data(), a.grad_reflectance = grad_reflectance.data();
-            run(POLARGUIDE_DISPATCH(conductor_backward), a, n);
-        },
-        nb::arg("derivatives"), nb::arg("grad_mean").none(), nb::arg("grad_slope").none(), nb::arg("grad_cosine"),
-        nb::arg("grad_reflectance"), "Gradients by the cosine and the reflectance of metals.");
+    bind_metal(module);
     module.def(
         "reflect_directions",
         [](const Array &features, const Array &rays, Array directions) {

@@ -40,6 +40,24 @@ POLARGUIDE_DECLARE(void cubemap_backward_directions(const CubemapArgs &a, int64_
 // Adds to `sums` [6,R,R,C], in the order of the directions.
 POLARGUIDE_DECLARE(void cubemap_backward_texture(const CubemapArgs &a, int64_t begin, int64_t end, float *sums))
 
+// Look-up between the mip levels of a cubemap, linear in the level; `begin` says where those of a level lie among the
+// gradients of all texels, one level after the other.
+constexpr int most_mip_levels = 16, largest_mip_channels = 64;
+struct MipArgs {
+    int levels, channels;
+    int resolution[most_mip_levels];
+    int64_t begin[most_mip_levels];
+    const float *textures[most_mip_levels];  // [6,R,R,C] each
+    const float *directions, *level;         // [P,3] [P]
+    float *out;                              // [P,C]
+    const float *grad_out;                   // [P,C]
+    float *grad_directions, *grad_level;     // [P,3] [P]
+};
+POLARGUIDE_DECLARE(void mips_forward(const MipArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void mips_backward(const MipArgs &a, int64_t begin, int64_t end))
+// Adds to `sums`, in the order of the directions.
+POLARGUIDE_DECLARE(void mips_backward_textures(const MipArgs &a, int64_t begin, int64_t end, float *sums))
+
 struct HarmonicsArgs {
     int degree;
     const float *means, *center, *dc, *rest; // [N,3] [3] [N,3] [N,15,3]
@@ -85,17 +103,26 @@ POLARGUIDE_DECLARE(void reflect_layers(const ReflectArgs &a, int64_t begin, int6
 POLARGUIDE_DECLARE(void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t end))
 
-// Reflectance of metals for unpolarized light, and its degree of polarization over sin^2 of the zenith. `derivatives` are
-// of both by the cosine and by the reflectance, in turn.
-struct ConductorArgs {
-    const float *cosine, *reflectance;        // [K] [K,3]
-    float *mean, *slope;                      // [K,3]
-    float *derivatives;                       // [K,3,4]; null: not wanted
-    const float *grad_mean, *grad_slope;      // [K,3], each may be null
-    float *grad_cosine, *grad_reflectance;    // [K] [K,3]
+// What metals add to the layers (shading.metal), at K pixels. Of the features, channel `first` begins reflectance,
+// metalness and roughness, the latter two times metalness as they are blended; `local` begins their own light, if not -1.
+struct MetalArgs {
+    int channels, first, local;
+    float least_share, blur;
+    const float *features, *rays; // [P,D] [P,3]
+    const int64_t *pixels;        // [K] ascending
+    float *directions, *level;    // [K,3] [K]: of the look-up between mips
+    const float *seen;            // [K,3]: what it gave
+    float *share, *reflected, *slope;    // [K] [K,3] [K,3]
+    float *final_picture, *specular;     // [P,3], to which it is added
+    const float *grad_layers[3];         // [P,3] each, by layers it was added to; may be null
+    const float *grad_reflected, *grad_slope; // [K,3] each, may be null
+    const float *grad_directions, *grad_level; // [K,3] [K]
+    float *grad_seen, *grad_features;          // [K,3]; [P,D], to which it is added
 };
-POLARGUIDE_DECLARE(void conductor_values(const ConductorArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void conductor_backward(const ConductorArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void metal_directions(const MetalArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void metal_layers(const MetalArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void metal_backward_layers(const MetalArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void metal_backward_directions(const MetalArgs &a, int64_t begin, int64_t end))
 
 // What a picture reads of its G-buffer beside the layers: the blended normal, channels 3 to 5, and the depth, the last
 // channel over alpha.

@@ -1,7 +1,7 @@
-// Fresnel's equations of a metal per pixel and color (optics.conductor), with derivatives by forward differentiation.
+// What metals reflect at the pixels that show them (shading.metal), added to the layers of dielectrics, and its gradient.
+// Fresnel's equations of a conductor (optics.conductor) are differentiated forward, by the cosine and the reflectance.
 #include "image.h"
-
-#include <math.h>
+#include "mirror.h"
 
 namespace polarguide {
 namespace POLARGUIDE_ISA {
@@ -11,60 +11,172 @@ constexpr float least_reflectance = 0.1f, largest_reflectance = 0.985f;
 
 // A value and its derivatives by the cosine and by the reflectance.
 struct Dual {
-    float v, c, r;
+    reg v, c, r;
 };
-inline Dual constant(float v) { return {v, 0.0f, 0.0f}; }
-inline Dual operator+(Dual a, Dual b) { return {a.v + b.v, a.c + b.c, a.r + b.r}; }
-inline Dual operator-(Dual a, Dual b) { return {a.v - b.v, a.c - b.c, a.r - b.r}; }
-inline Dual operator*(Dual a, Dual b) { return {a.v * b.v, a.c * b.v + a.v * b.c, a.r * b.v + a.v * b.r}; }
-inline Dual operator*(float a, Dual b) { return {a * b.v, a * b.c, a * b.r}; }
-inline Dual operator/(Dual a, Dual b) {
-    const float inverse = 1.0f / b.v, v = a.v * inverse;
+POLARGUIDE_INLINE Dual constant(float v) { return {reg_splat(v), reg{}, reg{}}; }
+POLARGUIDE_INLINE Dual operator+(Dual a, Dual b) { return {a.v + b.v, a.c + b.c, a.r + b.r}; }
+POLARGUIDE_INLINE Dual operator-(Dual a, Dual b) { return {a.v - b.v, a.c - b.c, a.r - b.r}; }
+POLARGUIDE_INLINE Dual operator*(Dual a, Dual b) { return {a.v * b.v, a.c * b.v + a.v * b.c, a.r * b.v + a.v * b.r}; }
+POLARGUIDE_INLINE Dual operator*(float a, Dual b) { return {a * b.v, a * b.c, a * b.r}; }
+POLARGUIDE_INLINE Dual operator/(Dual a, Dual b) {
+    const reg inverse = 1.0f / b.v, v = a.v * inverse;
     return {v, (a.c - v * b.c) * inverse, (a.r - v * b.r) * inverse};
 }
-inline Dual root(Dual a) {
-    const float v = sqrtf(a.v), half = 0.5f / v;
+POLARGUIDE_INLINE Dual root(Dual a) {
+    const reg v = square_root(a.v), half = 0.5f / v;
     return {v, half * a.c, half * a.r};
+}
+POLARGUIDE_INLINE Dual where(ireg chosen, Dual a, Dual b) {
+    return {chosen ? a.v : b.v, chosen ? a.c : b.c, chosen ? a.r : b.r};
+}
+
+struct Conductor {
+    Dual mean, slope; // reflectance for unpolarized light; degree of polarization over sin^2
+};
+
+POLARGUIDE_INLINE Dual within(reg given, float low, float high, bool cosine) {
+    const reg kept = clamp(given, reg_splat(low), reg_splat(high));
+    const reg passes = (given >= low) & (given <= high) ? reg_splat(1.0f) : reg{};
+    return {kept, cosine ? passes : reg{}, cosine ? reg{} : passes};
+}
+
+POLARGUIDE_INLINE Conductor conductor(reg cosine, reg reflectance) {
+    const Dual c = within(cosine, 0.0f, 1.0f, true), one = constant(1.0f), c2 = c * c, sine2 = one - c2;
+    const Dual r = within(reflectance, least_reflectance, largest_reflectance, false);
+    const Dual n = constant(2.1f) - 1.9f * r, n2 = n * n;
+    const Dual k2 = ((n + one) * (n + one) * r - (n - one) * (n - one)) / (one - r);
+    const Dual real = n2 - k2 - sine2, squared = root(real * real + 4.0f * (n2 * k2));
+    const ireg negative = real.v < 0.0f;
+    const Dual larger = root(0.5f * (squared + where(negative, -1.0f * real, real)));
+    const Dual half = where(negative, root(n2 * k2) / larger, larger); // the real part of the root
+    const Dual y = 2.0f * (half * c), sum = squared + c2, s = (sum - y) / (sum + y);
+    const Dual x = c2 * squared + sine2 * sine2, across = y * sine2;
+    return {0.5f * (s + s * ((x - across) / (x + across))), y / x};
+}
+
+// Columns `first` to `first` + W at some pixels; rows from n on are zero.
+template <int W> POLARGUIDE_INLINE void gather(const float *rows, int stride, int first, const int64_t *at, int n, reg *columns) {
+    alignas(64) float t[W][reg_lanes] = {};
+    for (int l = 0; l < n; ++l)
+        for (int k = 0; k < W; ++k) t[k][l] = rows[stride * at[l] + first + k];
+    __builtin_memcpy(columns, t, sizeof t);
+}
+template <int W> POLARGUIDE_INLINE void add(const reg *columns, const int64_t *at, int n, int stride, int first, float *rows) {
+    for (int l = 0; l < n; ++l)
+        for (int k = 0; k < W; ++k) rows[stride * at[l] + first + k] += columns[k][l];
+}
+
+// Of some pixels from the i-th on.
+struct Metal {
+    reg share, inverse, given[3], reflectance[3], roughness; // `given` as blended, reflectance and roughness without the share
+    ireg shows;                                              // not under the least share
+    Mirror mirror;
+};
+
+POLARGUIDE_INLINE Metal metal_at(const MetalArgs &a, int64_t i, int n) {
+    Metal m;
+    reg ray[3], blended[3], rough;
+    gather<3>(a.features, a.channels, 3, a.pixels + i, n, blended), gather<3>(a.rays, 3, 0, a.pixels + i, n, ray);
+    gather<3>(a.features, a.channels, a.first, a.pixels + i, n, m.given);
+    gather<1>(a.features, a.channels, a.first + 3, a.pixels + i, n, &m.share);
+    gather<1>(a.features, a.channels, a.first + 4, a.pixels + i, n, &rough);
+    m.mirror = mirror_of(ray, blended);
+    m.shows = m.share >= a.least_share;
+    m.inverse = 1.0f / (m.shows ? m.share : reg_splat(a.least_share));
+    for (int k = 0; k < 3; ++k) m.reflectance[k] = m.given[k] * m.inverse;
+    m.roughness = rough * m.inverse;
+    return m;
+}
+
+// What a metal mirrors, and where it is not cut at 0.
+POLARGUIDE_INLINE void light_at(const MetalArgs &a, int64_t i, int n, reg *light, ireg *lit) {
+    reg local[3] = {};
+    load_columns<3>(a.seen + 3 * i, n, light);
+    if (a.local >= 0) gather<3>(a.features, a.channels, a.local, a.pixels + i, n, local);
+    for (int k = 0; k < 3; ++k) {
+        const reg sum = light[k] + local[k];
+        lit[k] = a.local >= 0 ? sum >= 0.0f : ireg{} == ireg{};
+        light[k] = lit[k] ? sum : reg{};
+    }
 }
 
 } // namespace
 
-void conductor_values(const ConductorArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-        const float given = a.cosine[i], within = given < 0.0f ? 0.0f : given > 1.0f ? 1.0f : given;
-        const Dual c{within, within == given ? 1.0f : 0.0f, 0.0f}, c2 = c * c, sine2 = constant(1.0f) - c2;
-        for (int k = 0; k < 3; ++k) {
-            const int64_t at = 3 * i + k;
-            const float raw = a.reflectance[at];
-            const float kept = raw < least_reflectance ? least_reflectance : raw > largest_reflectance ? largest_reflectance : raw;
-            const Dual r{kept, 0.0f, kept == raw ? 1.0f : 0.0f}, one = constant(1.0f);
-            const Dual n = constant(2.1f) - 1.9f * r, n2 = n * n;
-            const Dual k2 = ((n + one) * (n + one) * r - (n - one) * (n - one)) / (one - r);
-            const Dual real = n2 - k2 - sine2, squared = root(real * real + 4.0f * (n2 * k2));
-            const Dual size = real.v < 0.0f ? -1.0f * real : real, larger = root(0.5f * (squared + size));
-            const Dual half = real.v < 0.0f ? root(n2 * k2) / larger : larger; // the real part of the root
-            const Dual y = 2.0f * (half * c), sum = squared + c2, s = (sum - y) / (sum + y);
-            const Dual x = c2 * squared + sine2 * sine2, across = y * sine2;
-            const Dual mean = 0.5f * (s + s * ((x - across) / (x + across))), slope = y / x;
-            a.mean[at] = mean.v, a.slope[at] = slope.v;
-            if (!a.derivatives) continue;
-            float *to = a.derivatives + 4 * at;
-            to[0] = mean.c, to[1] = mean.r, to[2] = slope.c, to[3] = slope.r;
-        }
+void metal_directions(const MetalArgs &a, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        const Metal m = metal_at(a, i, n);
+        reg out[3], level = a.blur * m.roughness;
+        mirrored_ray(m.mirror, out);
+        store_columns<3>(a.directions + 3 * i, n, out), store_columns<1>(a.level + i, n, &level);
     }
 }
 
-void conductor_backward(const ConductorArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-        float by_cosine = 0.0f;
+void metal_layers(const MetalArgs &a, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        const Metal m = metal_at(a, i, n);
+        reg light[3], reflected[3], slope[3];
+        ireg lit[3];
+        light_at(a, i, n, light, lit);
         for (int k = 0; k < 3; ++k) {
-            const int64_t at = 3 * i + k;
-            const float *by = a.derivatives + 4 * at;
-            const float mean = a.grad_mean ? a.grad_mean[at] : 0.0f, slope = a.grad_slope ? a.grad_slope[at] : 0.0f;
-            by_cosine += mean * by[0] + slope * by[2];
-            a.grad_reflectance[at] = mean * by[1] + slope * by[3];
+            const Conductor found = conductor(-m.mirror.along, m.reflectance[k]);
+            reflected[k] = m.share * found.mean.v * light[k], slope[k] = found.slope.v;
         }
-        a.grad_cosine[i] = by_cosine;
+        store_columns<1>(a.share + i, n, &m.share), store_columns<3>(a.reflected + 3 * i, n, reflected);
+        store_columns<3>(a.slope + 3 * i, n, slope);
+        add<3>(reflected, a.pixels + i, n, 3, 0, a.final_picture), add<3>(reflected, a.pixels + i, n, 3, 0, a.specular);
+    }
+}
+
+// Gradients by what was seen, and by the features except what comes through the look-up, which
+// metal_backward_directions adds.
+void metal_backward_layers(const MetalArgs &a, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        const int64_t *at = a.pixels + i;
+        const Metal m = metal_at(a, i, n);
+        reg light[3], by[3] = {}, by_slope[3] = {}, to_light[3], to_metal[4], to_normal[3], part[3];
+        ireg lit[3];
+        light_at(a, i, n, light, lit);
+        if (a.grad_reflected) load_columns<3>(a.grad_reflected + 3 * i, n, by);
+        if (a.grad_slope) load_columns<3>(a.grad_slope + 3 * i, n, by_slope);
+        for (const float *layer : a.grad_layers) {
+            if (!layer) continue;
+            gather<3>(layer, 3, 0, at, n, part);
+            for (int k = 0; k < 3; ++k) by[k] += part[k];
+        }
+        reg by_share = {}, by_inverse = {}, by_cosine = {};
+        for (int k = 0; k < 3; ++k) {
+            const Conductor found = conductor(-m.mirror.along, m.reflectance[k]);
+            const reg by_mean = m.share * light[k] * by[k];
+            to_light[k] = lit[k] ? m.share * found.mean.v * by[k] : reg{};
+            by_share += found.mean.v * light[k] * by[k];
+            by_cosine += by_mean * found.mean.c + by_slope[k] * found.slope.c;
+            const reg by_reflectance = by_mean * found.mean.r + by_slope[k] * found.slope.r;
+            to_metal[k] = by_reflectance * m.inverse, by_inverse += by_reflectance * m.given[k];
+        }
+        to_metal[3] = by_share - (m.shows ? by_inverse * m.inverse * m.inverse : reg{});
+        normal_by_along(m.mirror, -by_cosine, to_normal);
+        store_columns<3>(a.grad_seen + 3 * i, n, to_light);
+        add<4>(to_metal, at, n, a.channels, a.first, a.grad_features);
+        add<3>(to_normal, at, n, a.channels, 3, a.grad_features);
+        if (a.local >= 0) add<3>(to_light, at, n, a.channels, a.local, a.grad_features);
+    }
+}
+
+void metal_backward_directions(const MetalArgs &a, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        const int64_t *at = a.pixels + i;
+        const Metal m = metal_at(a, i, n);
+        reg g[3], by_level, to_normal[3], to_metal[2];
+        load_columns<3>(a.grad_directions + 3 * i, n, g), load_columns<1>(a.grad_level + i, n, &by_level);
+        normal_by_mirrored(m.mirror, g, to_normal);
+        to_metal[1] = a.blur * m.inverse * by_level;
+        to_metal[0] = m.shows ? -a.blur * m.roughness * m.inverse * by_level : reg{};
+        add<3>(to_normal, at, n, a.channels, 3, a.grad_features);
+        add<2>(to_metal, at, n, a.channels, a.first + 3, a.grad_features);
     }
 }
 

@@ -1,13 +1,13 @@
 // Deferred reflection per pixel, around the look-up in the cubemap: rays mirrored at blended normals before it, the
 // layers of the picture after it, and both gradients.
 #include "image.h"
-#include "simd.h"
+#include "mirror.h"
 
 namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-constexpr float shortest_normal = 1e-3f, brightest = 5.0f; // log of light
+constexpr float brightest = 5.0f; // log of light
 constexpr float least_alpha = 1e-6f, log2_e = 1.44269504f;
 
 // Columns `first` to `first` + W of as many rows as a register has lanes; rows from n on are zero.
@@ -18,24 +18,11 @@ template <int W> POLARGUIDE_INLINE void columns_of(const float *rows, int stride
     __builtin_memcpy(columns, t, sizeof t);
 }
 
-// The blended normals of pixels i to i + n, and the rays there.
-struct Mirror {
-    reg ray[3], normal[3], inverse; // unit, and 1 / length
-    ireg short_;                    // length below the floor: divided by the floor
-    reg along;                      // ray . normal
-};
-
 POLARGUIDE_INLINE Mirror mirror_at(const ReflectArgs &a, int64_t i, int n) {
-    reg blended[3];
-    Mirror m;
+    reg blended[3], ray[3];
     columns_of<3>(a.features + a.channels * i, a.channels, 3, n, blended);
-    load_columns<3>(a.rays + 3 * i, n, m.ray);
-    const reg squared = blended[0] * blended[0] + blended[1] * blended[1] + blended[2] * blended[2];
-    m.short_ = squared < shortest_normal * shortest_normal;
-    m.inverse = 1.0f / (m.short_ ? reg_splat(shortest_normal) : square_root(squared));
-    m.along = reg{};
-    for (int k = 0; k < 3; ++k) m.normal[k] = blended[k] * m.inverse, m.along += m.ray[k] * m.normal[k];
-    return m;
+    load_columns<3>(a.rays + 3 * i, n, ray);
+    return mirror_of(ray, blended);
 }
 
 // Unpolarized power reflectance where the ray meets the normal, and its derivative by their product.
@@ -96,16 +83,13 @@ POLARGUIDE_INLINE Blend blend_of(const ReflectArgs &a, reg strength, reg along) 
     return b;
 }
 
-POLARGUIDE_INLINE int count_at(int64_t i, int64_t end) { return end - i < reg_lanes ? int(end - i) : reg_lanes; }
-
 } // namespace
 
 void reflect_directions(const ReflectArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += reg_lanes) {
         const int n = count_at(i, end);
-        const Mirror m = mirror_at(a, i, n);
         reg out[3];
-        for (int k = 0; k < 3; ++k) out[k] = m.ray[k] - 2.0f * m.along * m.normal[k];
+        mirrored_ray(mirror_at(a, i, n), out);
         store_columns<3>(a.directions + 3 * i, n, out);
     }
 }
@@ -155,9 +139,8 @@ void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
             seen[k] = live * light.slope[k], texels[k] = both * light.slope[k];
         }
         to[6] = a.fresnel ? blend.share * (by_share + by_held) : by_share + by_held - by_kept;
-        const reg turn = blend.by_along * strength * by_share * (a.fresnel ? m.inverse : reg{});
-        for (int k = 0; k < 3; ++k)
-            to[3 + k] = a.fresnel ? turn * (m.ray[k] - (m.short_ ? reg{} : m.along * m.normal[k])) : reg{};
+        if (a.fresnel) normal_by_along(m, blend.by_along * strength * by_share, to + 3);
+        else to[3] = to[4] = to[5] = reg{};
         store_columns<3>(a.grad_seen + 3 * i, n, seen);
         if (held) store_columns<3>(a.grad_texels + 3 * i, n, texels);
         const int used = a.local ? 10 : 7;
@@ -172,18 +155,11 @@ void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
 void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += reg_lanes) {
         const int n = count_at(i, end);
-        const Mirror m = mirror_at(a, i, n);
-        reg g[3], by_unit[3], radial = {};
+        reg g[3], to[3];
         load_columns<3>(a.grad_directions + 3 * i, n, g);
-        const reg across = g[0] * m.normal[0] + g[1] * m.normal[1] + g[2] * m.normal[2];
-        for (int k = 0; k < 3; ++k) {
-            by_unit[k] = -2.0f * (m.along * g[k] + across * m.ray[k]);
-            radial += by_unit[k] * m.normal[k];
-        }
-        for (int k = 0; k < 3; ++k) {
-            const reg to = m.inverse * (by_unit[k] - (m.short_ ? reg{} : radial * m.normal[k]));
-            for (int l = 0; l < n; ++l) a.grad_features[a.channels * (i + l) + 3 + k] += to[l];
-        }
+        normal_by_mirrored(mirror_at(a, i, n), g, to);
+        for (int k = 0; k < 3; ++k)
+            for (int l = 0; l < n; ++l) a.grad_features[a.channels * (i + l) + 3 + k] += to[k][l];
     }
 }
 

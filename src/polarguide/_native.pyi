@@ -88,6 +88,16 @@ def cubemap_backward(
     grad_texture: Tensor | None,
     grad_directions: Tensor | None,
 ) -> None: ...
+def mips_forward(textures: Sequence[Tensor], directions: Tensor, level: Tensor, out: Tensor) -> None: ...
+def mips_backward(
+    textures: Sequence[Tensor],
+    directions: Tensor,
+    level: Tensor,
+    grad_out: Tensor,
+    grad_textures: Tensor | None,
+    grad_directions: Tensor,
+    grad_level: Tensor,
+) -> None: ...
 def harmonics_forward(
     degree: int, means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, out: Tensor
 ) -> None: ...
@@ -122,15 +132,60 @@ def axes_backward(
     grad_quaternions: Tensor,
 ) -> None: ...
 def mirrored_forward(means: Tensor, center: Tensor, normals: Tensor, out: Tensor) -> None: ...
-def conductor_values(
-    cosine: Tensor, reflectance: Tensor, mean: Tensor, slope: Tensor, derivatives: Tensor | None
+def metal_directions(
+    features: Tensor,
+    rays: Tensor,
+    pixels: Tensor,
+    first: int,
+    local: int,
+    least_share: float,
+    blur: float,
+    directions: Tensor,
+    level: Tensor,
 ) -> None: ...
-def conductor_backward(
-    derivatives: Tensor,
-    grad_mean: Tensor | None,
+def metal_layers(
+    features: Tensor,
+    rays: Tensor,
+    pixels: Tensor,
+    first: int,
+    local: int,
+    least_share: float,
+    blur: float,
+    seen: Tensor,
+    share: Tensor,
+    reflected: Tensor,
+    slope: Tensor,
+    final: Tensor,
+    specular: Tensor,
+) -> None: ...
+def metal_backward_layers(
+    features: Tensor,
+    rays: Tensor,
+    pixels: Tensor,
+    first: int,
+    local: int,
+    least_share: float,
+    blur: float,
+    seen: Tensor,
+    grad_final: Tensor | None,
+    grad_specular: Tensor | None,
+    grad_held: Tensor | None,
+    grad_reflected: Tensor | None,
     grad_slope: Tensor | None,
-    grad_cosine: Tensor,
-    grad_reflectance: Tensor,
+    grad_seen: Tensor,
+    grad_features: Tensor,
+) -> None: ...
+def metal_backward_directions(
+    features: Tensor,
+    rays: Tensor,
+    pixels: Tensor,
+    first: int,
+    local: int,
+    least_share: float,
+    blur: float,
+    grad_directions: Tensor,
+    grad_level: Tensor,
+    grad_features: Tensor,
 ) -> None: ...
 def reflect_directions(features: Tensor, rays: Tensor, directions: Tensor) -> None: ...
 def reflect_layers(

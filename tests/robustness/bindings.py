@@ -159,12 +159,33 @@ def polarization(rng: random.Random) -> None:
     )
 
 
-def conductor(rng: random.Random) -> None:
-    n = rng.choice((*SIZES, 5000))
-    given, derivatives = [array(rng, n), *(array(rng, n, 3) for _ in range(3))], array(rng, n, 3, 4)
-    _native.conductor_values(*given, maybe(rng, derivatives))
-    by = maybe(rng, array(rng, n, 3)), maybe(rng, array(rng, n, 3))
-    _native.conductor_backward(derivatives, *by, array(rng, n), array(rng, n, 3))
+def metal(rng: random.Random) -> None:
+    n, d = rng.choice((*SIZES, 5000)), rng.randint(10, 18)
+    first, local = rng.choice((7, 7, 10, 12, 3, d)), rng.choice((-1, -1, 7, 0, d - 2))
+    pixels = np.flatnonzero(np.random.default_rng(rng.randrange(2**31)).random(n) < 0.4)
+    if len(pixels) and rng.random() < 0.1:
+        pixels[rng.randrange(len(pixels))] = rng.choice((-1, n, 2**62))
+    k, blur = len(pixels), rng.choice((4.0, 4.0, 0.0, np.nan, 3e38))
+    given = array(rng, n, d), array(rng, n, 3), pixels, first, local, rng.choice((0.01, 0.01, 0.0)), blur
+    rows, seen = [array(rng, k, 3) for _ in range(3)], array(rng, k, 3)
+    _native.metal_directions(*given, rows[0], array(rng, k))
+    _native.metal_layers(*given, seen, array(rng, k), *rows[1:], array(rng, n, 3), array(rng, n, 3))
+    layers = [maybe(rng, array(rng, n, 3)) for _ in range(3)]
+    by = [maybe(rng, array(rng, k, 3)) for _ in range(2)]
+    _native.metal_backward_layers(*given, seen, *layers, *by, array(rng, k, 3), array(rng, n, d))
+    _native.metal_backward_directions(*given, array(rng, k, 3), array(rng, k), array(rng, n, d))
+
+
+def mips(rng: random.Random) -> None:
+    n, c = rng.choice((*SIZES, 5000)), rng.choice((1, 3, 3, 5, 64, 65, 0))
+    sides = [rng.choice((1, 2, 5, 16)) for _ in range(rng.choice((1, 2, 5, 16, 17, 0)))]
+    textures = [array(rng, 6, side, side, c) for side in sides]
+    directions, level = array(rng, n, 3), 3 * array(rng, n)
+    _native.mips_forward(textures, directions, level, array(rng, n, c))
+    flat = maybe(rng, array(rng, sum(6 * side * side * c for side in sides)))
+    _native.mips_backward(
+        textures, directions, level, array(rng, n, c), flat, array(rng, n, 3), array(rng, n)
+    )
 
 
 def direction(rng: random.Random) -> None:
@@ -185,7 +206,7 @@ def consistency(rng: random.Random) -> None:
 
 KINDS = (
     rasterizer, photometric, cubemap, reflect, harmonics, axes, finite, gbuffer, polarization, direction,
-    consistency, conductor,
+    consistency, metal, mips,
 )  # fmt: skip
 
 

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from polarguide import _native
 from polarguide.shading.cubemap import cubemap_lookup_reference
-from polarguide.shading.mips import box_mips, mip_lookup, mip_lookup_at_once
+from polarguide.shading.mips import box_mips, mip_lookup, mip_lookup_reference
 
 LEVELS = 5  # of resolution 8: 8, 4, 2, 1, and the mean
 
@@ -84,23 +85,47 @@ def test_no_directions() -> None:
     assert mip_lookup(levels, torch.zeros(0, 3).double(), torch.zeros(0).double()).shape == (0, 5)
 
 
-@pytest.mark.parametrize("count", [1, LEVELS])
-def test_all_at_once_is_level_by_level(count: int) -> None:
-    """What devices other than the CPU compute, with its gradients."""
-    rays = directions().requires_grad_()
-    levels = [t.detach().requires_grad_() for t in box_mips(texture())[:count]]
-    level = torch.linspace(-0.5, count + 0.5, len(rays), dtype=torch.float64).requires_grad_()
-    inputs = (*levels, rays, level)
-    weights = torch.randn(len(rays), 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    expected = mip_lookup(levels, rays, level)
-    clamped = level.clamp(0, count - 1)
-    lower = clamped.detach().floor().long().clamp(max=max(0, count - 2))
-    found = mip_lookup_at_once(levels, rays, lower, clamped - lower)
-    assert_close(found, expected)
-    pairs = zip(
-        torch.autograd.grad((found * weights).sum(), inputs),
-        torch.autograd.grad((expected * weights).sum(), inputs),
-        strict=True,
+@pytest.mark.parametrize("count", [1, 2, LEVELS])
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_the_native_look_up_is_the_reference(count: int, channels: int) -> None:
+    rays = directions(200)
+    rays[:8] = torch.tensor([[s, t, 1.0] for s in (-1, 1) for t in (-1, 0.99, 1, 0)])  # at edges and corners
+    # Not at whole levels, where the gradient by the level jumps.
+    level = torch.linspace(-0.55, count + 0.55, len(rays), dtype=torch.float64)
+    weights = torch.randn(
+        len(rays), channels, generator=torch.Generator().manual_seed(3), dtype=torch.float64
     )
-    for a, b in pairs:
-        assert_close(a, b)
+    found = []
+    for look_up, dtype in ((mip_lookup, torch.float32), (mip_lookup_reference, torch.float64)):
+        levels = [t.to(dtype).requires_grad_() for t in box_mips(texture(channels=channels).detach())[:count]]
+        inputs = (*levels, rays.to(dtype).requires_grad_(), level.to(dtype).requires_grad_())
+        seen = look_up(levels, *inputs[count:])
+        gradients = torch.autograd.grad((seen * weights.to(dtype)).sum(), inputs, allow_unused=count == 1)
+        found.append([t.detach().double() for t in (seen, *gradients) if t is not None])
+    if count == 1:  # a single level has no gradient by the level
+        found = [of[:3] for of in found]
+    for ours, exact in zip(*found, strict=True):
+        assert_close(ours, exact, rtol=1e-3, atol=1e-4)
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    found = []
+    for threads in (1, 2, 3):
+        _native.set_thread_count(threads)
+        levels = [t.float().requires_grad_() for t in box_mips(texture())]
+        rays, level = (
+            directions(9000).float().requires_grad_(),
+            4 * torch.rand(9000, generator=torch.Generator().manual_seed(4)),
+        )
+        seen = mip_lookup(levels, rays, level)
+        found.append([seen.detach(), *torch.autograd.grad(seen.square().sum(), [*levels, rays])])
+    _native.set_thread_count(0)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def test_a_texture_of_many_channels_goes_by_the_reference() -> None:
+    levels = box_mips(texture(torch.float32, channels=65))
+    level = torch.linspace(0, 4, 60)
+    found = mip_lookup(levels, directions().float(), level)
+    assert_close(found, mip_lookup_reference(levels, directions().float(), level))

@@ -23,7 +23,8 @@ from polarguide.shading.metal import (
     CHANNELS,
     FIRST_REFLECTANCE,
     FIRST_ROUGHNESS,
-    add_metal,
+    MINIMUM_SHARE,
+    MetalPixels,
     any_metal,
     metal_channels,
     metal_mips,
@@ -31,6 +32,7 @@ from polarguide.shading.metal import (
     metalness_picture,
     reflectance,
     reflectance_logits,
+    where_metal,
     with_metal,
 )
 from polarguide.shading.mips import mip_lookup
@@ -48,7 +50,7 @@ from polarguide.shading.model import (
     harmonic_values,
     mirrored,
 )
-from polarguide.shading.native import reflect_native
+from polarguide.shading.native import MetalArguments, reflect_native
 from polarguide.shading.result import LAYERS, HeldLayers
 from polarguide.vectors import dot, unit
 
@@ -235,10 +237,8 @@ class DeferredShading(ShadingModel):
         With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``.
         """
         features, texels = splatted.features, light["texels"]
-        if fits(features, texels):
-            return self._with_metals(
-                self._shade_native(features, texels, camera, held=False), splatted, texels, camera
-            )
+        if splatted.metal is None and fits(features, texels):
+            return self._shade_native(features, texels, camera, held=False)
         strength = features[..., 6]
         local = features[..., 7:10] if self.local else None
         layers = reflect_reference(splatted.color, splatted.normal, strength, texels, camera, self, local)
@@ -251,13 +251,8 @@ class DeferredShading(ShadingModel):
         texels = light["texels"]
         if not fits(splatted.features, texels):
             return super().shade_held(splatted, light, camera)
-        layers: dict[str, Any] = self._shade_native(splatted.features, texels, camera, held=True)
-        specular, diffuse = layers.pop("held specular"), layers.pop("held diffuse")
-        layers = self._with_metals(layers, splatted, texels, camera)
-        metal = layers.get("metal")
-        if metal is not None:
-            specular = add_metal(specular, metal)
-        return layers, (specular, diffuse, metal)
+        layers = self._shade_native(splatted.features, texels, camera, held=True)
+        return layers, (layers.pop("held specular"), layers.pop("held diffuse"), layers.get("metal"))
 
     def _with_metals(
         self, layers: dict[str, Tensor], splatted: GBuffer, texels: Tensor, camera: Camera
@@ -265,13 +260,12 @@ class DeferredShading(ShadingModel):
         """The layers of dielectrics with what metals add; as they are where the model knows no metals."""
         if not self.metal:
             return layers
-        features, first, metal = splatted.features, 10 if self.local else 7, splatted.metal
-        # Of a depth behind the channels of dielectrics there is one; of metals, five more.
-        if metal is None and features.shape[-1] >= first + CHANNELS:
+        features, metal = splatted.features, splatted.metal
+        if metal is None and self._shows_metals(features):
             rays = camera.world_rays(dtype=features.dtype, device=features.device)
             metal = metal_pixels(
                 features.flatten(0, 1),
-                first,
+                self._first_of_metals,
                 rays.flatten(0, 1),
                 splatted.normal.flatten(0, 1),
                 self.radiance(texels),
@@ -280,23 +274,49 @@ class DeferredShading(ShadingModel):
         found = layers if metal is None else with_metal(layers, metal)
         return {**found, "metalness": metalness_picture(metal, features), "metal": metal}
 
+    @property
+    def _first_of_metals(self) -> int:
+        """The channel where those of metals begin, behind the ones of dielectrics."""
+        return 10 if self.local else 7
+
+    def _shows_metals(self, features: Tensor) -> bool:
+        """Whether there are channels of metals; behind those of dielectrics may also be one of depth."""
+        return self.metal and features.shape[-1] >= self._first_of_metals + CHANNELS
+
     def _shade_native(
         self, features: Tensor, texels: Tensor, camera: Camera, *, held: bool
-    ) -> dict[str, Tensor]:
+    ) -> dict[str, Any]:
+        pixels, metal, levels = features.flatten(0, 1), None, []
+        if self._shows_metals(features):
+            first, local = self._first_of_metals, 7 if self.local else -1
+            metal = MetalArguments(where_metal(pixels, first), first, local, MINIMUM_SHARE, BLUR)
+            levels = metal_mips(self.radiance(texels))
         found = reflect_native(
-            features.flatten(0, 1),
+            pixels,
             camera.world_rays().flatten(0, 1),
             texels,
             fresnel=self.blend == "fresnel",
             local=self.local,
             refractive_index=self.refractive_index,
             held=held,
+            metal=metal,
+            levels=levels,
         )
-        names = ("final", "specular", "diffuse", "reflection", "held specular", "held diffuse")
-        layers = {
+        names = [
+            "final",
+            "specular",
+            "diffuse",
+            "reflection",
+            *(("held specular", "held diffuse") if held else ()),
+        ]
+        layers: dict[str, Any] = {
             name: layer.unflatten(0, features.shape[:2]) for name, layer in zip(names, found, strict=False)
         }
-        return {**layers, "strength": features[..., 6]}
+        layers["strength"] = features[..., 6]
+        if self.metal:
+            shown = None if metal is None else MetalPixels(metal.pixels, *found[len(names) :])
+            layers |= {"metalness": metalness_picture(shown, features), "metal": shown}
+        return layers
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Colors [N, 3] of Gaussians by themselves; see ``ShadingModel``."""

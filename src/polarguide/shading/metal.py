@@ -22,10 +22,8 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.camera import Camera
-from polarguide.native import fits
 from polarguide.optics.conductor import LARGEST_REFLECTANCE
 from polarguide.shading.mips import box_mips, mip_lookup
-from polarguide.shading.native import conductor_native
 from polarguide.vectors import dot, unit
 
 # Of which a metal's reflectance is trained between these.
@@ -92,10 +90,15 @@ def metal_mips(light: Tensor) -> list[Tensor]:
     return box_mips(light)[: math.ceil(BLUR) + 1]
 
 
+def where_metal(features: Tensor, first: int) -> Tensor:
+    """Pixels [K] that show metal, ascending, of ``metal_pixels``' features."""
+    return (features[:, first + 3].detach() > MINIMUM_SHARE).nonzero()[:, 0]
+
+
 def metal_pixels(
     features: Tensor, first: int, rays: Tensor, normal: Tensor, light: Tensor, local: int | None
 ) -> MetalPixels:
-    """Shade what shows metal.
+    """Shade what shows metal: the reference implementation of what ``reflect_native`` does of metals.
 
     Args:
         features: [P, C] blended. first: of its channels the one where ``metal_channels`` begin.
@@ -103,7 +106,7 @@ def metal_pixels(
         light: [6, R, R, 3] radiance from afar.
         local: the channel where the three of the light of the Gaussians' own begin; None: there is none.
     """
-    pixels = (features[:, first + 3].detach() > MINIMUM_SHARE).nonzero()[:, 0]
+    pixels = where_metal(features, first)
     # All channels at once: each part taken by itself would send back a picture of all of them.
     shown, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
     metal = shown[:, first : first + CHANNELS]
@@ -115,10 +118,7 @@ def metal_pixels(
     if local is not None:
         seen = (seen + shown[:, local : local + 3]).clamp(min=0)
     reflectances = metal[:, :3] * inverse[:, None]
-    if fits(metal):
-        mean, slope = conductor_native(-along[:, 0], reflectances)
-    else:
-        mean, slope = optics.conductor(-along, reflectances)
+    mean, slope = optics.conductor(-along, reflectances)
     return MetalPixels(pixels, share, share[:, None] * mean * seen, slope)
 
 

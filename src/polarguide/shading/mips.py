@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from polarguide.shading.cubemap import bilinear, cubemap_lookup, face_coordinates, ringed_texels
+from polarguide import _native
+from polarguide.native import fits
+from polarguide.shading.cubemap import bilinear, face_coordinates, ringed_texels
+
+# Of the native look-up.
+MOST_LEVELS, MOST_CHANNELS = 16, 64
 
 
 def box_mips(texture: Tensor) -> list[Tensor]:
@@ -41,12 +48,45 @@ def box_mips(texture: Tensor) -> list[Tensor]:
     return levels
 
 
+class _Between(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, directions: Tensor, level: Tensor, *levels: Tensor) -> Tensor:
+        directions, level = directions.detach().contiguous(), level.detach().contiguous()
+        kept = [t.detach().contiguous() for t in levels]
+        out = directions.new_empty(len(directions), kept[0].shape[-1])
+        _native.mips_forward(kept, directions, level, out)
+        ctx.save_for_backward(directions, level, *kept)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        directions, level, *levels = ctx.saved_tensors
+        to_directions, to_level, to_levels = mips_backward(
+            levels, directions, level, grad.contiguous(), any(ctx.needs_input_grad[2:])
+        )
+        return to_directions, to_level, *to_levels
+
+
+def mips_backward(
+    levels: Sequence[Tensor], directions: Tensor, level: Tensor, grad: Tensor, textures: bool
+) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
+    """Gradients of the native look-up by directions, level and, with ``textures``, the levels; contiguous tensors."""
+    to_directions, to_level = torch.empty_like(directions), torch.empty_like(level)
+    sizes = [texture.numel() for texture in levels]
+    flat = grad.new_empty(sum(sizes)) if textures else None
+    _native.mips_backward(levels, directions, level, grad, flat, to_directions, to_level)
+    if flat is None:
+        return to_directions, to_level, [None] * len(levels)
+    parts = zip(flat.split(sizes), levels, strict=True)
+    return to_directions, to_level, [part.view_as(texture) for part, texture in parts]
+
+
 def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> Tensor:
     """Look-up between mip levels: seamless bilinear on the two nearest, linear between them.
 
-    Only the two levels that a direction needs are read: on the CPU level by level, with the native look-up;
-    elsewhere all directions at once, since counting those of a level would wait for the device. The gradient with
-    respect to ``level`` is the difference of those two, and 0 beyond the ends.
+    On the CPU in float32 a native pass; ``mip_lookup_reference`` is its reference implementation. The gradient with
+    respect to ``level`` is the difference of the two levels, and 0 beyond the ends.
 
     Args:
         levels: L textures as of ``box_mips``, [6, R_l, R_l, C].
@@ -54,23 +94,13 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
         level: [P], clamped to [0, L - 1].
 
     Returns:
-        [P, C], differentiable in all three.
+        [P, C], differentiable in all three; on the CPU the same bits for any number of threads.
     """
-    last = len(levels) - 1
-    level = level.clamp(0, last)
-    # The last level is reached as the upper one of a pair, so that there is always a pair.
-    lower = level.detach().nan_to_num(0).floor().long().clamp(max=max(0, last - 1))
-    fraction = level - lower
-    if directions.device.type != "cpu":
-        return mip_lookup_at_once(levels, directions, lower, fraction)
-    out = directions.new_zeros(directions.shape[0], levels[0].shape[-1])
-    for index, texture in enumerate(levels):
-        own = lower == index
-        chosen = (own | (lower == index - 1)).nonzero()[:, 0]
-        if chosen.numel():
-            weight = torch.where(own, 1 - fraction, fraction)[chosen, None]
-            out.index_add_(0, chosen, weight * cubemap_lookup(texture, directions[chosen]))
-    return out
+    native = len(levels) <= MOST_LEVELS and levels[0].shape[-1] <= MOST_CHANNELS
+    if native and fits(directions, level, *levels):
+        found: Tensor = _Between.apply(directions, level, *levels)
+        return found
+    return mip_lookup_reference(levels, directions, level)
 
 
 @lru_cache(maxsize=8)
@@ -81,19 +111,17 @@ def _sizes(resolutions: tuple[int, ...], device: torch.device) -> tuple[Tensor, 
     return torch.tensor(resolutions, device=device), torch.tensor(begins, device=device)
 
 
-def mip_lookup_at_once(
-    levels: Sequence[Tensor], directions: Tensor, lower: Tensor, fraction: Tensor
-) -> Tensor:
-    """``mip_lookup`` in plain torch without a loop over what is found, for any device.
-
-    Args:
-        levels, directions: as of ``mip_lookup``.
-        lower: [P] int64, the lower level of the pair, at most L - 2 (0 for a single level).
-        fraction: [P], of the way to the upper one.
+def mip_lookup_reference(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> Tensor:
+    """The reference implementation of ``mip_lookup``: plain torch, any dtype and device, without a loop over what is
+    found, since counting the directions of a level would wait for the device.
     """
+    last = len(levels) - 1
+    level = level.clamp(0, last)
+    # The last level is reached as the upper one of a pair, so that there is always a pair.
+    lower = level.detach().nan_to_num(0).floor().long().clamp(max=max(0, last - 1))
     resolutions, begins = _sizes(tuple(texture.shape[1] for texture in levels), directions.device)
     ringed = torch.cat([ringed_texels(texture) for texture in levels])
     place = face_coordinates(directions)
-    upper = (lower + 1).clamp(max=len(levels) - 1)
+    upper = (lower + 1).clamp(max=last)
     below, above = (bilinear(ringed, place, resolutions[k], begins[k]) for k in (lower, upper))
-    return torch.lerp(below, above, fraction[:, None].expand_as(below))
+    return torch.lerp(below, above, (level - lower)[:, None].expand_as(below))

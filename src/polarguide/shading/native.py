@@ -1,18 +1,36 @@
 """Native passes over the G-buffer on the CPU.
 
-The reference implementation of ``reflect_native`` is ``deferred.reflect_reference``, that of ``split_native`` is
-``gbuffer.split_reference``, that of ``conductor_native`` is ``optics.conductor``.
+The reference implementation of ``reflect_native`` is ``deferred.reflect_reference``, of metals ``metal.metal_pixels``;
+that of ``split_native`` is ``gbuffer.split_reference``.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
+from polarguide.shading.mips import mips_backward
+
+
+class MetalArguments(NamedTuple):
+    """What the native pass has to know of metals, see ``shading.metal``.
+
+    Attributes:
+        pixels: [K] int64, those that show metal, ascending.
+        first: the channel where ``metal_channels`` begin. local: that of the Gaussians' own light; -1: there is none.
+        least_share: of metal. blur: mip levels from a mirror to a roughness of 1.
+    """
+
+    pixels: Tensor
+    first: int
+    local: int
+    least_share: float
+    blur: float
 
 
 class _Reflect(torch.autograd.Function):
@@ -26,23 +44,42 @@ class _Reflect(torch.autograd.Function):
         local: bool,
         ior: float,
         held: bool,
+        metal: MetalArguments | None,
+        *levels: Tensor,
     ) -> tuple[Tensor, ...]:
         features, rays, texels = (t.detach().contiguous() for t in (features, rays, texels))
         directions, seen = torch.empty_like(rays), torch.empty_like(rays)
-        layers = tuple(torch.empty_like(rays) for _ in range(4))
+        layers = [torch.empty_like(rays) for _ in range(4)]
         _native.reflect_directions(features, rays, directions)
         _native.cubemap_forward(texels, directions, seen)
         _native.reflect_layers(features, rays, seen, fresnel, local, ior, *layers)
         ctx.save_for_backward(features, rays, texels, directions, seen)
         ctx.model = (fresnel, local, ior)
+        ctx.metal, ctx.kept = metal, ()
         ctx.set_materialize_grads(False)
-        return (*layers, layers[1].clone(), layers[2].clone()) if held else layers
+        found: list[Tensor] = []
+        if metal is not None:
+            given = features, rays, *metal
+            count = len(metal.pixels)
+            mirrored, reflected, slope, light = (rays.new_empty(count, 3) for _ in range(4))
+            share, level = rays.new_empty(count), rays.new_empty(count)
+            kept = [t.detach().contiguous() for t in levels]
+            _native.metal_directions(*given, mirrored, level)
+            _native.mips_forward(kept, mirrored, level, light)
+            _native.metal_layers(*given, light, share, reflected, slope, *layers[:2])
+            ctx.kept = mirrored, level, light, kept
+            ctx.mark_non_differentiable(share)
+            found = [share, reflected, slope]
+        again = [layers[1].clone(), layers[2].clone()] if held else []
+        return (*layers, *again, *found)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         features, rays, texels, directions, seen = ctx.saved_tensors
-        to_layers = [None if g is None else g.contiguous() for g in grads]
+        contiguous = [None if g is None else g.contiguous() for g in grads]
+        by_metal = contiguous[-2:]
+        to_layers = contiguous if ctx.metal is None else contiguous[:-3]
         to_layers += [None] * (6 - len(to_layers))
         to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
         # What comes by the held layers goes to the texels, and not by way of the directions to the normals.
@@ -57,7 +94,18 @@ class _Reflect(torch.autograd.Function):
             _native.cubemap_backward(texels, directions, to_look_up, to_texels, None)
             _native.cubemap_backward(texels, directions, to_seen, None, to_directions)
         _native.reflect_backward_directions(features, rays, to_directions, to_features)
-        return to_features, None, to_texels, None, None, None, None
+        to_levels: Sequence[Tensor | None] = ()
+        if ctx.metal is not None:
+            mirrored, level, light, levels = ctx.kept
+            to_light, by_layers = torch.empty_like(light), [*to_layers[:2], to_layers[4]]
+            given = [features, rays, *ctx.metal, light, *by_layers, *by_metal, to_light, to_features]
+            _native.metal_backward_layers(*given)
+            to_mirrored, to_level, to_levels = mips_backward(
+                levels, mirrored, level, to_light, any(ctx.needs_input_grad[8:])
+            )
+            given = [features, rays, *ctx.metal, to_mirrored, to_level, to_features]
+            _native.metal_backward_directions(*given)
+        return to_features, None, to_texels, None, None, None, None, None, *to_levels
 
 
 def reflect_native(
@@ -69,8 +117,10 @@ def reflect_native(
     local: bool,
     refractive_index: float,
     held: bool = False,
+    metal: MetalArguments | None = None,
+    levels: Sequence[Tensor] = (),
 ) -> tuple[Tensor, ...]:
-    """The layers of a picture from its G-buffer (Ye et al. 2024, Eq. 5, or Fresnel-weighted).
+    """The layers of a picture from its G-buffer (Ye et al. 2024, Eq. 5, or Fresnel-weighted), with what metals reflect.
 
     Args:
         features: [P, D] blended base color, normal, strength and, with ``local``, light; others may follow.
@@ -78,59 +128,21 @@ def reflect_native(
         fresnel: Fresnel's weight and exponential light in place of the lerp and the logistic function.
         local: whether channels 7 to 9 are light that is added to the environment's.
         refractive_index: of Fresnel's weight.
-        held: also ``specular`` and ``diffuse`` once more, without a gradient on the normals.
+        held: also ``specular`` and ``diffuse`` once more, without a gradient on the normals but for that of metals.
+        metal: where there is some; it is added to ``final`` and ``specular``. levels: of light that it mirrors.
 
     Returns:
-        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and texels,
-        and with ``held`` the two that are held; the same bits for any number of threads.
+        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features, texels and
+        levels, with ``held`` the two that are held, and with ``metal`` its share [K], what it reflects [K, 3] and its
+        degree of polarization over ``sin^2(zenith)`` [K, 3]; the same bits for any number of threads.
 
     Raises:
         ValueError: if a shape is not as above.
     """
     layers: tuple[Tensor, ...] = _Reflect.apply(
-        features, rays, texels, fresnel, local, refractive_index, held
+        features, rays, texels, fresnel, local, refractive_index, held, metal, *levels
     )
     return layers
-
-
-class _Conductor(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, cosine: Tensor, reflectance: Tensor) -> tuple[Tensor, Tensor]:
-        cosine, reflectance = cosine.detach().contiguous(), reflectance.detach().contiguous()
-        mean, slope = torch.empty_like(reflectance), torch.empty_like(reflectance)
-        derivatives = reflectance.new_empty(*reflectance.shape, 4) if any(ctx.needs_input_grad) else None
-        _native.conductor_values(cosine, reflectance, mean, slope, derivatives)
-        ctx.save_for_backward(derivatives)
-        ctx.set_materialize_grads(False)
-        return mean, slope
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        (derivatives,) = ctx.saved_tensors
-        to_cosine, to_reflectance = (
-            derivatives.new_empty(len(derivatives)),
-            derivatives.new_empty(len(derivatives), 3),
-        )
-        by_mean, by_slope = (None if g is None else g.contiguous() for g in grads)
-        _native.conductor_backward(derivatives, by_mean, by_slope, to_cosine, to_reflectance)
-        return to_cosine, to_reflectance
-
-
-def conductor_native(cosine: Tensor, reflectance: Tensor) -> tuple[Tensor, Tensor]:
-    """``optics.conductor``, which is the reference implementation, of three colors a pixel.
-
-    Args:
-        cosine: [K]. reflectance: [K, 3]. Both float32 on the CPU.
-
-    Returns:
-        (R, rho / sin^2), each [K, 3].
-
-    Raises:
-        ValueError: if a shape is not as above.
-    """
-    mean, slope = _Conductor.apply(cosine, reflectance)
-    return mean, slope
 
 
 class _Split(torch.autograd.Function):

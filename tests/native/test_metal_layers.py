@@ -1,0 +1,131 @@
+"""Metals in the deferred picture: the native pass against its reference implementation, forward and gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from polarguide import _native
+from polarguide.camera import Camera
+from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.metal import BLUR, MINIMUM_SHARE, where_metal
+from polarguide.shading.model import GBuffer
+from polarguide.shading.native import MetalArguments, reflect_native
+
+HEIGHT, WIDTH, RESOLUTION = 20, 24, 32
+MODELS = [
+    DeferredShading(blend="fresnel", local=True, metal=True),
+    DeferredShading(blend="fresnel", metal=True),
+]
+
+
+def camera() -> Camera:
+    turn = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    )[0]
+    return Camera(WIDTH, HEIGHT, 20.0, 21.0, 12.0, 10.0, turn, torch.zeros(3, dtype=torch.float64))
+
+
+def buffers(shading: DeferredShading) -> tuple[Tensor, Tensor]:
+    """Pixels without metal, with too little, with some and of nothing else, of every reflectance and roughness."""
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    rays = camera().world_rays()
+    normals = torch.nn.functional.normalize(-rays + 0.9 * (uniform(HEIGHT, WIDTH, 3) - 0.5), dim=-1)
+    normals[1] *= 1e-4  # below the shortest length
+    normals[2] *= -1  # away from the camera
+    share = uniform(HEIGHT, WIDTH, 1)
+    share[3], share[4], share[5] = 0, 0.005, 1
+    metal = torch.cat((share * uniform(HEIGHT, WIDTH, 3), share, share * uniform(HEIGHT, WIDTH, 1)), dim=-1)
+    metal[6, :, :3] = 1.2  # beyond what metals reflect
+    own = [uniform(HEIGHT, WIDTH, 3) - 0.6] if shading.local else []
+    parts = [uniform(HEIGHT, WIDTH, 3), normals, uniform(HEIGHT, WIDTH, 1), *own, metal]
+    texels = torch.randn(6, RESOLUTION, RESOLUTION, 3, generator=generator)
+    return torch.cat([*parts, uniform(HEIGHT, WIDTH, 1)], dim=-1), texels
+
+
+def results(shading: DeferredShading, dtype: torch.dtype, *, held: bool) -> list[Tensor]:
+    """Layers and what metals reflect, then the gradients of a random sum of them by features and texels."""
+    features, texels = (t.to(dtype).requires_grad_() for t in buffers(shading))
+    splatted = GBuffer(features, features.new_ones(HEIGHT, WIDTH))
+    if held:
+        layers, again = shading.shade_held(splatted, {"texels": texels}, camera())
+        assert again is not None
+    else:
+        layers, again = shading.shade(splatted, {"texels": texels}, camera()), None
+    metal: Any = layers["metal"]
+    shown = [layers["final"], layers["specular"], metal.specular, metal.slope, *((again or ())[:2])]
+    generator = torch.Generator().manual_seed(1)
+    total = sum((t * torch.randn(t.shape, generator=generator).to(t)).sum() for t in shown)
+    assert isinstance(total, Tensor)
+    total.backward()
+    assert features.grad is not None
+    assert texels.grad is not None
+    found = [layers["metalness"], *(t.detach() for t in shown), features.grad, texels.grad]
+    return [t.double() for t in found]
+
+
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("shading", MODELS, ids=["local", "far"])
+def test_as_the_reference_has_it(shading: DeferredShading, held: bool, simd: str) -> None:
+    found, exact = (results(shading, dtype, held=held) for dtype in (torch.float32, torch.float64))
+    for ours, theirs in zip(found, exact, strict=True):
+        assert theirs.abs().max() > 0
+        assert_close(ours, theirs, rtol=2e-3, atol=2e-3)
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    found = []
+    for threads in (1, 2, 3):
+        _native.set_thread_count(threads)
+        found.append(results(MODELS[0], torch.float32, held=True))
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def test_where_no_pixel_shows_metal_the_layers_are_those_of_dielectrics() -> None:
+    shading = MODELS[0]
+    features, texels = buffers(shading)
+    features[..., 10:15] = 0
+    alpha, light = torch.ones(HEIGHT, WIDTH), {"texels": texels}
+    with_channels = shading.shade(GBuffer(features, alpha), light, camera())
+    without = shading.shade(GBuffer(features[..., :10].contiguous(), alpha), light, camera())
+    assert torch.equal(with_channels["final"], without["final"])
+    assert len(with_channels["metal"].pixels) == 0
+    assert without["metal"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "changed"),
+    [
+        ("pixels", {"pixels": torch.tensor([3, 3])}),
+        ("pixels", {"pixels": torch.tensor([3, HEIGHT * WIDTH])}),
+        ("pixels", {"pixels": torch.tensor([-1, 3])}),
+        ("features", {"first": 12}),
+        ("features", {"first": 5}),
+        ("features", {"local": 14}),
+    ],
+)
+def test_what_does_not_fit_is_refused(name: str, changed: dict[str, Any]) -> None:
+    features, texels = buffers(MODELS[0])
+    flat = features.flatten(0, 1)
+    given = MetalArguments(where_metal(flat, 10), 10, 7, MINIMUM_SHARE, BLUR)
+    rays = camera().world_rays().flatten(0, 1)
+    with pytest.raises(ValueError, match=name):
+        reflect_native(
+            flat,
+            rays,
+            texels,
+            fresnel=True,
+            local=True,
+            refractive_index=1.5,
+            metal=given._replace(**changed),
+            levels=[texels.exp()],
+        )
