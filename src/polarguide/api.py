@@ -135,7 +135,7 @@ def priors(
     *,
     run: OpenedRun | None = None,
     views: str = "test",
-    refractive_index: float = 1.5,
+    refractive_index: float | None = None,
     threshold: float | None = None,
     reading: SceneOptions = SceneOptions(),
     shots: ShotOptions | None = None,
@@ -152,7 +152,7 @@ def priors(
         paths: a scene, its folder, or files and folders of shots as ``find_shots`` takes them.
         out: folder to write.
         run, views, threshold, reading: as ``write_priors`` takes them, for a scene with poses alone.
-        refractive_index: of the surfaces.
+        refractive_index: of the surfaces; None: as ``scene.json`` says, else 1.5.
         shots, intrinsics: as ``write_shots`` takes them, for shots alone; noise and ``snr`` for maps of scenes, too.
         formats: of the maps: png, exr, npy, page; None: all of them for shots, none for a scene with poses.
 
@@ -174,18 +174,19 @@ def priors(
             shots,
             formats=FORMATS if formats is None else formats,
             intrinsics=intrinsics,
-            refractive_index=refractive_index,
+            refractive_index=1.5 if refractive_index is None else refractive_index,
             reporter=reporter,
         )
     _refuse_with_poses(intrinsics, shots, reading, bool(formats))
     refuse_scene(Path(out))
     scene = paths if isinstance(paths, Scene) else read_scene(many[0], reading, reporter)
+    index = (scene.refractive_index or 1.5) if refractive_index is None else refractive_index
     sheet = write_priors(
         scene,
         out,
         run=run,
         views=views,
-        refractive_index=refractive_index,
+        refractive_index=index,
         threshold=0.05 if threshold is None else threshold,
         reporter=reporter,
     )
@@ -197,7 +198,7 @@ def priors(
             for found in find_shots([scene.root], options)
             if found.view in chosen
         ]
-        write_shots(sets, out, options, formats=formats, refractive_index=refractive_index, reporter=reporter)
+        write_shots(sets, out, options, formats=formats, refractive_index=index, reporter=reporter)
     return sheet
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,18 @@ def test_another_question_has_other_folders(changes: dict[str, Any]) -> None:
 def test_seeds_count_up_from_that_of_the_settings() -> None:
     runs = plan_runs(asked(settings=TrainSettings(40, 3)), [ENTRY])
     assert [run.settings.seed for run in runs] == [3, 3, 4, 4]
+
+
+def test_each_scene_has_its_refractive_index_where_none_is_asked_for() -> None:
+    water = replace(ENTRY, name="water", digest="another", refractive_index=1.33)
+
+    def found(index: float) -> list[float]:
+        settings = TrainSettings(40, refractive_index=index)
+        return [run.settings.refractive_index for run in plan_runs(asked(settings=settings), [ENTRY, water])]
+
+    assert set(found(0.0)[: len(found(0.0)) // 2]) == {1.5}
+    assert set(found(0.0)[len(found(0.0)) // 2 :]) == {1.33}
+    assert set(found(1.6)) == {1.6}
 
 
 def test_a_recipe_may_have_seeds_of_its_own() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -17,7 +18,7 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs import forecast as forecasts
 from polarguide.runs import memory
-from polarguide.runs.defaults import MOST_GAUSSIANS, STEPS, with_defaults
+from polarguide.runs.defaults import MOST_GAUSSIANS, STEPS, with_defaults, with_index
 from polarguide.runs.memory import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.flat import Flat
 from polarguide.training.settings import TrainSettings
@@ -92,6 +93,17 @@ def test_defaults_follow_from_the_size_and_are_those_of_the_run_that_goes_on(tin
     assert with_defaults(TrainSettings(7, gaussians=9), tiny_scene, STOKES) == TrainSettings(7, gaussians=9)
     older = TrainSettings(steps=700)
     assert with_defaults(asked, tiny_scene, STOKES, older) == older
+
+
+def test_the_refractive_index_is_the_one_asked_for_or_the_scenes_or_that_of_the_run_that_goes_on(
+    tiny_scene: Scene,
+) -> None:
+    asked, water = TrainSettings(refractive_index=0.0), replace(tiny_scene, refractive_index=1.33)
+    unsaid = replace(tiny_scene, refractive_index=None)
+    assert with_index(asked, water).refractive_index == 1.33
+    assert with_index(asked, unsaid).refractive_index == 1.5
+    assert with_index(TrainSettings(refractive_index=1.6), water).refractive_index == 1.6
+    assert with_index(asked, water, TrainSettings(refractive_index=1.4)).refractive_index == 1.4
 
 
 def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Scene) -> None:

@@ -14,7 +14,7 @@ from polarguide.optics import Mount
 from polarguide.polarizer import ANGLES
 from polarguide.records import decode
 
-Index = Annotated[float, msgspec.Meta(gt=1.0, lt=10.0)]
+Index = Annotated[float, msgspec.Meta(gt=1.0, lt=4.0)]
 
 
 class _Split(msgspec.Struct):
@@ -96,7 +96,7 @@ def refractive_index_of(path: Path, data: bytes | None) -> float | None:
         path: ``scene.json``, for messages. data: its content, or None if there is no such file.
 
     Raises:
-        PolarguideError: the index is not a number from 1 to 10.
+        PolarguideError: the index is not a number between 1 and 4.
     """
     if data is None:
         return None

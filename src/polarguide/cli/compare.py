@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def compared_settings(
-    refractive_index: float = TrainSettings.refractive_index,
+    refractive_index: float = 0.0,
     background: Background = TrainSettings.background,
     materials: Materials = TrainSettings.materials,
 ) -> TrainSettings:

@@ -24,7 +24,7 @@ def priors(
     out: Path,
     formats: str | None = None,
     intrinsics: str | None = None,
-    refractive_index: float = 1.5,
+    refractive_index: float | None = None,
     run: Path | None = None,
     views: str = "test",
     threshold: float | None = None,
@@ -48,7 +48,7 @@ def priors(
         out: Folder to write: a folder for each shot in it; pictures and a contact sheet for a scene with poses.
         formats: Of the maps: some of png,exr,npy,page. Without it all for shots, none for a scene with poses.
         intrinsics: fx,fy,cx,cy of the developed pictures, for normals; without them the rays are taken to be parallel.
-        refractive_index: Of the surfaces.
+        refractive_index: Of the surfaces; without it as scene.json says, else 1.5.
         run: For a scene: a run trained on it (at the same --downscale), whose normals resolve the ambiguity.
         views: For a scene: test, train, all, or names separated by commas.
         threshold: For a scene: DoLP above which a pixel's normal is used; without it 0.05.

@@ -26,6 +26,7 @@ from polarguide.experiments.options import CompareOptions
 from polarguide.options import Exposures, SceneOptions, check_count
 from polarguide.progress import SILENT, Reporter
 from polarguide.recipes.registry import ablations_of
+from polarguide.runs.defaults import INDEX
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, trained_steps
 from polarguide.runs.opened import read_scene
@@ -144,6 +145,7 @@ class SceneEntry:
     test_views: tuple[str, ...]
     black_share: float | None = None
     warnings: tuple[str, ...] = ()
+    refractive_index: float | None = None
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,11 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
         for warning in facts.warnings:
             reporter.warn(f"{scene.name}: {warning}")
         count, names = len(scene.views), scene.test_names
-        entries.append(SceneEntry(path, scene.name, scene.digest, count, names, share, facts.warnings))
+        entries.append(
+            SceneEntry(
+                path, scene.name, scene.digest, count, names, share, facts.warnings, scene.refractive_index
+            )
+        )
     return entries
 
 
@@ -266,7 +272,10 @@ def _for(recipe: Method, exposures: Exposures) -> Method:
 def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int) -> PlannedRun:
     recipe, options = row.recipe, comparison.options
     steps = row.steps or comparison.settings.steps
-    settings = replace(comparison.settings, steps=steps, seed=seed, exposures=row.exposures)
+    index = comparison.settings.refractive_index or scene.refractive_index or INDEX
+    settings = replace(
+        comparison.settings, steps=steps, seed=seed, exposures=row.exposures, refractive_index=index
+    )
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
     code = f"{__version__} {training_digest()}{_own_digest(recipe)}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)

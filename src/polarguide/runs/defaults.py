@@ -9,6 +9,7 @@ from polarguide.capture import Scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
+INDEX = 1.5
 STEPS = 5000
 VISITS = 60
 """Least number of times that each training view is looked at."""
@@ -23,6 +24,15 @@ more of them would give at full size was not studied.
 def most_gaussians(pixels: int, recipe: Recipe) -> int:
     """How many Gaussians there may be for so many pixels of all views."""
     return min(int(pixels / recipe.densification.pixels_each), MOST_GAUSSIANS)
+
+
+def with_index(settings: TrainSettings, scene: Scene, resumed: TrainSettings | None = None) -> TrainSettings:
+    """The settings with a refractive index, where it is 0: of the run that is gone on with, or what the scene says."""
+    if settings.refractive_index:
+        return settings
+    if resumed is not None:
+        return replace(settings, refractive_index=resumed.refractive_index)
+    return replace(settings, refractive_index=scene.refractive_index or INDEX)
 
 
 def with_defaults(

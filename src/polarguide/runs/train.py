@@ -23,6 +23,7 @@ from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
+from polarguide.runs.defaults import with_index
 from polarguide.runs.families import AnyTrainer, Family, family_of
 from polarguide.runs.folder import (
     CHECKPOINT,
@@ -116,6 +117,9 @@ def train(
         if settings.background == "masked":
             loaded = without_surroundings(loaded)
         _check_scene(loaded)
+        if not settings.refractive_index and not resume and loaded.refractive_index is not None:
+            reporter.say(f"refractive index {loaded.refractive_index:g}, as scene.json says")
+        settings = with_index(settings, loaded, earlier)
         settings = family.filled(settings, loaded, chosen, earlier)
         configuration = RunConfiguration.of(loaded, chosen, settings, backend.device)
         state = None

@@ -30,7 +30,8 @@ class TrainSettings:
         steps: Optimizer steps in all. 3,000 show the scene, 5,000 and more settle it; 0 takes 5,000, 60 visits to each
             view where that is more, and twice as many for pictures over a megapixel (or what the run to resume took).
         seed: Seed of every random draw.
-        refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water.
+        refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water; 0 takes what scene.json
+            says, and 1.5 where it does not (or what the run to resume took).
         views_per_step: Views whose mean gradient makes a step; 0 takes one for each process (or what the run to resume
             took). Learning rates grow with its square root; steps are steps, so more views are looked at.
         background: What is behind the subject: a scene to reconstruct, too; black, that is nothing; masked makes it
@@ -63,7 +64,7 @@ class TrainSettings:
         check_choice("background", self.background, BACKGROUNDS)
         check_choice("exposures", self.exposures, EXPOSURES)
         check_choice("materials", self.materials, MATERIALS)
-        if not 1.0 < self.refractive_index < 4.0:
+        if self.refractive_index and not 1.0 < self.refractive_index < 4.0:
             raise PolarguideError(
                 "refractive_index",
                 expected="between 1 and 4",
