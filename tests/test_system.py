@@ -15,6 +15,7 @@ import pytest
 from polarguide import system
 from polarguide.errors import PolarguideError
 from polarguide.system import (
+    MemoryBound,
     StopSignals,
     exclusive_lock,
     free_memory,
@@ -166,6 +167,44 @@ def test_freed_memory_is_kept_by_the_command_and_the_children_of_a_comparison_al
     )
     faults, pages = (int(number) for number in done.stdout.split()[-2:])
     assert (faults < pages / 10) == kept, done.stdout
+
+
+HOLES = """
+import numpy as np
+from polarguide.system import MemoryBound, keep_freed_memory, resident_memory
+keep_freed_memory()
+blocks = [np.ones(1 << 20, dtype=np.uint8) for _ in range(300)]
+blocks = [blocks[-1]]
+before = resident_memory()
+bound = MemoryBound(200 << 20)
+bound.keep()
+print(before, resident_memory())
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "gnu_get_libc_version"), reason="not a system with glibc")
+def test_memory_that_lies_free_between_what_is_used_is_given_back() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", HOLES], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=True
+    )
+    before, after = (int(number) for number in done.stdout.split())
+    assert before > 300 << 20
+    assert after < before - (250 << 20)
+
+
+def test_memory_is_given_back_near_the_limit_and_no_more_often_than_it_helps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    returned: list[int] = []
+    held = 0
+    monkeypatch.setattr(system, "resident_memory", lambda: held)
+    monkeypatch.setattr(system, "return_freed_memory", lambda: returned.append(held))
+    bound = MemoryBound(1000)
+    for held in (500, 899, 901, 700, 880, 899, 910, 905, 940, 950, 951, 300, 895, 905):  # noqa: B007
+        bound.keep()
+    # 901 is too much, after which a step takes 700; 910 is, after which it needs 905 and may grow by a twentieth; so
+    # are 951 and, as a step then is content with 300, 905.
+    assert returned == [901, 910, 951, 905]
 
 
 @pytest.mark.parametrize("libc", [OSError(), TypeError(), object()], ids=["none", "Windows", "another"])

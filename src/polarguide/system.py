@@ -19,6 +19,8 @@ MEBIBYTE = 1 << 20
 LAST_WORDS_SECONDS = 5.0
 MOST_PROCESSES = 65536
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+NEARLY, GROWTH = 0.9, 1.05
+"""Of a limit, from which on freed memory is given back; and of what a step then holds, until it is again."""
 
 
 def _posix(module: str) -> Any | None:
@@ -185,6 +187,34 @@ def return_freed_memory() -> None:
     """Give what has been freed back to the system, where the allocator is glibc's."""
     with contextlib.suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+class MemoryBound:
+    """Gives freed memory back to the system where this process comes to hold nearly as much as it may.
+
+    An allocator that keeps what is freed (``keep_freed_memory``) holds ever more where sizes change, as with each
+    growth of the Gaussians: pieces of former sizes lie free between those in use.
+
+    Args:
+        limit: bytes that the process may hold.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._least = NEARLY * limit
+        self._bound, self._returned = self._least, False
+
+    def keep(self) -> None:
+        """Called between steps that each take and free the like of what the one before took."""
+        held = resident_memory()
+        if held is None:
+            return
+        if (
+            self._returned
+        ):  # a step has taken what it needs again: no sooner than above that is there much to return
+            self._bound, self._returned = max(self._least, GROWTH * held), False
+        elif held > self._bound:
+            return_freed_memory()
+            self._returned = True
 
 
 def keep_freed_memory() -> None:

@@ -21,7 +21,7 @@ from polarguide.training.trainer import Trainer
 
 LEAST_STEPS = 500
 """A shorter training is over before it has been measured."""
-GROWTH = 4
+GROWTH = 16
 """Of the Gaussians, up to which the time is estimated: the density control decides it on the way."""
 
 

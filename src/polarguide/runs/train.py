@@ -36,7 +36,7 @@ from polarguide.runs.folder import (
 )
 from polarguide.runs.memory import MemoryPlan, pixels_of
 from polarguide.runs.opened import OpenedRun, read_scene
-from polarguide.system import return_freed_memory
+from polarguide.system import MemoryBound, return_freed_memory
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.recipe import Method
@@ -146,7 +146,8 @@ def train(
                     if problem := _unsuitable(out, resume):  # another training has begun meanwhile
                         raise problem
                 configuration.save(out)
-            seconds = _Loop(trainer, out, session, reporter, should_stop, look).run()
+            bound = MemoryBound(plan.peak)
+            seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound).run()
         model = family.model(trainer.state, chosen, settings, backend)
         if expected is not None:
             reporter.say(expected.truth(seconds))
@@ -166,8 +167,9 @@ class _Loop:
         reporter: Reporter,
         should_stop: Ends,
         look: Look | None,
+        memory: MemoryBound,
     ) -> None:
-        self._trainer, self._out, self._session = trainer, out, session
+        self._trainer, self._out, self._session, self._memory = trainer, out, session, memory
         self._reporter, self._should_stop, self._look = reporter, should_stop, look
         self._log = RunLog(out) if trainer.ranks.rank == 0 else None
         if self._log is not None:
@@ -200,6 +202,7 @@ class _Loop:
             if (ranks.world == 1 or trainer.state.step % LOG_EVERY == 0) and ranks.any(self._should_stop()):
                 return True
             meter.take(trainer.step())
+            self._memory.keep()
             if trainer.state.step % self._session.checkpoint_every == 0:
                 with self._stopwatch.paused():
                     meter.read()
