@@ -4,8 +4,10 @@ Each metric of a scene is compared with the row without polarization that is bes
 --against and the recipe's controls). A difference of means over seeds is a loss where it is below -0.15 dB (picture,
 foreground), -0.2 dB (layers) or above +0.3 degrees, even with twice its standard error over common seeds in its favor
 (at most 0.1 dB or 0.2 degrees, and that much of fewer than two common seeds). Scenes with metals are judged by object,
-metals by picture and normals alone. Then come the gains over all scenes, views with haze or fog, and views of which
-more is drawn from behind the true surface than in the best row without polarization.
+metals by picture and normals alone. How many losses each of the rows without polarization has by the same rule, against
+the best of the other three, says how much is to be expected of a best of several. Then come the gains over all scenes,
+views with haze or fog, and views of which more is drawn from behind the true surface than in the best row without
+polarization.
 
     python benchmarks/accuracy/never_hurts.py benchmarks/results/bench/*.json
 
@@ -124,6 +126,16 @@ def judged_scene(scene: str, rows: Runs, recipe: str, others: Sequence[str]) -> 
                 yield found
 
 
+def all_judged(scenes: Mapping[str, Runs], recipe: str, others: Sequence[str]) -> list[Judged]:
+    """Every comparison of every scene that has runs of the recipe."""
+    return [
+        found
+        for scene, rows in scenes.items()
+        if recipe in rows
+        for found in judged_scene(scene, rows, recipe, others)
+    ]
+
+
 def mean_gains(scenes: Mapping[str, Runs], recipe: str, other: str) -> str:
     """What the recipe has over another on average: geometric mean of normals, layers without the pixels of metals."""
 
@@ -205,11 +217,8 @@ def main() -> None:
             runs = scene_runs(record, name)
             if recipe in runs:
                 scenes[name] = runs
-    judged = [
-        found
-        for scene, rows in scenes.items()
-        for found in judged_scene(scene, rows, recipe, [*options.against, *controls])
-    ]
+    rows_without = [*options.against, *controls]
+    judged = all_judged(scenes, recipe, rows_without)
     losses = [found for found in judged if found.lost]
     print(
         "| where | metric | value | best without polarization | difference | |\n|---|---|---:|---:|---:|---|"
@@ -217,16 +226,22 @@ def main() -> None:
     for found in judged if options.all else losses:
         print(found.line())
     print(f"\n{len(losses)} of {len(judged)} comparisons on {len(scenes)} scenes are losses.\n")
+    print("| by the same rule | losses | of them pictures | normals | layers |\n|---|---:|---:|---:|---:|")
+    for name in (recipe, *rows_without):
+        lost = [f for f in all_judged(scenes, name, [r for r in rows_without if r != name]) if f.lost]
+        kinds = [sum(found.key in kind for found in lost) for kind in (PICTURE, NORMALS, LAYERS)]
+        print(f"| `{name}` | {' | '.join(map(str, (len(lost), *kinds)))} |")
+    print()
     print("| over | PSNR (dB) | foreground (dB) | normals | specular (dB) | diffuse (dB) |")
     print("|---|---:|---:|---:|---:|---:|")
-    for other in (*options.against, *controls):
+    for other in rows_without:
         if any(other in rows for rows in scenes.values()):
             print(mean_gains(scenes, recipe, other))
     print()
     for scene, rows in scenes.items():
         for line in (
             *bad_views(scene, rows, recipe),
-            *drawn_through(scene, rows, recipe, [*options.against, *controls]),
+            *drawn_through(scene, rows, recipe, rows_without),
         ):
             print(line)
     sys.exit(1 if losses else 0)
