@@ -1,7 +1,14 @@
-"""The CPU rasterizer's speed: milliseconds, pixel-Gaussian pairs a second, and the share of the processor's peak.
+"""The CPU rasterizer's speed: milliseconds, pixel-Gaussian pairs a second, and the shares of the processor's and of the
+memory's peak.
 
-The peak is measured in the same run (independent fused multiply-adds, widest instruction set, all threads). A pair
-counts 150 flop for both passes, 50 of them forward. Run it alone: ``python benchmarks/speed/rasterizer.py``.
+Two cases: few Gaussians of three pixels, bound by their pairs with pixels, and many of half a pixel, bound by gathering
+them. Both peaks are measured in the same run: independent fused multiply-adds with the widest instruction set and all
+threads, and a copy between two arrays that no cache holds. A pair counts 150 flop for both passes, 50 of them forward.
+Of memory, what has to be read and written at least: each Gaussian and its gradient, each pixel and its gradient, once.
+
+    python benchmarks/speed/rasterizer.py [--threads 1]
+
+Run it alone.
 """
 
 from __future__ import annotations
@@ -14,6 +21,7 @@ import torch
 
 from polarguide import _native
 from polarguide.camera import Camera
+from polarguide.raster import use_threads
 from polarguide.raster.cpu import native_rasterizer
 from polarguide.raster.interface import ScreenStatistic, Splats
 
@@ -36,41 +44,74 @@ def scene(count: int, width: int, height: int, channels: int, sigma: float) -> t
     return Splats(torch.stack((x, y, depth), dim=1), rotations, scales, opacities, features), camera
 
 
+CASES = {"pairs": (20_000, 3.0), "gathering": (300_000, 0.5)}
+COPIED = 256 << 20
+"""Bytes."""
+OF_GAUSSIAN, OF_PIXEL = 11, 1
+"""Floats of a Gaussian (mean, rotation, scales, opacity) and of a pixel (alpha) beside its features."""
+
+
+def bandwidth() -> float:
+    """Bytes a second that a copy reads and writes."""
+    source, to = torch.ones(COPIED // 4), torch.empty(COPIED // 4)
+    times = []
+    for _ in range(7):
+        start = time.perf_counter()
+        to.copy_(source)
+        times.append(time.perf_counter() - start)
+    return 2 * COPIED / min(times)
+
+
+def measured(count: int, sigma: float, channels: int, size: tuple[int, int], repeats: int) -> list[float]:
+    """Pairs, and median seconds of the forward and of the backward pass."""
+    width, height = size
+    splats, camera = scene(count, width, height, channels, sigma)
+    rasterizer = native_rasterizer(camera, channels, ScreenStatistic((0, 1, 2)))
+    out, alpha = torch.empty(height, width, channels), torch.empty(height, width)
+    radii, screen = torch.empty(count), torch.empty(count, 2)
+    grad_out, grad_alpha = torch.randn_like(out), torch.randn_like(alpha)
+    gradients = [torch.empty_like(t) for t in splats]
+    rasterizer.forward(*splats, out, alpha, radii, count_pairs=True)
+    pairs = rasterizer.pairs
+    forward, backward = [], []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        rasterizer.forward(*splats, out, alpha, radii)
+        middle = time.perf_counter()
+        rasterizer.backward(*splats, out, grad_out, grad_alpha, *gradients, screen)
+        forward.append(middle - start)
+        backward.append(time.perf_counter() - middle)
+    return [pairs, statistics.median(forward[5:]), statistics.median(backward[5:])]
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--gaussians", type=int, default=20_000)
-    parser.add_argument("--sigma", type=float, default=3.0)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240))
+    parser.add_argument("--channels", type=int, nargs="+", default=[3, 7, 8, 11, 12, 16])
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=40)
     arguments = parser.parse_args()
-    width, height = arguments.size
-    peak = _native.fma_peak(0.5)
-    print(f"{_native.simd()}, {_native.thread_count()} threads, peak {peak / 1e9:.0f} GFLOP/s")
-    print("| D | pairs | forward ms | backward ms | Mpairs/s | of peak |\n|---|---|---|---|---|---|")
-    for channels in (3, 7, 8, 12):
-        splats, camera = scene(arguments.gaussians, width, height, channels, arguments.sigma)
-        statistic = ScreenStatistic((0, 1, 2))
-        rasterizer = native_rasterizer(camera, channels, statistic)
-        out, alpha = torch.empty(height, width, channels), torch.empty(height, width)
-        radii, screen = torch.empty(arguments.gaussians), torch.empty(arguments.gaussians, 2)
-        grad_out, grad_alpha = torch.randn_like(out), torch.randn_like(alpha)
-        gradients = [torch.empty_like(t) for t in splats]
-        rasterizer.forward(*splats, out, alpha, radii, count_pairs=True)
-        pairs = rasterizer.pairs
-        forward, backward = [], []
-        for _ in range(arguments.repeats):
-            start = time.perf_counter()
-            rasterizer.forward(*splats, out, alpha, radii)
-            middle = time.perf_counter()
-            rasterizer.backward(*splats, out, grad_out, grad_alpha, *gradients, screen)
-            forward.append(middle - start)
-            backward.append(time.perf_counter() - middle)
-        f, b = statistics.median(forward[5:]), statistics.median(backward[5:])
-        share = pairs * FLOP_PER_PAIR / (f + b) / peak
-        print(
-            f"| {channels} | {pairs / 1e6:.2f} M | {f * 1e3:.2f} | {b * 1e3:.2f} "
-            f"| {pairs / (f + b) / 1e6:.0f} | {share:.1%} |"
-        )
+    use_threads(arguments.threads)
+    peak, memory = _native.fma_peak(0.5), bandwidth()
+    print(
+        f"{_native.simd()}, {_native.thread_count()} threads, {peak / 1e9:.0f} GFLOP/s, {memory / 1e9:.1f} GB/s\n"
+    )
+    print("| bound by | D | pairs | forward ms | backward ms | Mpairs/s | of flop | of memory |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name, (count, sigma) in CASES.items():
+        for channels in arguments.channels:
+            size = tuple(arguments.size)
+            pairs, f, b = measured(count, sigma, channels, size, arguments.repeats)
+            # Read forward and backward, and written as gradients; pictures written, read again, and their gradients.
+            floats = 3 * count * (OF_GAUSSIAN + channels) + 3 * size[0] * size[1] * (OF_PIXEL + channels)
+            print(
+                f"| {name} | {channels} | {pairs / 1e6:.2f} M | {f * 1e3:.2f} | {b * 1e3:.2f} "
+                f"| {pairs / (f + b) / 1e6:.0f} | {pairs * FLOP_PER_PAIR / (f + b) / peak:.1%} "
+                f"| {4 * floats / (f + b) / memory:.1%} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -43,7 +43,8 @@ PARTS = {
     "reflection": (
         *("reflect_directions", "cubemap_forward", "reflect_layers"),
         *("reflect_backward_layers", "cubemap_backward", "reflect_backward_directions"),
-        *("gbuffer_split", "gbuffer_join"),
+        *("gbuffer_split", "gbuffer_join", "metal_directions", "mips_forward", "metal_layers"),
+        *("metal_backward_layers", "mips_backward", "metal_backward_directions"),
     ),
     "photometric terms": ("photometric",),
     "normals, Stokes": ("polarization", "direction", "consistency"),
