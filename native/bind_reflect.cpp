@@ -51,7 +51,7 @@ const float *optional_rows(const MaybeArray &array, const char *name, int64_t n)
 MetalArgs metal_args(const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share,
                      float blur) {
     const ReflectArgs all = reflect_args(features, rays, true, false, 1.5f);
-    if (first < 7 || first + 5 > all.channels || local < -1 || local + 3 > all.channels)
+    if (first < 7 || first > all.channels - 5 || local < -1 || local > all.channels - 3)
         throw std::invalid_argument("features: expected the channels of metals behind those of dielectrics");
     expect_ascending(pixels, "pixels", int64_t(features.shape(0)));
     MetalArgs a{};

@@ -87,7 +87,7 @@ Tap tap_at(int face, int column, int row, int resolution) {
     return {3, {own, across(face, column, inner_row, resolution), across(face, inner_column, row, resolution)}};
 }
 
-// One cubemap: a texture [6,R,R,C]; of gradients, without texels.
+// One cubemap: a texture [6,R,R,C].
 struct Texture {
     int resolution, channels;
     const float *texels;

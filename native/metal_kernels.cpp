@@ -35,7 +35,7 @@ struct Conductor {
 };
 
 POLARGUIDE_INLINE Dual within(reg given, float low, float high, bool cosine) {
-    const reg kept = clamp(given, reg_splat(low), reg_splat(high));
+    const reg kept = given < low ? reg_splat(low) : given > high ? reg_splat(high) : given; // NaN stays
     const reg passes = (given >= low) & (given <= high) ? reg_splat(1.0f) : reg{};
     return {kept, cosine ? passes : reg{}, cosine ? reg{} : passes};
 }

@@ -200,10 +200,11 @@ def test_memory_is_given_back_near_the_limit_and_no_more_often_than_it_helps(
     monkeypatch.setattr(system, "resident_memory", lambda: held)
     monkeypatch.setattr(system, "return_freed_memory", lambda: returned.append(held))
     bound = MemoryBound(1000)
-    for held in (500, 899, 901, 700, 880, 899, 910, 905, 940, 950, 951, 300, 895, 905):  # noqa: B007
+    once, again = [700, 700, 850], [905, 300, 300]
+    for held in (500, 899, 901, *once, 899, 910, *again, 905, 300, 950, 951, 200, 200, 200, 899, 905):  # noqa: B007
         bound.keep()
-    # 901 is too much, after which a step takes 700; 910 is, after which it needs 905 and may grow by a twentieth; so
-    # are 951 and, as a step then is content with 300, 905.
+    # 901 is too much, after which steps take up to 850: 910 is, too. After that one of them needs 905, so that they may
+    # hold a twentieth more, and 951 is too much. After that they need 200, and 905 is.
     assert returned == [901, 910, 951, 905]
 
 

@@ -5,7 +5,7 @@ Each metric of a scene is compared with the row without polarization that is bes
 foreground), -0.2 dB (layers) or above +0.3 degrees, even with twice its standard error over common seeds in its favor
 (at most 0.1 dB or 0.2 degrees, and that much of fewer than two common seeds). Scenes with metals are judged by object,
 metals by picture and normals alone. How many losses each of the rows without polarization has by the same rule, against
-the best of the other three, says how much is to be expected of a best of several. Then come the gains over all scenes,
+the best of the others, says how much is to be expected of a best of several. Then come the gains over all scenes,
 views with haze or fog, and views of which more is drawn from behind the true surface than in the best row without
 polarization.
 

@@ -16,10 +16,12 @@ from typing import Any
 
 from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
+from polarguide.capture.metadata import refractive_index_of
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import evaluate
 from polarguide.evaluation.record import read_metrics
 from polarguide.export import formats
+from polarguide.files import read_file
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
 from polarguide.inspection.record import write_inspection
 from polarguide.inspection.settings import InspectSettings
@@ -88,7 +90,7 @@ def train(
     out: PathLike,
     *,
     recipe: Recipe | str = "polarguide-stokes",
-    settings: TrainSettings = TrainSettings(),
+    settings: TrainSettings = TrainSettings(refractive_index=0.0),
     session: SessionOptions = SessionOptions(),
     reading: SceneOptions = SceneOptions(),
     resume: bool = False,
@@ -174,7 +176,7 @@ def priors(
             shots,
             formats=FORMATS if formats is None else formats,
             intrinsics=intrinsics,
-            refractive_index=1.5 if refractive_index is None else refractive_index,
+            refractive_index=_said_index(many) if refractive_index is None else refractive_index,
             reporter=reporter,
         )
     _refuse_with_poses(intrinsics, shots, reading, bool(formats))
@@ -200,6 +202,13 @@ def priors(
         ]
         write_shots(sets, out, options, formats=formats, refractive_index=index, reporter=reporter)
     return sheet
+
+
+def _said_index(paths: Sequence[PathLike]) -> float:
+    """The refractive index of shots: what the ``scene.json`` of the one folder says, else 1.5."""
+    file = Path(paths[0]) / "scene.json" if len(paths) == 1 else None
+    found = refractive_index_of(file, read_file(file)) if file is not None and file.is_file() else None
+    return found or 1.5
 
 
 def _refuse_for_shots(

@@ -19,8 +19,10 @@ MEBIBYTE = 1 << 20
 LAST_WORDS_SECONDS = 5.0
 MOST_PROCESSES = 65536
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
-NEARLY, GROWTH = 0.9, 1.05
-"""Of a limit, from which on freed memory is given back; and of what a step then holds, until it is again."""
+NEARLY, GROWTH, SETTLED = 0.9, 1.05, 3
+"""Of a limit, from which on freed memory is given back; of the most that steps then hold, until it is again; and how
+many steps tell the most, some of which take more than others.
+"""
 
 
 def _posix(module: str) -> Any | None:
@@ -201,20 +203,19 @@ class MemoryBound:
 
     def __init__(self, limit: int) -> None:
         self._least = NEARLY * limit
-        self._bound, self._returned = self._least, False
+        self._bound, self._most, self._waits = self._least, 0, 0
 
     def keep(self) -> None:
         """Called between steps that each take and free the like of what the one before took."""
         held = resident_memory()
         if held is None:
             return
-        if (
-            self._returned
-        ):  # a step has taken what it needs again: no sooner than above that is there much to return
-            self._bound, self._returned = max(self._least, GROWTH * held), False
+        if self._waits:  # steps take what they need again: under the most of it there is nothing to return
+            self._most, self._waits = max(self._most, held), self._waits - 1
+            self._bound = max(self._least, GROWTH * self._most)
         elif held > self._bound:
             return_freed_memory()
-            self._returned = True
+            self._most, self._waits = 0, SETTLED
 
 
 def keep_freed_memory() -> None:

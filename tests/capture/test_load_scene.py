@@ -120,6 +120,7 @@ def test_damage_in_views_that_are_not_selected_does_not_matter(capture: TinyCapt
         ({"refractive_index": 1.4, "objects": [{"material": {"ior": 1.5}}]}, 1.4),
         ({"objects": [{"material": {"ior": 1.5}}, {"material": {"type": "metal"}}, {"name": "x"}]}, 1.5),
         ({"objects": [{"material": {"ior": 1.5}}, {"material": {"ior": 1.33}}]}, None),
+        ({"objects": [{"material": {"ior": 4.05}}]}, None),
         ({"exposure": 2.0}, None),
     ],
 )

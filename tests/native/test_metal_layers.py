@@ -102,6 +102,40 @@ def test_where_no_pixel_shows_metal_the_layers_are_those_of_dielectrics() -> Non
     assert without["metal"] is None
 
 
+def test_a_view_without_metal_has_the_gradients_of_one_of_dielectrics() -> None:
+    shading = MODELS[0]
+    alpha, found = torch.ones(HEIGHT, WIDTH), []
+    for channels in (16, 10):
+        features, texels = buffers(shading)
+        features[..., 10:15] = 0
+        features = features[..., :channels].contiguous().requires_grad_()
+        texels.requires_grad_()
+        shading.shade(GBuffer(features, alpha), {"texels": texels}, camera())[
+            "final"
+        ].square().sum().backward()
+        assert features.grad is not None
+        found.append((features.grad[..., :10], texels.grad))
+    for ours, theirs in zip(*found, strict=True):
+        assert_close(ours, theirs, rtol=0, atol=0)
+
+
+def test_light_that_is_not_trained_gets_no_gradient() -> None:
+    shading = MODELS[0]
+    features, texels = buffers(shading)
+    features.requires_grad_()
+    layers = shading.shade(GBuffer(features, torch.ones(HEIGHT, WIDTH)), {"texels": texels}, camera())
+    layers["final"].sum().backward()
+    trained, (_, light) = features.grad, buffers(shading)
+    features.grad = None
+    layers = shading.shade(
+        GBuffer(features, torch.ones(HEIGHT, WIDTH)), {"texels": light.requires_grad_()}, camera()
+    )
+    layers["final"].sum().backward()
+    assert texels.grad is None
+    assert trained is not None
+    assert torch.equal(trained, features.grad)
+
+
 @pytest.mark.parametrize(
     ("name", "changed"),
     [

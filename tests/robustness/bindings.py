@@ -161,7 +161,10 @@ def polarization(rng: random.Random) -> None:
 
 def metal(rng: random.Random) -> None:
     n, d = rng.choice((*SIZES, 5000)), rng.randint(10, 18)
-    first, local = rng.choice((7, 7, 10, 12, 3, d)), rng.choice((-1, -1, 7, 0, d - 2))
+    first, local = (
+        rng.choice((7, 7, 10, 12, 3, d, 2**31 - 1)),
+        rng.choice((-1, -1, 7, 0, d - 2, 2**31 - 1, -(2**31))),
+    )
     pixels = np.flatnonzero(np.random.default_rng(rng.randrange(2**31)).random(n) < 0.4)
     if len(pixels) and rng.random() < 0.1:
         pixels[rng.randrange(len(pixels))] = rng.choice((-1, n, 2**62))

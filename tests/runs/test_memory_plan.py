@@ -111,7 +111,7 @@ def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Sc
     found = forecasts.forecast(tiny_scene, STOKES, settings, backend, 10**9)
     assert found is not None
     assert 0 < found.seconds < 600
-    assert found.most == 4 * found.gaussians
+    assert found.most == 16 * found.gaussians
     assert "1.0 GB" in found.sentence()
     assert forecasts.forecast(tiny_scene, STOKES, TrainSettings(60), backend, 10**9) is None
     assert [forecasts.in_words(s) for s in (3.4, 300, 5400, 7260)] == [

@@ -14,7 +14,8 @@ from polarguide.optics import Mount
 from polarguide.polarizer import ANGLES
 from polarguide.records import decode
 
-Index = Annotated[float, msgspec.Meta(gt=1.0, lt=4.0)]
+LEAST_INDEX, LARGEST_INDEX = 1.0, 4.0
+Index = Annotated[float, msgspec.Meta(gt=LEAST_INDEX, lt=LARGEST_INDEX)]
 
 
 class _Split(msgspec.Struct):
@@ -90,7 +91,8 @@ def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
 
 
 def refractive_index_of(path: Path, data: bytes | None) -> float | None:
-    """The one index in ``scene.json``, or None: ``refractive_index``, else the ``ior`` its objects agree on.
+    """The one index in ``scene.json``, or None: ``refractive_index``, else the ``ior`` its objects agree on, between 1
+    and 4.
 
     Args:
         path: ``scene.json``, for messages. data: its content, or None if there is no such file.
@@ -105,10 +107,9 @@ def refractive_index_of(path: Path, data: bytes | None) -> float | None:
     if scene.refractive_index is not None:
         return scene.refractive_index
     materials = [item.material for item in scene.objects]
-    found = [item.ior for item in materials if isinstance(item, _Material) and item.ior is not None]
-    if not found or any(index != found[0] for index in found):
-        return None
-    return decode(found[0], Index, f"{path} (ior)", remedy=remedy)
+    found = {item.ior for item in materials if isinstance(item, _Material) and item.ior is not None}
+    index = found.pop() if len(found) == 1 else None
+    return index if index is not None and LEAST_INDEX < index < LARGEST_INDEX else None
 
 
 def mount_of(path: Path, data: bytes | None) -> Mount:

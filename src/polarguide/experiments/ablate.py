@@ -23,7 +23,7 @@ def ablate(
     *,
     only: Sequence[str] = (),
     reference: Sequence[str | Method] = (),
-    settings: TrainSettings = TrainSettings(),
+    settings: TrainSettings = TrainSettings(refractive_index=0.0),
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,
 ) -> Results:

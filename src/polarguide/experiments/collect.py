@@ -65,7 +65,7 @@ def collect(
             "background": comparison.settings.background,
             "materials": comparison.settings.materials,
         },
-        scenes=[_scene_record(scene) for scene in scenes],
+        scenes=[_scene_record(scene, comparison) for scene in scenes],
         recipes=[_recipe_record(row) for row in comparison.rows],
         runs=runs,
         table=aggregate(runs, [scene.name for scene in scenes], recipes),
@@ -75,7 +75,7 @@ def collect(
     return validate_results(record)
 
 
-def _scene_record(scene: SceneEntry) -> SceneRecord:
+def _scene_record(scene: SceneEntry, comparison: Comparison) -> SceneRecord:
     record = SceneRecord(
         name=scene.name,
         digest=scene.digest,
@@ -85,6 +85,8 @@ def _scene_record(scene: SceneEntry) -> SceneRecord:
     )
     if scene.warnings:
         record["warnings"] = list(scene.warnings)
+    if not comparison.settings.refractive_index:
+        record["refractive_index"] = comparison.index_of(scene)
     return record
 
 

@@ -36,7 +36,7 @@ def compare(
     recipes: Sequence[str | Method],
     out: PathLike,
     *,
-    settings: TrainSettings = TrainSettings(),
+    settings: TrainSettings = TrainSettings(refractive_index=0.0),
     options: CompareOptions = CompareOptions(),
     seeds_of: Mapping[str, int] = MappingProxyType({}),
     steps_of: Mapping[str, int] = MappingProxyType({}),

@@ -112,6 +112,10 @@ class Comparison:
         first = self.settings.seed
         return range(first, first + self.seeds_of.get(recipe.name, self.options.seeds))
 
+    def index_of(self, scene: SceneEntry) -> float:
+        """The refractive index of a scene's runs: the one that is asked for, or the scene's own."""
+        return self.settings.refractive_index or scene.refractive_index or INDEX
+
     @property
     def command(self) -> str:
         """A command line that asks for the same."""
@@ -230,6 +234,8 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
             raise PolarguideError(
                 path, expected="test views", found="none", remedy="Name some in split.json to score on."
             )
+        if not comparison.settings.refractive_index and scene.refractive_index is not None:
+            reporter.say(f"{scene.name}: refractive index {scene.refractive_index:g}, as scene.json says")
         share = black_share(scene.test_views[0])
         facts = SceneFacts.of(scene)
         for warning in facts.warnings:
@@ -272,9 +278,12 @@ def _for(recipe: Method, exposures: Exposures) -> Method:
 def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int) -> PlannedRun:
     recipe, options = row.recipe, comparison.options
     steps = row.steps or comparison.settings.steps
-    index = comparison.settings.refractive_index or scene.refractive_index or INDEX
     settings = replace(
-        comparison.settings, steps=steps, seed=seed, exposures=row.exposures, refractive_index=index
+        comparison.settings,
+        steps=steps,
+        seed=seed,
+        exposures=row.exposures,
+        refractive_index=comparison.index_of(scene),
     )
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
     code = f"{__version__} {training_digest()}{_own_digest(recipe)}"

@@ -62,9 +62,11 @@ class SceneRecord(_Scene, total=False):
 
     ``black_share`` is the share of black pixels in its first test view, None where that is not known.
     ``warnings``, only where there are some, are what its scores do not mean because ground truth is missing.
+    ``refractive_index`` is that of its runs, where ``Settings`` have 0: each scene its own.
     """
 
     warnings: list[str]
+    refractive_index: Annotated[float, msgspec.Meta(gt=1, lt=4)]
 
 
 class _Recipe(TypedDict):

@@ -183,13 +183,19 @@ def _angles(
         return angles, pixels
     if len(capture.posed) < FEWEST_TO_TRAIN:
         return angles, pixels
-    pixels = _trained_pixels(capture, out, settings, pairing, backend, reporter)
+    pixels = _trained_pixels(capture, out, settings, pairing, index, backend, reporter)
     sources.append(normal_evidence(pixels, index))
     return combine_evidence(sources, pairing, capture.applied), pixels
 
 
 def _trained_pixels(
-    capture: Capture, out: Path, settings: InspectSettings, pairing: int, backend: Backend, reporter: Reporter
+    capture: Capture,
+    out: Path,
+    settings: InspectSettings,
+    pairing: int,
+    index: float,
+    backend: Backend,
+    reporter: Reporter,
 ) -> SurfaceSamples:
     names = [view.name for view in capture.posed]
     scene = _training_scene(capture, settings, reporter)
@@ -200,6 +206,7 @@ def _trained_pixels(
             steps=settings.steps,
             backend=backend,
             on_step=lambda report: advance(report.step + 1),
+            refractive_index=index,
         )
     with reporter.track("comparing with normals", len(names)) as advance:
 

@@ -64,6 +64,7 @@ def short_run(
     on_step: Callable[[StepReport], None],
     recipe: Recipe | None = None,
     until: int = 0,
+    refractive_index: float = 1.5,
 ) -> TrainingState:
     """Train, or go on, or take what is there.
 
@@ -74,7 +75,7 @@ def short_run(
         backend: device and rasterizer.
         on_step: called after every step.
         recipe: what trains; None: ``RECIPE``.
-        until: the step to stop after; 0: the last.
+        until: the step to stop after; 0: the last. refractive_index: of the surfaces.
     """
     if recipe is None:
         named = recipe_named(RECIPE)
@@ -84,11 +85,14 @@ def short_run(
         "photographs": photograph_digest(scene),
         "steps": steps,
         "recipe": recipe.name,
+        "refractive_index": refractive_index,
         "version": __version__,
     }
     until = until or steps
     state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
-    trainer = Trainer(scene, recipe, TrainSettings(steps, 0, begin_again=False), backend, state)
+    trainer = Trainer(
+        scene, recipe, TrainSettings(steps, 0, refractive_index, begin_again=False), backend, state
+    )
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)

@@ -118,7 +118,12 @@ class RunConfiguration:
                 found=f"one of version {written}",
                 remedy=f"Train again into a new folder, or open it with polarguide {_series(written)}.",
             )
-        return decode(data, cls, path, remedy=remedy)
+        found = decode(data, cls, path, remedy=remedy)
+        if not found.settings.refractive_index:
+            raise PolarguideError(
+                f"{path} (settings.refractive_index)", expected="between 1 and 4", found="0", remedy=remedy
+            )
+        return found
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,8 @@ COPIES, WRITTEN = 5, 4
 """Of a Gaussian's parameters: values, gradients, two moments, frozen; and those in the file that is written."""
 SPLAT = 600
 """Bytes a Gaussian of what a rasterizer makes of it."""
+FILLED = 0.88
+"""Of a limit, up to which views are kept in memory; the rest is for gaps between what is used."""
 FIELD_COPIES = 5
 """Of what a field learns: values, gradients, two moments, and those in the file that is written."""
 SAMPLE, READ_VIEW, TARGET_KEPT = 14_000, 60, 10
@@ -111,8 +113,9 @@ def _shared(
         allowed = now + int(SHARE * free)
     if whole <= allowed:
         return MemoryPlan(True, None, whole)
-    hold = held or (work + masks + pictures + of_view * largest <= allowed and of_view * total <= pictures)
-    room = allowed - work - masks - (pictures if hold and not held else KEPT * largest)
+    filled = int(FILLED * allowed)
+    hold = held or (work + masks + pictures + of_view * largest <= filled and of_view * total <= pictures)
+    room = filled - work - masks - (pictures if hold and not held else KEPT * largest)
     return MemoryPlan(hold, max(0, room), max(least, min(allowed, whole)))
 
 

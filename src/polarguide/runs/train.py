@@ -68,7 +68,7 @@ def train(
     out: PathLike,
     *,
     recipe: Method | str = "polarguide-stokes",
-    settings: TrainSettings = TrainSettings(),
+    settings: TrainSettings = TrainSettings(refractive_index=0.0),
     session: SessionOptions = SessionOptions(),
     reading: SceneOptions = SceneOptions(),
     resume: bool = False,

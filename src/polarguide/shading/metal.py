@@ -43,7 +43,7 @@ class MetalPixels(NamedTuple):
 
     Attributes:
         pixels: [K] int64, those that show metal, ascending.
-        share: [K] blended metalness in [0, 1].
+        share: [K] blended metalness in [0, 1], without a gradient.
         specular: [K, 3] what metals reflect there.
         slope: [K, 3] its degree of polarization over ``sin^2(zenith)``.
     """
@@ -119,7 +119,7 @@ def metal_pixels(
         seen = (seen + shown[:, local : local + 3]).clamp(min=0)
     reflectances = metal[:, :3] * inverse[:, None]
     mean, slope = optics.conductor(-along, reflectances)
-    return MetalPixels(pixels, share, share[:, None] * mean * seen, slope)
+    return MetalPixels(pixels, share.detach(), share[:, None] * mean * seen, slope)
 
 
 def with_metal(layers: Mapping[str, Tensor], metal: MetalPixels) -> dict[str, Tensor]:

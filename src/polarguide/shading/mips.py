@@ -85,8 +85,8 @@ def mips_backward(
 def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> Tensor:
     """Look-up between mip levels: seamless bilinear on the two nearest, linear between them.
 
-    On the CPU in float32 a native pass; ``mip_lookup_reference`` is its reference implementation. The gradient with
-    respect to ``level`` is the difference of the two levels, and 0 beyond the ends.
+    On the CPU in float32 a native pass, up to 16 levels and 64 channels; ``mip_lookup_reference`` is its reference
+    implementation. The gradient with respect to ``level`` is the difference of the two levels, and 0 beyond the ends.
 
     Args:
         levels: L textures as of ``box_mips``, [6, R_l, R_l, C].
@@ -96,7 +96,7 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
     Returns:
         [P, C], differentiable in all three; on the CPU the same bits for any number of threads.
     """
-    native = len(levels) <= MOST_LEVELS and levels[0].shape[-1] <= MOST_CHANNELS
+    native = len(levels) <= MOST_LEVELS and 1 <= levels[0].shape[-1] <= MOST_CHANNELS
     if native and fits(directions, level, *levels):
         found: Tensor = _Between.apply(directions, level, *levels)
         return found

@@ -141,7 +141,13 @@ class ShadingModel(ABC):
     """Whether shading reads the normals, so that they are always splatted."""
 
     def bind(self: Model, refractive_index: float) -> Model:
-        """The same model for surfaces of a refractive index."""
+        """The same model for surfaces of a refractive index.
+
+        Raises:
+            ValueError: it is not over 1.
+        """
+        if not refractive_index > 1:
+            raise ValueError(f"refractive index: expected more than 1, found {refractive_index}")
         return dataclasses.replace(self, refractive_index=refractive_index)
 
     def data(self) -> dict[str, Any]:

@@ -53,30 +53,30 @@ class _Reflect(torch.autograd.Function):
         _native.reflect_directions(features, rays, directions)
         _native.cubemap_forward(texels, directions, seen)
         _native.reflect_layers(features, rays, seen, fresnel, local, ior, *layers)
-        ctx.save_for_backward(features, rays, texels, directions, seen)
-        ctx.model = (fresnel, local, ior)
-        ctx.metal, ctx.kept = metal, ()
+        ctx.model, ctx.metal = (fresnel, local, ior), metal
         ctx.set_materialize_grads(False)
         found: list[Tensor] = []
+        kept: list[Tensor] = []
         if metal is not None:
             given = features, rays, *metal
             count = len(metal.pixels)
             mirrored, reflected, slope, light = (rays.new_empty(count, 3) for _ in range(4))
             share, level = rays.new_empty(count), rays.new_empty(count)
-            kept = [t.detach().contiguous() for t in levels]
+            mips = [t.detach().contiguous() for t in levels]
             _native.metal_directions(*given, mirrored, level)
-            _native.mips_forward(kept, mirrored, level, light)
+            _native.mips_forward(mips, mirrored, level, light)
             _native.metal_layers(*given, light, share, reflected, slope, *layers[:2])
-            ctx.kept = mirrored, level, light, kept
+            kept = [metal.pixels, mirrored, level, light, *mips]
             ctx.mark_non_differentiable(share)
             found = [share, reflected, slope]
+        ctx.save_for_backward(features, rays, texels, directions, seen, *kept)
         again = [layers[1].clone(), layers[2].clone()] if held else []
         return (*layers, *again, *found)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        features, rays, texels, directions, seen = ctx.saved_tensors
+        features, rays, texels, directions, seen, *kept = ctx.saved_tensors
         contiguous = [None if g is None else g.contiguous() for g in grads]
         by_metal = contiguous[-2:]
         to_layers = contiguous if ctx.metal is None else contiguous[:-3]
@@ -94,9 +94,9 @@ class _Reflect(torch.autograd.Function):
             _native.cubemap_backward(texels, directions, to_look_up, to_texels, None)
             _native.cubemap_backward(texels, directions, to_seen, None, to_directions)
         _native.reflect_backward_directions(features, rays, to_directions, to_features)
-        to_levels: Sequence[Tensor | None] = ()
+        to_levels: Sequence[Tensor | None] = [None] * len(ctx.needs_input_grad[8:])
         if ctx.metal is not None:
-            mirrored, level, light, levels = ctx.kept
+            _, mirrored, level, light, *levels = kept
             to_light, by_layers = torch.empty_like(light), [*to_layers[:2], to_layers[4]]
             given = [features, rays, *ctx.metal, light, *by_layers, *by_metal, to_light, to_features]
             _native.metal_backward_layers(*given)
@@ -133,8 +133,9 @@ def reflect_native(
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features, texels and
-        levels, with ``held`` the two that are held, and with ``metal`` its share [K], what it reflects [K, 3] and its
-        degree of polarization over ``sin^2(zenith)`` [K, 3]; the same bits for any number of threads.
+        levels, with ``held`` the two that are held, and with ``metal`` its share [K], not differentiable, what it
+        reflects [K, 3] and its degree of polarization over ``sin^2(zenith)`` [K, 3]; the same bits for any number of
+        threads.
 
     Raises:
         ValueError: if a shape is not as above.

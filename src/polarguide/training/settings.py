@@ -67,7 +67,7 @@ class TrainSettings:
         if self.refractive_index and not 1.0 < self.refractive_index < 4.0:
             raise PolarguideError(
                 "refractive_index",
-                expected="between 1 and 4",
+                expected="between 1 and 4, or 0 for that of the scene",
                 found=str(self.refractive_index),
                 remedy="1.5 suits most.",
             )

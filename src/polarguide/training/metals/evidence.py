@@ -15,12 +15,13 @@ from polarguide.raster import Rasterize
 from polarguide.shading.metal import FIRST_REFLECTANCE
 from polarguide.shading.model import Parameters
 from polarguide.training.metals.explanations import DARK, oblique_light, residuals
-from polarguide.training.metals.looks import Seen, seen_by
+from polarguide.training.metals.looks import seen_by, seen_of
 from polarguide.training.metals.words import LEAST_SEEN, said_by
 from polarguide.vectors import dot
 
 LEAST_VIEWS = 4.0
 NEIGHBORS = 64
+CHUNK = 1 << 14
 # Mean squares of relative residuals below this count as this.
 LEAST_RESIDUAL = 2e-4
 # Neighbors whose brightness, or whose colors in proportion to it, differ by this factor's logarithm are of another
@@ -61,6 +62,19 @@ class Evidence(NamedTuple):
     said: Tensor
 
 
+class _Explained(NamedTuple):
+    """How each of N Gaussians is explained by itself: mean squares of residuals as a dielectric and as a metal, that
+    metal's reflectance [N, 3], the mean square at 45 degrees, how much is known of it, and its color [N, 3].
+    """
+
+    dielectric: Tensor
+    metal: Tensor
+    reflectance: Tensor
+    oblique: Tensor
+    known: Tensor
+    color: Tensor
+
+
 @torch.no_grad()
 def evidence(
     gaussians: Parameters, views: Sequence[View], rasterize: Rasterize, refractive_index: float
@@ -69,12 +83,18 @@ def evidence(
 
     Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
     """
-    near, alike = _neighborhoods(gaussians)
     said = said_by(gaussians, views, rasterize)
     measured = [view for view in views if view.is_determined]
-    if not measured:
+    explained = _explained(seen_by(gaussians, measured, rasterize), refractive_index) if measured else None
+    near, alike = _neighborhoods(gaussians)
+    if explained is None:
         return _nothing_measured(near, alike, said)
-    return _of_neighbors(seen_by(gaussians, measured, rasterize), near, alike, said, refractive_index)
+    return _of_neighbors(explained, near, alike, said)
+
+
+def _chunks(count: int) -> list[slice]:
+    """Some Gaussians at a time, so that what is computed of all of them takes little memory."""
+    return [slice(begin, min(begin + CHUNK, count)) for begin in range(0, max(1, count), CHUNK)]
 
 
 def _neighborhoods(gaussians: Parameters) -> tuple[Tensor, Tensor]:
@@ -82,12 +102,19 @@ def _neighborhoods(gaussians: Parameters) -> tuple[Tensor, Tensor]:
     means = gaussians["means"].detach()
     places = means.cpu().double().numpy()
     count = min(NEIGHBORS, len(places))
-    found = cKDTree(places).query(places, k=count)[1]
-    near = torch.from_numpy(found).view(len(places), count).to(means.device)
-    axes = shortest_axis_normals(
-        means, gaussians["quaternions"], gaussians["log_scales"], means.new_zeros(3), None
+    tree, axes = (
+        cKDTree(places),
+        shortest_axis_normals(
+            means, gaussians["quaternions"], gaussians["log_scales"], means.new_zeros(3), None
+        ),
     )
-    return near, dot(axes[:, None], axes[near]) ** 4
+    near = torch.empty(len(places), count, dtype=torch.int64, device=means.device)
+    alike = means.new_empty(len(places), count)
+    for chunk in _chunks(len(places)):
+        found = torch.from_numpy(tree.query(places[chunk], k=count)[1])
+        near[chunk] = found.view(-1, count).to(means.device)
+        alike[chunk] = dot(axes[chunk, None], axes[near[chunk]]) ** 4
+    return near, alike
 
 
 def _nothing_measured(near: Tensor, alike: Tensor, said: Tensor) -> Evidence:
@@ -97,44 +124,66 @@ def _nothing_measured(near: Tensor, alike: Tensor, said: Tensor) -> Evidence:
     return Evidence(none, none, gray, near, alike, none, none, none, none, none, said)
 
 
-def _of_neighbors(seen: Seen, near: Tensor, alike: Tensor, said: Tensor, refractive_index: float) -> Evidence:
+def _explained(looks: Sequence[Tensor], refractive_index: float) -> _Explained:
+    """Explanations of all Gaussians, of which ``looks`` are ``seen_by``."""
+    parts = []
+    for chunk in _chunks(len(looks[0])):
+        seen = seen_of(looks, chunk)
+        total = seen.weight.sum(dim=0)
+        effective = total * total / (seen.weight**2).sum(dim=0).clamp(min=1e-9)
+        color = (seen.weight[..., None] * seen.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
+        known = total.clamp(max=20) * (effective > LEAST_VIEWS)
+        fitted = residuals(seen, refractive_index)
+        parts.append(_Explained(*fitted, oblique_light(seen), known, color.clamp(min=0)))
+    return _Explained(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def _of_neighbors(found: _Explained, near: Tensor, alike: Tensor, said: Tensor) -> Evidence:
     """Evidence of what was measured, over neighborhoods in which those of like color count."""
-    dielectric, metal, reflectance = residuals(seen, refractive_index)
-    total = seen.weight.sum(dim=0)
-    effective = total * total / (seen.weight**2).sum(dim=0).clamp(min=1e-9)
-    known = total.clamp(max=20) * (effective > LEAST_VIEWS)
-    color = ((seen.weight[..., None] * seen.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]).clamp(min=0)
-    mean = (color * known[:, None]).sum(dim=0) / known.sum().clamp(min=1e-6)
-    tints = color / mean.clamp(min=1e-6)
-    color = color + DARK
+    known = found.known
+    mean = (found.color * known[:, None]).sum(dim=0) / known.sum().clamp(min=1e-6)
+    tints = found.color / mean.clamp(min=1e-6)
+    color = found.color + DARK
     brightness = color.mean(dim=1)
-    like_color = _like_color(color, near)
-    trust = (known + 1e-6)[near] * like_color
-
-    def over_neighbors(values: Tensor) -> Tensor:
-        return (values[near] * trust).sum(dim=1) / trust.sum(dim=1)
-
-    ratio = (dielectric.clamp(min=LEAST_RESIDUAL) / metal.clamp(min=LEAST_RESIDUAL)).log()
-    tints = torch.stack([over_neighbors(t) for t in tints.unbind(1)], dim=1)
+    ratio = (found.dielectric.clamp(min=LEAST_RESIDUAL) / found.metal.clamp(min=LEAST_RESIDUAL)).log()
+    each = (
+        ratio,
+        found.dielectric,
+        found.metal,
+        found.oblique,
+        *found.reflectance.unbind(1),
+        *tints.unbind(1),
+    )
+    means, support = [], []
+    for chunk in _chunks(len(near)):
+        nearest = near[chunk]
+        like_color = _like_color(color, chunk, nearest)
+        trust = (known + 1e-6)[nearest] * like_color
+        whole = trust.sum(dim=1)
+        means.append(torch.stack([(values[nearest] * trust).sum(dim=1) / whole for values in each]))
+        support.append((known > LEAST_SEEN).float()[nearest].mean(dim=1))
+        alike[chunk] *= like_color
+    ratio, dielectric, metal, oblique, *rest = torch.cat(means, dim=1)
+    tints = torch.stack(rest[3:], dim=1)
     return Evidence(
-        ratio=over_neighbors(ratio),
-        misfit=over_neighbors(dielectric).sqrt(),
-        reflectance=torch.stack([over_neighbors(r) for r in reflectance.unbind(1)], dim=1),
+        ratio=ratio,
+        misfit=dielectric.sqrt(),
+        reflectance=torch.stack(rest[:3], dim=1),
         near=near,
-        alike=alike * like_color,
+        alike=alike,
         brightness=brightness * known.sum() / (brightness * known).sum().clamp(min=1e-6),
         tint=tints.amin(dim=1) / tints.amax(dim=1).clamp(min=1e-6),
-        metal_misfit=over_neighbors(metal).sqrt(),
-        oblique=over_neighbors(oblique_light(seen)).sqrt(),
-        support=(known > LEAST_SEEN).float()[near].mean(dim=1),
+        metal_misfit=metal.sqrt(),
+        oblique=oblique.sqrt(),
+        support=torch.cat(support),
         said=said,
     )
 
 
-def _like_color(color: Tensor, near: Tensor) -> Tensor:
-    """How much the neighbors [N, K] of each Gaussian look like it, in [0, 1]; of colors [N, 3] over 0."""
+def _like_color(color: Tensor, which: slice, near: Tensor) -> Tensor:
+    """How much the neighbors [n, K] of some Gaussians look like them, in [0, 1]; of colors [N, 3] over 0."""
     brightness, logarithms = color.mean(dim=1).log(), color.log()
     tint = logarithms - logarithms.mean(dim=1, keepdim=True)
-    brighter = (brightness[near] - brightness[:, None]) / LIKE_BRIGHTNESS
-    tinted = (tint[near] - tint[:, None]) / LIKE_TINT
+    brighter = (brightness[near] - brightness[which, None]) / LIKE_BRIGHTNESS
+    tinted = (tint[near] - tint[which, None]) / LIKE_TINT
     return torch.exp(-0.5 * (brighter.square() + tinted.square().mean(dim=2)))

@@ -37,9 +37,11 @@ class Seen(NamedTuple):
     cosine: Tensor
 
 
-def seen_by(gaussians: Parameters, views: Sequence[View], rasterize: Rasterize) -> Seen:
-    """What views that determine the Stokes vector show: at least one; ``MOST_VIEWS`` of them at most, evenly."""
-    return _seen(torch.stack([_look(gaussians, view, rasterize) for view in evenly(views, MOST_VIEWS)]))
+def seen_by(gaussians: Parameters, views: Sequence[View], rasterize: Rasterize) -> list[Tensor]:
+    """Sums [N, 11] over the pixels of each view that determines the Stokes vector, at least one; ``MOST_VIEWS`` of them
+    at most, evenly. ``seen_of`` tells what they say of some of the Gaussians.
+    """
+    return [_look(gaussians, view, rasterize) for view in evenly(views, MOST_VIEWS)]
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
@@ -78,8 +80,9 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
     return shares(gaussians, view, target.contiguous(), rasterize)
 
 
-def _seen(sums: Tensor) -> Seen:
-    """Means of the sums [V, N, 11], with the weight of views that count."""
+def seen_of(looks: Sequence[Tensor], which: slice) -> Seen:
+    """Means of the sums of some Gaussians, with the weight of views that count."""
+    sums = torch.stack([look[which] for look in looks])
     weight = sums[..., 0]
     means = sums[..., 1:] / weight.clamp(min=1e-6)[..., None]
     cosine = means[..., 9].clamp(0, 1)

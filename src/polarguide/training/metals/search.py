@@ -12,6 +12,7 @@ from polarguide.capture.view import listed
 from polarguide.gaussians.initialize import far_away
 from polarguide.raster import Backend
 from polarguide.shading.model import ShadingModel
+from polarguide.system import return_freed_memory
 from polarguide.training.distributed import Ranks
 from polarguide.training.metals.decision import REACH, decide
 from polarguide.training.metals.evidence import evidence
@@ -73,6 +74,7 @@ class MetalSearch:
         if not any(view.is_determined or view.materials is not None for view in views):
             return
         gaussians, rasterize = state.gaussians, self._backend.rasterize
+        return_freed_memory()  # of steps: what is looked at has other sizes
         found = evidence(gaussians, views, rasterize, self._index)
         if not self._told and (wrong := contradicted(gaussians, views, rasterize, found.said)):
             self._told = True
@@ -90,3 +92,5 @@ class MetalSearch:
         shown = [view for view in views if view.is_determined]
         gain = partial(light_gain, gaussians, state.light, shown, rasterize, self._shading)
         self._shading.become_metal(gaussians, state.light, metal > 0, reflectance, gain)
+        del found
+        return_freed_memory()
