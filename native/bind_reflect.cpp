@@ -15,14 +15,15 @@ namespace {
 using MaybeArray = std::optional<Array>;
 constexpr int64_t item_chunk = 2048;
 
-ReflectArgs reflect_args(const Array &features, const Array &rays, bool fresnel, bool local, float refractive_index) {
+ReflectArgs reflect_args(const Array &features, const Array &rays, bool fresnel, bool local, float refractive_index, int index) {
     const int64_t n = features.ndim() == 2 ? int64_t(features.shape(0)) : 0;
     const int64_t channels = features.ndim() == 2 ? int64_t(features.shape(1)) : 0;
     expect_shape(features, "features", {n, channels}), expect_shape(rays, "rays", {n, 3});
     if (channels < (local ? 10 : 7))
         throw std::invalid_argument("features: expected base color, normal, strength and what the shading reads");
     ReflectArgs a{};
-    a.channels = int(channels), a.fresnel = fresnel, a.local = local, a.refractive_index = refractive_index;
+    if (index < -1 || index >= channels) throw std::invalid_argument("index: expected a channel, or -1");
+    a.channels = int(channels), a.fresnel = fresnel, a.local = local, a.refractive_index = refractive_index, a.index = index;
     a.features = features.data(), a.rays = rays.data();
     return a;
 }
@@ -50,7 +51,7 @@ const float *optional_rows(const MaybeArray &array, const char *name, int64_t n)
 
 MetalArgs metal_args(const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share,
                      float blur) {
-    const ReflectArgs all = reflect_args(features, rays, true, false, 1.5f);
+    const ReflectArgs all = reflect_args(features, rays, true, false, 1.5f, -1);
     if (first < 7 || first > all.channels - 5 || local < -1 || local > all.channels - 3)
         throw std::invalid_argument("features: expected the channels of metals behind those of dielectrics");
     expect_ascending(pixels, "pixels", int64_t(features.shape(0)));
@@ -135,7 +136,7 @@ void bind_reflect(nb::module_ &module) {
     module.def(
         "reflect_directions",
         [](const Array &features, const Array &rays, Array directions) {
-            ReflectArgs a = reflect_args(features, rays, false, false, 1.5f);
+            ReflectArgs a = reflect_args(features, rays, false, false, 1.5f, -1);
             const int64_t n = int64_t(rays.shape(0));
             expect_shape(directions, "directions", {n, 3});
             a.directions = directions.data();
@@ -145,8 +146,8 @@ void bind_reflect(nb::module_ &module) {
     module.def(
         "reflect_layers",
         [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,
-           Array final_picture, Array specular, Array diffuse, Array reflection) {
-            ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index);
+           int index, Array final_picture, Array specular, Array diffuse, Array reflection) {
+            ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index, index);
             const int64_t n = int64_t(rays.shape(0));
             expect_shape(seen, "seen", {n, 3}), expect_shape(final_picture, "final", {n, 3});
             expect_shape(specular, "specular", {n, 3}), expect_shape(diffuse, "diffuse", {n, 3});
@@ -155,15 +156,15 @@ void bind_reflect(nb::module_ &module) {
             a.diffuse = diffuse.data(), a.reflection = reflection.data();
             run(POLARGUIDE_DISPATCH(reflect_layers), a, n);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
+        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"), nb::arg("index"),
         nb::arg("final"), nb::arg("specular"), nb::arg("diffuse"), nb::arg("reflection"), "The layers of the picture.");
     module.def(
         "reflect_backward_layers",
         [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,
-           MaybeArray grad_final, MaybeArray grad_specular, MaybeArray grad_diffuse, MaybeArray grad_reflection,
+           int index, MaybeArray grad_final, MaybeArray grad_specular, MaybeArray grad_diffuse, MaybeArray grad_reflection,
            MaybeArray grad_held_specular, MaybeArray grad_held_diffuse, Array grad_seen, MaybeArray grad_texels,
            Array grad_features) {
-            ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index);
+            ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index, index);
             const int64_t n = int64_t(rays.shape(0));
             expect_shape(seen, "seen", {n, 3}), expect_shape(grad_seen, "grad_seen", {n, 3});
             expect_shape(grad_features, "grad_features", {n, a.channels});
@@ -179,7 +180,7 @@ void bind_reflect(nb::module_ &module) {
             a.seen = seen.data(), a.grad_seen = grad_seen.data(), a.grad_features = grad_features.data();
             run(POLARGUIDE_DISPATCH(reflect_backward_layers), a, n);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
+        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"), nb::arg("index"),
         nb::arg("grad_final").none(), nb::arg("grad_specular").none(), nb::arg("grad_diffuse").none(),
         nb::arg("grad_reflection").none(), nb::arg("grad_held_specular").none(), nb::arg("grad_held_diffuse").none(),
         nb::arg("grad_seen"), nb::arg("grad_texels").none(), nb::arg("grad_features"),
@@ -188,7 +189,7 @@ void bind_reflect(nb::module_ &module) {
     module.def(
         "reflect_backward_directions",
         [](const Array &features, const Array &rays, const Array &grad_directions, Array grad_features) {
-            ReflectArgs a = reflect_args(features, rays, false, false, 1.5f);
+            ReflectArgs a = reflect_args(features, rays, false, false, 1.5f, -1);
             const int64_t n = int64_t(rays.shape(0));
             expect_shape(grad_directions, "grad_directions", {n, 3});
             expect_shape(grad_features, "grad_features", {n, a.channels});

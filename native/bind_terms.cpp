@@ -46,8 +46,8 @@ template <class Args> double run(void (*kernel)(const Args &, int64_t, int64_t),
 
 double polarization(const Array &normal, const Array &rays, const Array &rotation, const Array &specular,
                     const Array &diffuse, MaybeArray metal, const Array &measured, const Array &analyzers,
-                    MaybeArray weight, float factor, float refractive_index, Array grad_normal, Array grad_specular,
-                    Array grad_diffuse, MaybeArray grad_metal) {
+                    MaybeArray weight, float factor, float refractive_index, MaybeArray index, Array grad_normal,
+                    Array grad_specular, Array grad_diffuse, MaybeArray grad_metal) {
     PolarizationArgs a{};
     a.term = term_args(normal, weight, factor, grad_normal);
     const int64_t n = rows(normal), measurements = rows(measured);
@@ -63,6 +63,7 @@ double polarization(const Array &normal, const Array &rays, const Array &rotatio
     if (!(refractive_index > 1.0f)) throw std::invalid_argument("refractive_index: expected more than 1");
     a.rays = rays.data(), a.rotation = rotation.data(), a.specular = specular.data(), a.diffuse = diffuse.data();
     a.measured = measured.data(), a.analyzers = analyzers.data(), a.count = n, a.measurements = int(measurements);
+    if (index) expect_shape(*index, "index", {n}), a.index = index->data();
     a.refractive_index = refractive_index, a.grad_specular = grad_specular.data(), a.grad_diffuse = grad_diffuse.data();
     return run(POLARGUIDE_DISPATCH(polarization_term), a, n);
 }
@@ -106,7 +107,7 @@ double consistency(const Array &normal, const Array &rays, const Array &rotation
 void bind_terms(nb::module_ &module) {
     module.def("polarization", &polarization, nb::arg("normal"), nb::arg("rays"), nb::arg("rotation"),
                nb::arg("specular"), nb::arg("diffuse"), nb::arg("metal").none(), nb::arg("measured"), nb::arg("analyzers"),
-               nb::arg("weight").none(), nb::arg("factor"), nb::arg("refractive_index"), nb::arg("grad_normal"),
+               nb::arg("weight").none(), nb::arg("factor"), nb::arg("refractive_index"), nb::arg("index").none(), nb::arg("grad_normal"),
                nb::arg("grad_specular"), nb::arg("grad_diffuse"), nb::arg("grad_metal").none(),
                "Distance of the polarization of two layers from K measurements; adds to grad_normal, fills the others.");
     module.def("direction", &direction, nb::arg("normal"), nb::arg("directions"), nb::arg("weight").none(),

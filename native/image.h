@@ -88,6 +88,7 @@ struct ReflectArgs {
     int channels;
     bool fresnel, local; // Fresnel's weight and exponential light, or the lerp and the logistic function
     float refractive_index;
+    int index;             // the channel of what is added to it; -1: there is none
     const float *features; // [P,D]
     const float *rays;     // [P,3] unit
     const float *seen;     // [P,3]

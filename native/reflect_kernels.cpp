@@ -26,9 +26,9 @@ POLARGUIDE_INLINE Mirror mirror_at(const ReflectArgs &a, int64_t i, int n) {
 }
 
 // Unpolarized power reflectance where the ray meets the normal, and its derivative by their product.
-POLARGUIDE_INLINE reg reflectance(reg along, float refractive_index, reg *by_along) {
+POLARGUIDE_INLINE reg reflectance(reg along, reg refractive_index, reg *by_along) {
     const reg c = clamp(-along, reg{}, reg_splat(1.0f)); // the cosine
-    const float n2 = refractive_index * refractive_index;
+    const reg n2 = refractive_index * refractive_index;
     const reg t = square_root(c * c + (n2 - 1.0f)), p = n2 * c, dt = c / t;
     const reg s_sum = 1.0f / (c + t), p_sum = 1.0f / (p + t), rs = (c - t) * s_sum, rp = (p - t) * p_sum;
     // ((a - t) / (a + t))' = 2 (a' t - a t') / (a + t)^2
@@ -77,9 +77,12 @@ struct Blend {
     reg by_along;    // derivative of the share by ray . normal
 };
 
-POLARGUIDE_INLINE Blend blend_of(const ReflectArgs &a, reg strength, reg along) {
+POLARGUIDE_INLINE Blend blend_of(const ReflectArgs &a, int64_t i, int n, reg strength, reg along) {
     Blend b = {reg_splat(1.0f), 1.0f - strength, reg{}};
-    if (a.fresnel) b.share = reflectance(along, a.refractive_index, &b.by_along), b.kept = reg_splat(1.0f);
+    if (!a.fresnel) return b;
+    reg index = {};
+    if (a.index >= 0) columns_of<1>(a.features + a.channels * i, a.channels, a.index, n, &index);
+    b.share = reflectance(along, a.refractive_index + index, &b.by_along), b.kept = reg_splat(1.0f);
     return b;
 }
 
@@ -101,7 +104,7 @@ void reflect_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
         columns_of<3>(a.features + a.channels * i, a.channels, 0, n, base);
         columns_of<1>(a.features + a.channels * i, a.channels, 6, n, &strength);
         const Light light = light_at(a, i, n);
-        const Blend blend = blend_of(a, strength, a.fresnel ? mirror_at(a, i, n).along : reg{});
+        const Blend blend = blend_of(a, i, n, strength, a.fresnel ? mirror_at(a, i, n).along : reg{});
         for (int k = 0; k < 3; ++k) {
             specular[k] = strength * blend.share * light.value[k], diffuse[k] = blend.kept * base[k];
             final_picture[k] = specular[k] + diffuse[k];
@@ -125,7 +128,7 @@ void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
         Mirror m;
         m.along = reg{};
         if (a.fresnel) m = mirror_at(a, i, n);
-        const Blend blend = blend_of(a, strength, m.along);
+        const Blend blend = blend_of(a, i, n, strength, m.along);
         gradient_at(a.grad_final, i, n, picture), gradient_at(a.grad_specular, i, n, by[0]);
         gradient_at(a.grad_diffuse, i, n, by[1]), gradient_at(a.grad_reflection, i, n, by[2]);
         gradient_at(a.grad_held_specular, i, n, by[3]), gradient_at(a.grad_held_diffuse, i, n, by[4]);

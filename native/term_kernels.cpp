@@ -74,9 +74,9 @@ inline void frame_at(const Vec &ray, int l, float *right, float *up) {
     up[0] = mixed, up[1] = y * y * scale - 1.0f, up[2] = y;
 }
 
-void surface_at(const Vec &normal, float refractive_index, Surface &s) {
-    const float n2 = refractive_index * refractive_index, inverse_n2 = 1.0f / n2;
+void surface_at(const Vec &normal, const Lane &index, Surface &s) {
     for (int l = 0; l < block; ++l) {
+        const float n2 = index[l] * index[l], inverse_n2 = 1.0f / n2;
         const float nx = normal.k[0][l], ny = normal.k[1][l], nz = normal.k[2][l], squared = nx * nx + ny * ny + nz * nz;
         const bool live = squared > no_length * no_length;
         const float inverse = (live ? 1.0f : 0.0f) / sqrtf(live ? squared : 1.0f);
@@ -137,12 +137,13 @@ template <bool with_metal> void polarization_term_of(const PolarizationArgs &a, 
         Surface s;
         Vec normal, turned, specular, diffuse, stokes[3], metal, field;
         if (with_metal) read_metal(a, i, n, metal, field);
-        alignas(64) Lane weight, pull;
+        alignas(64) Lane weight, pull, index;
         read(a.term.normal + 3 * i, n, normal), read(a.rays + 3 * i, n, s.ray);
         read(a.specular + 3 * i, n, specular), read(a.diffuse + 3 * i, n, diffuse);
         read_weight(a.term, i, n, weight);
         turn(a.rotation, normal, turned);
-        surface_at(turned, a.refractive_index, s);
+        for (int l = 0; l < block; ++l) index[l] = a.index && l < n ? a.index[i + l] : a.refractive_index;
+        surface_at(turned, index, s);
         for (int l = 0; l < block; ++l) pull[l] = a.term.factor * weight[l];
         for (int c = 0; c < 3; ++c)
             for (int l = 0; l < block; ++l) {

@@ -30,6 +30,7 @@ struct PolarizationArgs {
     int64_t count;                    // P
     int measurements;                 // K
     float refractive_index;
+    const float *index; // [P] of each pixel; null: the same everywhere
     float *grad_specular, *grad_diffuse; // [P,3], written
     float *grad_metal;                   // [P,6], written; null without metal
 };

@@ -140,6 +140,7 @@ def test_a_gradient_by_held_layers_needs_room_for_the_texels() -> None:
             True,
             True,
             1.5,
+            -1,
             None,
             None,
             None,

@@ -105,7 +105,12 @@ def reflect(rng: random.Random) -> None:
     n, d, local = rng.choice((*SIZES, 5000)), rng.randint(5, 12), rng.random() < 0.5
     features, rays, three = array(rng, n, d), array(rng, n, 3), [array(rng, n, 3) for _ in range(7)]
     _native.reflect_directions(features, rays, three[0])
-    model = rng.random() < 0.5, local, rng.choice((1.5, 0.0, np.nan))
+    model = (
+        rng.random() < 0.5,
+        local,
+        rng.choice((1.5, 0.0, np.nan)),
+        rng.choice((-1, -1, 0, d - 1, d, 2**31 - 1)),
+    )
     _native.reflect_layers(features, rays, three[0], *model, *three[1:5])
     layers = [maybe(rng, values) for values in (*three[1:5], *three[1:3])]
     by_look_up = three[5], maybe(rng, three[6])
@@ -155,7 +160,14 @@ def polarization(rng: random.Random) -> None:
     metal = maybe(rng, array(rng, n, 6))
     layers = specular, diffuse, metal, measured, analyzers, weight
     _native.polarization(
-        normal, rays, array(rng, 3, 3), *layers, *numbers, *gradients, maybe(rng, array(rng, n, 6))
+        normal,
+        rays,
+        array(rng, 3, 3),
+        *layers,
+        *numbers,
+        maybe(rng, array(rng, n)),
+        *gradients,
+        maybe(rng, array(rng, n, 6)),
     )
 
 

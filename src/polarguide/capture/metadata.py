@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import msgspec
 
 from polarguide.capture.calibration import Calibration, Sense, combined
+from polarguide.capture.formats.pictures import MOST_MATERIAL
 from polarguide.capture.view import unknown_view
 from polarguide.errors import PolarguideError
 from polarguide.optics import Mount
@@ -15,6 +16,8 @@ from polarguide.polarizer import ANGLES
 from polarguide.records import decode
 
 LEAST_INDEX, LARGEST_INDEX = 1.0, 4.0
+# Of the numbers in materials/, the first that the table of scene.json explains.
+FIRST_LISTED = 3
 Index = Annotated[float, msgspec.Meta(gt=LEAST_INDEX, lt=LARGEST_INDEX)]
 
 
@@ -30,6 +33,18 @@ class _Material(msgspec.Struct):
 
 class _Object(msgspec.Struct):
     material: _Material | str | None = None
+
+
+class _Dielectric(msgspec.Struct):
+    """A dielectric that ``materials/`` names by a number."""
+
+    refractive_index: Index
+
+
+class _Materials(msgspec.Struct):
+    """The table of materials in ``scene.json``."""
+
+    materials: dict[str, _Dielectric] = {}
 
 
 class _Scene(msgspec.Struct):
@@ -110,6 +125,31 @@ def refractive_index_of(path: Path, data: bytes | None) -> float | None:
     found = {item.ior for item in materials if isinstance(item, _Material) and item.ior is not None}
     index = found.pop() if len(found) == 1 else None
     return index if index is not None and LEAST_INDEX < index < LARGEST_INDEX else None
+
+
+def indices_of(path: Path, data: bytes | None) -> dict[int, float]:
+    """Refractive indices of the dielectrics that ``materials/`` names by numbers from 3 on: ``materials`` in
+    ``scene.json``, as ``{"3": {"refractive_index": 1.33}}``.
+
+    Args:
+        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+
+    Raises:
+        PolarguideError: a number or an index is out of range.
+    """
+    if data is None:
+        return {}
+    remedy = 'Write {"materials": {"3": {"refractive_index": 1.33}}}, or remove materials.'
+    table = decode(data, _Materials, path, remedy=remedy).materials
+    for key in table:
+        if not (key.isascii() and key.isdigit() and FIRST_LISTED <= int(key) <= MOST_MATERIAL):
+            raise PolarguideError(
+                f"{path} (materials)",
+                expected=f"numbers from {FIRST_LISTED} to {MOST_MATERIAL}",
+                found=repr(key),
+                remedy=remedy,
+            )
+    return {int(key): item.refractive_index for key, item in table.items()}
 
 
 def mount_of(path: Path, data: bytes | None) -> Mount:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,10 +18,10 @@ from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unused_poses
 from polarguide.capture.exposures import FOUR
-from polarguide.capture.formats.pictures import TRANSFERS
+from polarguide.capture.formats.pictures import MATERIAL_REMEDY, TRANSFERS
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.memory import check_memory, stated_size
-from polarguide.capture.metadata import held_out, mount_of, refractive_index_of
+from polarguide.capture.metadata import held_out, indices_of, mount_of, refractive_index_of
 from polarguide.capture.objects import objects_of
 from polarguide.capture.split import chosen_views, far_from_training, held_out_band
 from polarguide.capture.stored_view import StoredView, ViewFiles
@@ -104,6 +104,7 @@ def load_scene(
     tests, stray = _held_out(root / "split.json", files, layout, model, split, test_views)
     about = files.read_if_there(root / "scene.json")
     index = refractive_index_of(root / "scene.json", about)
+    indices = indices_of(root / "scene.json", about)
     mount = mount_of(root / "scene.json", about)
     if layout.table is not None:
         files.read(layout.table)
@@ -136,6 +137,7 @@ def load_scene(
         for item, camera in zip(stored.data, stored.cameras, strict=True)
         if camera is not None
     )
+    _check_materials(layout, stored.data, indices)
     told_apart = any(item.ground_truth and item.ground_truth.object_ids is not None for item in stored.data)
     warnings = [
         *layout.warnings,
@@ -160,7 +162,22 @@ def load_scene(
         digest=_digest_all(root, files),
         warnings=(*warnings, *_picture_warnings(stored, transfer)),
         objects=objects_of(root / "scene.json", about) if told_apart else (),
+        indices=indices,
     )
+
+
+def _check_materials(layout: Layout, views: Iterable[ViewData], indices: Mapping[int, float]) -> None:
+    """Refuse numbers of materials that nobody explains."""
+    for view in views:
+        if view.materials is not None:
+            unknown = set(np.unique(view.materials).tolist()) - {0, 1, 2, *indices}
+            if unknown:
+                raise PolarguideError(
+                    layout.materials[view.name],
+                    expected=f"the numbers {', '.join(map(str, (0, 1, 2, *sorted(indices))))}",
+                    found=str(min(unknown)),
+                    remedy=MATERIAL_REMEDY,
+                )
 
 
 def _held_out(

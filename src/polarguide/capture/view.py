@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -189,6 +190,7 @@ class Scene:
         digest: SHA-256 over the names and contents of all files that were read, as hexadecimal digits.
         warnings: about possible faults that do not prevent the use of the scene.
         objects: the objects that ``scene.json`` lists, if the ground truth of some view tells objects apart.
+        indices: refractive indices of the dielectrics that ``materials/`` names by numbers from 3 on.
     """
 
     root: Path
@@ -203,6 +205,7 @@ class Scene:
     digest: str
     warnings: tuple[str, ...]
     objects: tuple[SceneObject, ...] = ()
+    indices: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def train_views(self) -> tuple[View, ...]:

@@ -91,7 +91,13 @@ RECIPE_POLARGUIDE: Recipe = replace(
 )
 
 SHADING_STOKES = replace(
-    SHADING_3DGS_DR, blend="fresnel", local=True, local_rate=5e-3, first_strength=0.5, metal=True
+    SHADING_3DGS_DR,
+    blend="fresnel",
+    local=True,
+    local_rate=5e-3,
+    first_strength=0.5,
+    metal=True,
+    indices=True,
 )
 
 RECIPE_POLARGUIDE_STOKES: Recipe = replace(

@@ -25,6 +25,7 @@ from polarguide.shading.metal import (
     FIRST_ROUGHNESS,
     MINIMUM_SHARE,
     MetalPixels,
+    any_given,
     any_metal,
     metal_channels,
     metal_mips,
@@ -63,6 +64,9 @@ LOCAL_NOTE = (
 )
 
 
+INDEX_NOTE = "Surfaces of several refractive indices are drawn with one that reflects as much at 45 degrees."
+
+
 @dataclass(frozen=True)
 class DeferredShading(ShadingModel):
     """How base color and reflection make the picture.
@@ -80,6 +84,7 @@ class DeferredShading(ShadingModel):
         environment_rate: learning rate of the texels.
         environment_resolution: texels along a cube face's side.
         metal: whether Gaussians can be metals, see ``shading.metal``; with the blend "fresnel".
+        indices: whether Gaussians can have refractive indices of their own (never learned); with the blend "fresnel".
         metal_rate: learning rate of their reflectance and roughness.
     """
 
@@ -93,16 +98,20 @@ class DeferredShading(ShadingModel):
     environment_resolution: int = 128
     metal: bool = False
     metal_rate: float = 0.01
+    indices: bool = False
 
     stream: ClassVar[int] = 1
 
     def as_recorded(self, data: Mapping[str, Any]) -> ShadingModel:
-        """Without metals where there could be none."""
-        return self if data.get("metal", False) else replace(self, metal=False)
+        """Without metals and indices where there could be none."""
+        known = {name: getattr(self, name) and data.get(name, False) for name in ("metal", "indices")}
+        return replace(self, **known)
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """``strength_logits``; with ``local`` harmonics of the mirrored direction; with ``metal`` its three."""
+        """``strength_logits``; with ``local`` harmonics of the mirrored direction; with ``metal`` its three; with
+        ``indices`` what is added to the refractive index.
+        """
         minimum = float(torch.logit(torch.tensor(RESET_STRENGTH, dtype=torch.float64)))
         own = {
             "local_dc": Parameter((3,), self.local_rate),
@@ -117,6 +126,7 @@ class DeferredShading(ShadingModel):
             "strength_logits": Parameter((), self.strength_rate, minimum),
             **(own if self.local else {}),
             **(metals if self.metal else {}),
+            **({"index_offset": Parameter((), 0.0)} if self.indices else {}),
         }
 
     @property
@@ -172,22 +182,28 @@ class DeferredShading(ShadingModel):
         return LOCAL_NOTE if self.local else ""
 
     def contributions(
-        self, base: Tensor, strength: Tensor, light: Tensor, cosine: Tensor
+        self,
+        base: Tensor,
+        strength: Tensor,
+        light: Tensor,
+        cosine: Tensor,
+        index: float | Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Specular and diffuse contributions [..., 3].
 
         Args:
             base: [..., 3]. strength: [..., 1] in [0, 1]. light: [..., 3] from the mirrored direction.
             cosine: [..., 1] of the angle between the ray and the normal, in [0, 1].
+            index: refractive index, a number or [..., 1]; None: the run's.
         """
         if self.blend == "lerp":
             return strength * light, (1 - strength) * base
-        s, p = reflectances_from_cosine(cosine, self.refractive_index)
+        s, p = reflectances_from_cosine(cosine, self.refractive_index if index is None else index)
         return strength * (0.5 * (s + p)) * light, base
 
     def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
-        """Base color [N, 3], strength [N, 1], with ``local`` the Gaussians' own light [N, 3], and where some are metals
-        what these need [N, 5].
+        """Base color [N, 3], strength [N, 1], with ``local`` the Gaussians' own light [N, 3], where some are metals
+        what these need [N, 5], and where some have refractive indices of their own these less the run's [N, 1].
         """
         channels = [base_colors(gaussians, center, degree), self.strength(gaussians)[:, None]]
         if self.local:
@@ -196,7 +212,18 @@ class DeferredShading(ShadingModel):
         if self._has_metal(gaussians):
             body = 1 - gaussians["metalness"].detach()[:, None]
             channels = [channels[0] * body, channels[1] * body, *channels[2:], self._metals(gaussians)]
+        if self._has_indices(gaussians):
+            channels.append(gaussians["index_offset"].detach()[:, None])
         return channels
+
+    @property
+    def knows_indices(self) -> bool:
+        """With ``indices``."""
+        return self.indices
+
+    def _has_indices(self, gaussians: Parameters) -> bool:
+        """Whether one of the Gaussians has a refractive index of its own."""
+        return self.indices and any_given(gaussians["index_offset"])
 
     @property
     def knows_metals(self) -> bool:
@@ -234,15 +261,19 @@ class DeferredShading(ShadingModel):
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
         """``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], and ``strength`` [H, W].
 
-        With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``.
+        With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``. Where there are several refractive
+        indices, ``index`` [H, W].
         """
         features, texels = splatted.features, light["texels"]
         if splatted.metal is None and fits(features, texels):
-            return self._shade_native(features, texels, camera, held=False)
+            return self._shade_native(splatted, texels, camera, held=False)
         strength = features[..., 6]
         local = features[..., 7:10] if self.local else None
-        layers = reflect_reference(splatted.color, splatted.normal, strength, texels, camera, self, local)
-        return self._with_metals({**layers, "strength": strength}, splatted, texels, camera)
+        index = self._index_picture(splatted)
+        layers = reflect_reference(
+            splatted.color, splatted.normal, strength, texels, camera, self, local, index
+        )
+        return self._with_metals({**layers, "strength": strength, "index": index}, splatted, texels, camera)
 
     def shade_held(
         self, splatted: GBuffer, light: Light, camera: Camera
@@ -251,17 +282,17 @@ class DeferredShading(ShadingModel):
         texels = light["texels"]
         if not fits(splatted.features, texels):
             return super().shade_held(splatted, light, camera)
-        layers = self._shade_native(splatted.features, texels, camera, held=True)
+        layers = self._shade_native(splatted, texels, camera, held=True)
         return layers, (layers.pop("held specular"), layers.pop("held diffuse"), layers.get("metal"))
 
     def _with_metals(
-        self, layers: dict[str, Tensor], splatted: GBuffer, texels: Tensor, camera: Camera
+        self, layers: dict[str, Any], splatted: GBuffer, texels: Tensor, camera: Camera
     ) -> dict[str, Any]:
         """The layers of dielectrics with what metals add; as they are where the model knows no metals."""
         if not self.metal:
             return layers
         features, metal = splatted.features, splatted.metal
-        if metal is None and self._shows_metals(features):
+        if metal is None and self._shows_metals(splatted):
             rays = camera.world_rays(dtype=features.dtype, device=features.device)
             metal = metal_pixels(
                 features.flatten(0, 1),
@@ -279,15 +310,30 @@ class DeferredShading(ShadingModel):
         """The channel where those of metals begin, behind the ones of dielectrics."""
         return 10 if self.local else 7
 
-    def _shows_metals(self, features: Tensor) -> bool:
-        """Whether there are channels of metals; behind those of dielectrics may also be one of depth."""
-        return self.metal and features.shape[-1] >= self._first_of_metals + CHANNELS
+    def _more_channels(self, splatted: GBuffer) -> int:
+        """Channels behind those of dielectrics: none, five of metals, one of indices, or both; that of depth apart."""
+        return splatted.features.shape[-1] - splatted.depth - self._first_of_metals
+
+    def _shows_metals(self, splatted: GBuffer) -> bool:
+        """Whether there are channels of metals."""
+        return self.metal and self._more_channels(splatted) >= CHANNELS
+
+    def _index_channel(self, splatted: GBuffer) -> int:
+        """The channel of what is added to the refractive index; -1: there is none."""
+        more = self._more_channels(splatted)
+        return self._first_of_metals + more - 1 if self.indices and more in (1, CHANNELS + 1) else -1
+
+    def _index_picture(self, splatted: GBuffer) -> Tensor | None:
+        """Refractive indices [H, W]; None: the run's everywhere."""
+        channel = self._index_channel(splatted)
+        return None if channel < 0 else self.refractive_index + splatted.features[..., channel].detach()
 
     def _shade_native(
-        self, features: Tensor, texels: Tensor, camera: Camera, *, held: bool
+        self, splatted: GBuffer, texels: Tensor, camera: Camera, *, held: bool
     ) -> dict[str, Any]:
+        features = splatted.features
         pixels, metal, levels = features.flatten(0, 1), None, []
-        if self._shows_metals(features):
+        if self._shows_metals(splatted):
             first, local = self._first_of_metals, 7 if self.local else -1
             metal = MetalArguments(where_metal(pixels, first), first, local, MINIMUM_SHARE, BLUR)
             levels = metal_mips(self.radiance(texels))
@@ -298,6 +344,7 @@ class DeferredShading(ShadingModel):
             fresnel=self.blend == "fresnel",
             local=self.local,
             refractive_index=self.refractive_index,
+            index=self._index_channel(splatted),
             held=held,
             metal=metal,
             levels=levels,
@@ -312,7 +359,7 @@ class DeferredShading(ShadingModel):
         layers: dict[str, Any] = {
             name: layer.unflatten(0, features.shape[:2]) for name, layer in zip(names, found, strict=False)
         }
-        layers["strength"] = features[..., 6]
+        layers |= {"strength": features[..., 6], "index": self._index_picture(splatted)}
         if self.metal:
             shown = None if metal is None else MetalPixels(metal.pixels, *found[len(names) :])
             layers |= {"metalness": metalness_picture(shown, features), "metal": shown}
@@ -326,7 +373,9 @@ class DeferredShading(ShadingModel):
             seen = (seen + local_light(gaussians, directions, 3)).clamp(min=0)
         cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
         base, strength = harmonic_colors(gaussians, rays), self.strength(gaussians)[:, None]
-        specular, diffuse = self.contributions(base, strength, seen, cosine)
+        several = self._has_indices(gaussians)
+        index = self.refractive_index + gaussians["index_offset"][:, None] if several else None
+        specular, diffuse = self.contributions(base, strength, seen, cosine, index)
         if not self._has_metal(gaussians):
             return specular + diffuse
         metal = self._metals(gaussians)
@@ -342,19 +391,25 @@ class DeferredShading(ShadingModel):
         return colors * (1 - gaussians["metalness"][:, None]) if self._has_metal(gaussians) else colors
 
     def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """Linear harmonics of the base color, ``strength`` [N], and of metals ``metalness`` [N], ``reflectance`` [N, 3]
-        and ``roughness`` [N].
+        """Linear harmonics of the base color, ``strength`` [N], of metals ``metalness`` [N], ``reflectance`` [N, 3] and
+        ``roughness`` [N], and ``refractive_index`` [N].
         """
         own = {**super().fields(gaussians), "strength": self.strength(gaussians)}
         if self.metal:
             own["metalness"] = gaussians["metalness"]
             own["reflectance"] = reflectance(gaussians["reflectance_logits"])
             own["roughness"] = torch.sigmoid(gaussians["roughness_logits"])
+        if self._has_indices(gaussians):
+            own["refractive_index"] = self.refractive_index + gaussians["index_offset"]
         return own
 
     def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
         """Harmonics, strength and texels; where there is metal, also what that needs."""
         values = {**harmonic_values(gaussians), "share": self.strength(gaussians)}
+        notes = [self.local_note] if self.local else []
+        if self._has_indices(gaussians):
+            values["share"] = self._share_for_one_index(gaussians)
+            notes.append(INDEX_NOTE)
         if self.local:
             values |= {"own_color": gaussians["local_dc"], "own_harmonics": gaussians["local_rest"]}
         constants: dict[str, Any] = {"blend": self.blend, "index": self.refractive_index}
@@ -372,8 +427,16 @@ class DeferredShading(ShadingModel):
             values=values,
             light=texels,
             constants=constants,
-            notes=[self.local_note] if self.local else [],
+            notes=notes,
         )
+
+    def _share_for_one_index(self, gaussians: Parameters) -> Tensor:
+        """Strengths [N] with which surfaces of the run's index reflect as much at 45 degrees as those of their own."""
+        own, one = (
+            sum(reflectances_from_cosine(gaussians["index_offset"].new_tensor(0.5).sqrt(), index))
+            for index in (self.refractive_index + gaussians["index_offset"], self.refractive_index)
+        )
+        return (self.strength(gaussians) * own / one).clamp(max=1)
 
 
 def local_light(gaussians: Parameters, directions: Tensor, sh_degree: int) -> Tensor:
@@ -399,12 +462,14 @@ def reflect_reference(
     camera: Camera,
     shading: DeferredShading,
     local: Tensor | None = None,
+    index: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Deferred reflection per pixel: the reference implementation of ``reflect_native``, any dtype and device.
 
     Args:
         base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
         local: [H, W, 3] blended light of the Gaussians' own, added to the environment's.
+        index: [H, W] refractive index; None: the run's.
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
@@ -416,5 +481,6 @@ def reflect_reference(
     if local is not None:
         light = (light + local).clamp(min=0)
     cosine = -dot(rays, facing)[..., None].clamp(-1, 0)
-    specular, diffuse = shading.contributions(base, strength[..., None], light, cosine)
+    indices = None if index is None else index[..., None]
+    specular, diffuse = shading.contributions(base, strength[..., None], light, cosine, indices)
     return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": light}

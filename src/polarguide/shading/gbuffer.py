@@ -69,7 +69,7 @@ def render(
         still=NORMAL_CHANNELS if still and normals else (),
     )
     features, normal, camera_depth = split(picture.features, picture.alpha, normals=normals, depth=depth)
-    splatted = GBuffer(features, picture.alpha)
+    splatted = GBuffer(features, picture.alpha, depth=depth)
     if held and normals:
         layers, again = shading.shade_held(splatted, light, camera)
     else:
@@ -91,6 +91,7 @@ def render(
         held=again,
         still_normal=picture.still,
         metal=layers.get("metal"),
+        index=layers.get("index"),
         blended_normal=blended,
     )
 

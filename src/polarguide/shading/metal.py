@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -55,17 +55,22 @@ class MetalPixels(NamedTuple):
 
 
 def any_metal(metalness: Tensor) -> bool:
-    """Whether one Gaussian is a metal; False of a tensor without values. The device is asked once for each state of a
-    tensor: after a change of metals, and when Gaussians come or go.
+    """Whether one Gaussian is a metal; see ``any_given``."""
+    return any_given(metalness)
+
+
+def any_given(values: Tensor) -> bool:
+    """Whether a value of a tensor that is not trained is other than 0; False of a tensor without values. The device is
+    asked once for each state of a tensor: after a change of the values, and when Gaussians come or go.
     """
-    if metalness.is_meta:
+    if values.is_meta:
         return False
-    kept = _known.get(id(metalness))
-    if kept is not None and kept[0]() is metalness and kept[1] == metalness._version:
+    kept = _known.get(id(values))
+    if kept is not None and kept[0]() is values and kept[1] == values._version:
         return kept[2]
-    found = bool((metalness > 0).any())
-    key = id(metalness)
-    _known[key] = (weakref.ref(metalness, lambda _: _known.pop(key, None)), metalness._version, found)
+    found = bool((values != 0).any())
+    key = id(values)
+    _known[key] = (weakref.ref(values, lambda _: _known.pop(key, None)), values._version, found)
     return found
 
 
@@ -122,7 +127,7 @@ def metal_pixels(
     return MetalPixels(pixels, share.detach(), share[:, None] * mean * seen, slope)
 
 
-def with_metal(layers: Mapping[str, Tensor], metal: MetalPixels) -> dict[str, Tensor]:
+def with_metal(layers: Mapping[str, Any], metal: MetalPixels) -> dict[str, Any]:
     """Layers of a picture [H, W, 3] and what metals add to them."""
     return {**layers, **{name: add_metal(layers[name], metal) for name in ("final", "specular")}}
 
@@ -146,7 +151,7 @@ def metal_stokes(
     normal: Tensor,
     metal: MetalPixels,
     camera: Camera,
-    refractive_index: float,
+    refractive_index: float | Tensor,
 ) -> Tensor:
     """Stokes vectors [3, K, 3] of the pixels that show metal, from layers on the scale of S0/2.
 
@@ -154,6 +159,7 @@ def metal_stokes(
 
     Args:
         specular, diffuse, normal: [H, W, 3]. metal: with what it adds to ``specular``.
+        refractive_index: of the rest, a number or [K].
     """
     at = metal.pixels
     rays = camera.rays(device=normal.device).flatten(0, 1)[at]

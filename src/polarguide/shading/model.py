@@ -64,11 +64,13 @@ class GBuffer(NamedTuple):
             follow.
         alpha: [H, W].
         metal: what metals add to the picture, where that is known before; None: not yet.
+        depth: whether the last channel is the depth.
     """
 
     features: Tensor
     alpha: Tensor
     metal: MetalPixels | None = None
+    depth: bool = False
 
     @property
     def color(self) -> Tensor:
@@ -210,6 +212,11 @@ class ShadingModel(ABC):
         """Whether Gaussians can be metals; then ``become_metal`` makes them."""
         return False
 
+    @property
+    def knows_indices(self) -> bool:
+        """Whether Gaussians can have refractive indices of their own: ``index_offset``, what each adds to the run's."""
+        return False
+
     def become_metal(
         self,
         gaussians: Gaussians,
@@ -260,7 +267,7 @@ class ShadingModel(ABC):
         if "specular" not in layers:
             return layers, None
         parts = features[..., :3], features[..., 3:6].detach(), features[..., 6:]
-        held = GBuffer(torch.cat(parts, dim=-1), splatted.alpha, layers.get("metal"))
+        held = GBuffer(torch.cat(parts, dim=-1), splatted.alpha, layers.get("metal"), splatted.depth)
         again = self.shade(held, light, camera)
         return layers, (again["specular"], again["diffuse"], again.get("metal"))
 
@@ -284,12 +291,14 @@ class ShadingModel(ABC):
             2 * result.diffuse,
             camera.to_camera(normal),
             camera.rays(device=normal.device),
-            self.refractive_index,
+            self.refractive_index if result.index is None else result.index,
         )
         if result.metal is None:
             return stokes
-        layers, index = (result.specular, result.diffuse, normal), self.refractive_index
-        metal = metal_stokes(*layers, result.metal, camera, index)
+        index: float | Tensor = self.refractive_index
+        if result.index is not None:
+            index = result.index.flatten()[result.metal.pixels]
+        metal = metal_stokes(result.specular, result.diffuse, normal, result.metal, camera, index)
         return stokes.flatten(1, 2).index_copy(1, result.metal.pixels, metal).view_as(stokes)
 
     # What exports need

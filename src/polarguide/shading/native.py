@@ -43,6 +43,7 @@ class _Reflect(torch.autograd.Function):
         fresnel: bool,
         local: bool,
         ior: float,
+        index: int,
         held: bool,
         metal: MetalArguments | None,
         *levels: Tensor,
@@ -52,8 +53,8 @@ class _Reflect(torch.autograd.Function):
         layers = [torch.empty_like(rays) for _ in range(4)]
         _native.reflect_directions(features, rays, directions)
         _native.cubemap_forward(texels, directions, seen)
-        _native.reflect_layers(features, rays, seen, fresnel, local, ior, *layers)
-        ctx.model, ctx.metal = (fresnel, local, ior), metal
+        _native.reflect_layers(features, rays, seen, fresnel, local, ior, index, *layers)
+        ctx.model, ctx.metal = (fresnel, local, ior, index), metal
         ctx.set_materialize_grads(False)
         found: list[Tensor] = []
         kept: list[Tensor] = []
@@ -94,18 +95,18 @@ class _Reflect(torch.autograd.Function):
             _native.cubemap_backward(texels, directions, to_look_up, to_texels, None)
             _native.cubemap_backward(texels, directions, to_seen, None, to_directions)
         _native.reflect_backward_directions(features, rays, to_directions, to_features)
-        to_levels: Sequence[Tensor | None] = [None] * len(ctx.needs_input_grad[8:])
+        to_levels: Sequence[Tensor | None] = [None] * len(ctx.needs_input_grad[9:])
         if ctx.metal is not None:
             _, mirrored, level, light, *levels = kept
             to_light, by_layers = torch.empty_like(light), [*to_layers[:2], to_layers[4]]
             given = [features, rays, *ctx.metal, light, *by_layers, *by_metal, to_light, to_features]
             _native.metal_backward_layers(*given)
             to_mirrored, to_level, to_levels = mips_backward(
-                levels, mirrored, level, to_light, any(ctx.needs_input_grad[8:])
+                levels, mirrored, level, to_light, any(ctx.needs_input_grad[9:])
             )
             given = [features, rays, *ctx.metal, to_mirrored, to_level, to_features]
             _native.metal_backward_directions(*given)
-        return to_features, None, to_texels, None, None, None, None, None, *to_levels
+        return to_features, None, to_texels, None, None, None, None, None, None, *to_levels
 
 
 def reflect_native(
@@ -116,6 +117,7 @@ def reflect_native(
     fresnel: bool,
     local: bool,
     refractive_index: float,
+    index: int = -1,
     held: bool = False,
     metal: MetalArguments | None = None,
     levels: Sequence[Tensor] = (),
@@ -127,7 +129,8 @@ def reflect_native(
         rays: [P, 3] unit, world. texels: [6, R, R, 3] raw. All float32 on the CPU.
         fresnel: Fresnel's weight and exponential light in place of the lerp and the logistic function.
         local: whether channels 7 to 9 are light that is added to the environment's.
-        refractive_index: of Fresnel's weight.
+        refractive_index: of Fresnel's weight. index: the channel of what is added to it, without a gradient; -1: there
+            is none.
         held: also ``specular`` and ``diffuse`` once more, without a gradient on the normals but for that of metals.
         metal: where there is some; it is added to ``final`` and ``specular``. levels: of light that it mirrors.
 
@@ -141,7 +144,7 @@ def reflect_native(
         ValueError: if a shape is not as above.
     """
     layers: tuple[Tensor, ...] = _Reflect.apply(
-        features, rays, texels, fresnel, local, refractive_index, held, metal, *levels
+        features, rays, texels, fresnel, local, refractive_index, index, held, metal, *levels
     )
     return layers
 

@@ -52,6 +52,7 @@ class RenderResult:
         still_normal: the blended normal once more, with a gradient that turns Gaussians and neither moves nor fades
             them; None where not asked for.
         metal: what metals add to ``specular``; None where there is none.
+        index: [H, W] refractive index of each pixel, without a gradient; None: that of the run everywhere.
         blended_normal: the blended normal, where ``normal`` is that of the surface.
     """
 
@@ -69,6 +70,7 @@ class RenderResult:
     still_normal: Tensor | None = None
     metal: MetalPixels | None = None
     metalness: Tensor | None = None
+    index: Tensor | None = None
     blended_normal: Tensor | None = None
 
     @property
@@ -93,5 +95,7 @@ class RenderResult:
                     for new, old in zip((height, width), layer.shape[:2], strict=True)
                 )
                 found[name] = layer[rows][:, columns]
-        bare: dict[str, Any] = dict.fromkeys(("held", "still_normal", "radii", "metal", "blended_normal"))
+        bare: dict[str, Any] = dict.fromkeys(
+            ("held", "still_normal", "radii", "metal", "index", "blended_normal")
+        )
         return replace(self, **bare, **found)

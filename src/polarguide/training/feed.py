@@ -14,6 +14,7 @@ from polarguide.color import srgb_encode
 from polarguide.raster import Backend
 from polarguide.shading.gbuffer import render
 from polarguide.training.flat import Flat, flat_surfaces
+from polarguide.training.indices import index_picture
 from polarguide.training.metals.looks import metalness_share
 from polarguide.training.packing import (
     Entry,
@@ -135,7 +136,9 @@ class Feed:
         kept = self._store.get(self._unguided, view.name, make, disposable=True)
         known = Unguided(**{name: part.codes for name, part in kept.items()})
         flat = self._flat_surfaces().get(view.name)
-        return pack_priors(view_priors(view, guide, self._settings, self._index, known, metal, flat), fields)
+        own = index_picture(frozen, view.camera, self._backend.rasterize, self._index)
+        index = self._index if own is None else own
+        return pack_priors(view_priors(view, guide, self._settings, index, known, metal, flat), fields)
 
     def _flat_surfaces(self) -> dict[str, Flat]:
         """Flat surfaces of all views, found when the first priors are asked for."""

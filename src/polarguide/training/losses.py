@@ -300,7 +300,7 @@ def normal_terms(
         elif weights.stokes and shading.reflects:
             measured, index = priors.stokes[1:], shading.refractive_index
             factor = weights.stokes / measured.numel()
-            stokes = Polarization(measured, S1_AND_S2, priors.stokes_weight, factor, index)
+            stokes = Polarization(measured, S1_AND_S2, priors.stokes_weight, factor, index, result.index)
     if weights.consistency and camera is not None:
         factor = weights.consistency / ((result.alpha.shape[0] - 2) * (result.alpha.shape[1] - 2))
         consistency = Consistency(None if priors is None else priors.surface, factor)

@@ -29,7 +29,8 @@ class Polarization(NamedTuple):
         measured: [K, H, W, 3] on the scale of Stokes vectors.
         analyzers: K vectors a: ``S1_AND_S2``, or (1, cos 2t, sin 2t) / 2 of a polarizer at angle t.
         weight: [H, W].
-        factor: on the sum. refractive_index: of the surfaces, more than 1.
+        factor: on the sum. refractive_index: of the surfaces, more than 1. indices: [H, W] that of each pixel, in its
+            place; None: the same everywhere.
     """
 
     measured: Tensor
@@ -37,6 +38,7 @@ class Polarization(NamedTuple):
     weight: Tensor
     factor: float
     refractive_index: float
+    indices: Tensor | None = None
 
 
 class Directions(NamedTuple):
@@ -108,6 +110,7 @@ class _PixelTerms(torch.autograd.Function):
                 weight,
                 p.factor,
                 p.refractive_index,
+                None if p.indices is None else p.indices.reshape(-1).contiguous(),
                 to_normal,
                 to_specular,
                 to_diffuse,

@@ -172,7 +172,7 @@ def view_priors(
     view: View,
     normal: Tensor,
     settings: Priors,
-    refractive_index: float,
+    refractive_index: float | Tensor,
     known: Unguided | None = None,
     metal: Tensor | None = None,
     flat: Flat | None = None,
@@ -183,8 +183,8 @@ def view_priors(
         view: the capture; its pictures have to determine the Stokes vector.
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
-        refractive_index: of all surfaces.
-        known: ``unguided`` of the view, where it is at hand.
+        refractive_index: of all surfaces, or [H, W] of each pixel.
+        known: ``unguided`` of the view, where it is at hand; needed with the index of each pixel.
         metal: [H, W] share of metals: where there are some, what holds for dielectrics alone does not count. None: no
             metal.
         flat: a flat surface, whose normal takes the place of the guide's and of the color differences' where the guide
@@ -192,7 +192,10 @@ def view_priors(
     """
     view = view.to(normal.device)
     rays = view.camera.rays(device=normal.device)
-    usable, degree, *found = known or unguided(view, settings, refractive_index)
+    if known is None:
+        assert not isinstance(refractive_index, Tensor)
+        known = unguided(view, settings, refractive_index)
+    usable, degree, *found = known
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide, shown = guide_normals(view.camera.to_camera(normal), rays)
@@ -282,7 +285,7 @@ def _noise(view: View) -> Tensor | float:
 
 
 def _candidates(
-    kind: Candidates, luminance: Tensor, rays: Tensor, refractive_index: float
+    kind: Candidates, luminance: Tensor, rays: Tensor, refractive_index: float | Tensor
 ) -> optics.Candidates | optics.PhysicalCandidates | Tensor:
     """The candidate normals of a recipe, camera axes. luminance: [3, H, W]. rays: [H, W, 3]."""
     if kind == "physical":

@@ -26,6 +26,7 @@ from polarguide.shading.visibility import outward_directions, touched_pixels
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.behind import turned_behind
 from polarguide.training.distributed import ALONE, Ranks
+from polarguide.training.indices import index_offsets
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.search import MetalSearch
 from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
@@ -336,8 +337,19 @@ class Trainer:
         else:
             if self._metals.is_due(self.state.step / self._steps):
                 self._metals.look(self.state, self._views)
+            self._heed_indices()
             self.state.frozen = self.state.gaussians.snapshot()
             self._sizes.refresh_priors()
+
+    def _heed_indices(self) -> None:
+        """Give Gaussians the refractive indices that the user says objects have."""
+        indices = self.scene.indices
+        if not indices or not self.shading.knows_indices:
+            return
+        gaussians, rasterize = self.state.gaussians, self.backend.rasterize
+        offsets = index_offsets(gaussians, self._views, indices, self.settings.refractive_index, rasterize)
+        self.ranks.broadcast(offsets)
+        gaussians.overwrite("index_offset", offsets)
 
     def _refreshes(self) -> Iterator[float]:
         """Shares of the training's steps, search for angles apart, after which the priors are refreshed."""

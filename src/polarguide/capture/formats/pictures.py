@@ -24,7 +24,11 @@ LARGEST_PIXELS = 150_000_000
 _DECODED = 16
 """Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on."""
 
-MOST_MATERIAL = 2
+MOST_MATERIAL = 255
+MATERIAL_REMEDY = (
+    "Write the numbers 0 (unknown), 1 (dielectric) and 2 (metal) themselves, not levels of gray, and others only as "
+    "scene.json lists them under materials."
+)
 
 
 def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
@@ -122,19 +126,19 @@ def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_])
 
 
 def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
-    """Decode a picture of materials into [H, W]: 0 unknown, 1 dielectric, 2 metal.
+    """Decode a picture of materials into [H, W]: 0 unknown, 1 dielectric, 2 metal, from 3 on what ``scene.json`` says.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, of another kind, or has another value.
+        PolarguideError: the file is damaged, cut short, of another kind, or has a larger value than a byte holds.
     """
     pixels = decode_stored(path, data)
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
     if int(gray.max(initial=0)) > MOST_MATERIAL:
         raise PolarguideError(
             path,
-            expected="the numbers 0 (unknown), 1 (dielectric) and 2 (metal)",
+            expected=f"the numbers of materials, up to {MOST_MATERIAL}",
             found=f"{int(gray.max())}",
-            remedy="Write these numbers themselves, not levels of gray.",
+            remedy=MATERIAL_REMEDY,
         )
     return np.asarray(gray, np.uint8)
 

@@ -53,5 +53,5 @@ def contradicted(
 
 def _said_in(gaussians: Parameters, view: View, materials: Tensor, rasterize: Rasterize) -> Tensor:
     kinds = materials.to(gaussians["means"].device)
-    target = torch.stack((kinds == 1, kinds == 2), dim=-1).float()
+    target = torch.stack(((kinds == 1) | (kinds > 2), kinds == 2), dim=-1).float()
     return shares(gaussians, view, target, rasterize)

@@ -1,0 +1,180 @@
+"""Refractive indices of single Gaussians in the deferred shading model: what they change, and what they leave."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from instruction_sets import instruction_sets, selected
+from torch import Tensor
+from torch.testing import assert_close
+
+from polarguide import optics
+from polarguide.camera import Camera
+from polarguide.raster import rasterize_reference
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
+from polarguide.shading.gbuffer import render
+from polarguide.shading.result import RenderResult
+from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
+
+COUNT, RESOLUTION = 30, 8
+SHADING = DeferredShading("fresnel", local=True, metal=True, indices=True)
+WITHOUT = DeferredShading("fresnel", local=True, metal=True)
+TRAINED = ("strength_logits", "local_dc", "sh_dc", "quaternions", "opacity_logits")
+
+
+def camera() -> Camera:
+    eye, back = torch.eye(3, dtype=torch.float64), torch.tensor([0.1, -0.2, 4.0], dtype=torch.float64)
+    return Camera(24, 20, 30.0, 30.0, 12.0, 10.0, eye, back)
+
+
+def gaussians(
+    dtype: torch.dtype = torch.float32, *, metals: int = 0, others: int = COUNT // 2
+) -> dict[str, Tensor]:
+    """The last of them have other indices, from 1.33 to 1.9 where the run has 1.5."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    number = torch.arange(COUNT)
+    offsets = torch.linspace(-0.17, 0.4, COUNT, dtype=torch.float64).to(dtype)
+    return {
+        "means": 0.7 * normal(COUNT, 3),
+        "quaternions": normal(COUNT, 4),
+        "log_scales": -1.5 + 0.5 * normal(COUNT, 3),
+        "opacity_logits": 1 + normal(COUNT),
+        "sh_dc": normal(COUNT, 3),
+        "sh_rest": 0.1 * normal(COUNT, 15, 3),
+        "strength_logits": normal(COUNT),
+        "local_dc": 0.3 * normal(COUNT, 3),
+        "local_rest": 0.1 * normal(COUNT, 15, 3),
+        "metalness": (number < metals).to(dtype),
+        "reflectance_logits": normal(COUNT, 3),
+        "roughness_logits": normal(COUNT),
+        "index_offset": torch.where(number >= COUNT - others, offsets, torch.zeros_like(offsets)),
+    }
+
+
+def rendered(shading: DeferredShading, values: dict[str, Tensor], **options: bool) -> RenderResult:
+    dtype = values["means"].dtype
+    generator = torch.Generator().manual_seed(1)
+    texels = 0.1 * torch.randn(6, RESOLUTION, RESOLUTION, 3, generator=generator, dtype=torch.float64)
+    rasterize = rasterize_cpu if dtype == torch.float32 else rasterize_reference
+    return render(values, camera(), rasterize, shading=shading, light={"texels": texels.to(dtype)}, **options)
+
+
+@pytest.mark.parametrize("metals", [0, 10])
+def test_without_other_indices_every_bit_is_as_before(metals: int) -> None:
+    values = gaussians(metals=metals, others=0)
+    ours, before = rendered(SHADING, values, depth=True), rendered(WITHOUT, values, depth=True)
+    for name in (
+        "final",
+        "specular",
+        "diffuse",
+        "reflection",
+        "strength",
+        "normal",
+        "depth",
+        "alpha",
+        "metalness",
+    ):
+        assert torch.equal(getattr(ours, name), getattr(before, name))
+    assert ours.index is None
+    assert torch.equal(SHADING.predicted_stokes(ours, camera()), WITHOUT.predicted_stokes(before, camera()))
+
+
+@pytest.mark.parametrize("metals", [0, 10])
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("depth", [False, True])
+def test_the_native_pass_agrees_with_the_reference(metals: int, held: bool, depth: bool) -> None:
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        values = gaussians(dtype, metals=metals)
+        for name in TRAINED:
+            values[name].requires_grad_()
+        result = rendered(SHADING, values, held=held, depth=depth)
+        assert result.index is not None
+        assert not result.index.requires_grad
+        assert result.specular is not None
+        loss = (result.final * result.final).sum() + result.specular.sum()
+        if held:
+            assert result.held is not None
+            loss = loss + 2 * result.held[0].sum()
+        loss = loss + SHADING.predicted_stokes(result, camera()).square().sum()
+        loss.backward()
+        shown = [result.final, result.specular, result.index, loss]
+        found.append([t.detach().double() for t in (*shown, *(values[name].grad for name in TRAINED))])
+    for ours, exact in zip(*found, strict=True):
+        assert_close(ours, exact, rtol=5e-3, atol=5e-3)
+
+
+def test_the_index_of_a_pixel_is_that_of_what_it_shows() -> None:
+    values = gaussians(others=COUNT)
+    values["index_offset"].fill_(-0.17)
+    result = rendered(SHADING, values)
+    assert result.index is not None
+    assert_close(result.index, 1.5 - 0.17 * result.alpha)
+    # As bright as Fresnel's equations say: all that differs from the run's index is the reflectance.
+    before = rendered(WITHOUT, values)
+    assert before.specular is not None
+    assert result.specular is not None
+    assert before.normal is not None
+    cosine = (
+        -(camera().world_rays() * torch.nn.functional.normalize(before.normal, dim=-1)).sum(-1).clamp(-1, 0)
+    )
+    ours, theirs = (sum(optics.reflectances_from_cosine(cosine, index)) for index in (result.index, 1.5))
+    lit = (result.alpha > 0.1) & (before.specular.amin(dim=-1) > 1e-4)
+    assert int(lit.sum()) > 20
+    assert_close(result.specular[lit] / before.specular[lit], (ours / theirs)[lit][:, None].expand(-1, 3))
+
+
+@pytest.mark.parametrize("instructions", instruction_sets())
+@pytest.mark.parametrize("metals", [0, 10])
+def test_the_native_polarization_term_has_the_index_of_each_pixel(instructions: str, metals: int) -> None:
+    generator = torch.Generator().manual_seed(5)
+    measured = 0.3 * torch.randn(2, 20, 24, 3, generator=generator)
+    weight = torch.rand(20, 24, generator=generator)
+    found = []
+    for native in (True, False):
+        values = gaussians(metals=metals)
+        for name in TRAINED:
+            values[name].requires_grad_()
+        result = rendered(SHADING, values)
+        if native:
+            term = Polarization(measured, S1_AND_S2, weight, 0.7, 1.5, result.index)
+            with selected(instructions):
+                loss = pixel_terms(result, camera(), Terms(term, [], None))
+        else:
+            predicted = SHADING.predicted_stokes(result, camera())[1:]
+            loss = 0.7 * (weight[..., None] * (predicted - measured).abs()).sum()
+        loss.backward()
+        found.append([loss.detach(), *(values[name].grad for name in TRAINED)])
+    for ours, reference in zip(*found, strict=True):
+        assert_close(ours, reference, rtol=2e-3, atol=2e-3)
+
+
+def test_colors_attributes_and_the_page() -> None:
+    values = gaussians()
+    rays = torch.nn.functional.normalize(torch.tensor([[0.3, 0.1, 1.0]]), dim=-1).expand(COUNT, 3)
+    light = {"texels": torch.zeros(6, RESOLUTION, RESOLUTION, 3)}
+    ours, before = (shading.colors(values, light, rays, -rays) for shading in (SHADING, WITHOUT))
+    other = values["index_offset"] != 0
+    assert torch.equal(ours[~other], before[~other])
+    assert bool((ours[other] != before[other]).any(dim=1).all())
+    assert_close(SHADING.fields(values)["refractive_index"], 1.5 + values["index_offset"])
+    assert "refractive_index" not in SHADING.fields(gaussians(others=0))
+    page, plain = SHADING.page(values, light), WITHOUT.page(values, light)
+    assert page is not None
+    assert plain is not None
+    assert INDEX_NOTE in page.notes
+    assert_close(page.values["share"][~other], plain.values["share"][~other])
+    less, more = values["index_offset"] < 0, values["index_offset"] > 0
+    assert bool((page.values["share"][less] < plain.values["share"][less]).all())
+    assert bool((page.values["share"][more] >= plain.values["share"][more]).all())
+
+
+def test_runs_recorded_before_there_were_indices_have_none() -> None:
+    recorded = {name: value for name, value in SHADING.data().items() if name != "indices"}
+    assert SHADING.as_recorded(recorded) == WITHOUT
+    assert SHADING.as_recorded(SHADING.data()) == SHADING
