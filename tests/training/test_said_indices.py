@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import polarguide
 from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions
+from polarguide.progress import Reporter
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.runs.folder import CHECKPOINT
 from polarguide.runs.train import TrainingStopped
@@ -62,6 +64,7 @@ def test_a_scene_has_the_indices_of_its_materials(demo_scene: Path, tmp_path: Pa
             r"scene.json \(materials\): expected numbers from 3 to 255, found '2'",
         ),
         ({"water": {"refractive_index": 1.4}}, 1, "found 'water'"),
+        ({"03": {"refractive_index": 1.4}}, 1, "found '03'"),
         ({"3": {"refractive_index": 0.9}}, 3, "refractive_index"),
         ({"3": {}}, 3, "refractive_index"),
         ([1.33], 3, "materials"),
@@ -90,6 +93,57 @@ def test_gaussians_get_the_index_of_what_most_of_their_pixels_show(demo_scene: P
     assert float(picture[:, half + 2 :][covered[:, half + 2 :]].mean()) > 1.47
     assert index_picture(gaussians, one[0].camera, rasterize_cpu, 1.5) is None
     assert not bool(index_offsets(gaussians, scene.views[1:2], scene.indices, 1.5, rasterize_cpu).any())
+
+
+def test_many_materials_are_looked_at_in_turns(demo_scene: Path, tmp_path: Path) -> None:
+    run = polarguide.train(demo_scene, tmp_path / "run", settings=TrainSettings(2), reading=READING)
+    table = {str(number): {"refractive_index": 1.3 + 0.01 * number} for number in range(3, 50)}
+    scene = load_scene(said(demo_scene, tmp_path, table), downscale=4)
+    view = scene.views[0]
+    assert view.materials is not None
+    height, width = view.materials.shape
+    numbers = (torch.arange(height * width) // 4 % 47 + 3).view(height, width)
+    striped = replace(view, materials=numbers.to(torch.uint8))
+    found = index_offsets(run.gaussians, [striped], scene.indices, 1.5, rasterize_cpu)
+    alone = [
+        index_offsets(run.gaussians, [striped], {number: scene.indices[number]}, 1.5, rasterize_cpu)
+        for number in (3, 40)
+    ]
+    assert len(found.unique()) > 33
+    for number, one in zip((3, 40), alone, strict=True):
+        mine = (found - (scene.indices[number] - 1.5)).abs() < 1e-6
+        assert bool(mine.any())
+        assert torch.equal(found[mine], one[mine])
+    metals = {**run.gaussians, "metalness": torch.ones(len(found))}
+    assert not bool(index_offsets(metals, [striped], scene.indices, 1.5, rasterize_cpu).any())
+
+
+class Warned(Reporter):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def warn(self, message: str) -> None:
+        self.lines.append(message)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "left", "message"),
+    [
+        ("3dgs-dr", 3, "the recipe 3dgs-dr takes the run's for everything"),
+        ("polarguide-stokes:unpolarized", 3, "the recipe polarguide-stokes:unpolarized takes"),
+        ("polarguide-stokes", 1, "no picture in materials/ of a training view has one of their numbers"),
+        ("polarguide-stokes", 3, ""),
+    ],
+)
+def test_a_training_says_where_they_count_for_nothing(
+    demo_scene: Path, tmp_path: Path, recipe: str, left: int, message: str
+) -> None:
+    scene, reporter = said(demo_scene, tmp_path, left=left), Warned()
+    given = {"recipe": recipe, "settings": TrainSettings(2), "reading": READING, "reporter": reporter}
+    polarguide.train(scene, tmp_path / "run", **given)
+    warned = [line for line in reporter.lines if "refractive ind" in line]
+    assert len(warned) == bool(message)
+    assert message in "".join(warned)
 
 
 def test_a_training_heeds_them_and_goes_on_to_the_same_bits(demo_scene: Path, tmp_path: Path) -> None:

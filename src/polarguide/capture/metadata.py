@@ -141,8 +141,9 @@ def indices_of(path: Path, data: bytes | None) -> dict[int, float]:
         return {}
     remedy = 'Write {"materials": {"3": {"refractive_index": 1.33}}}, or remove materials.'
     table = decode(data, _Materials, path, remedy=remedy).materials
+    numbers = {str(number) for number in range(FIRST_LISTED, MOST_MATERIAL + 1)}
     for key in table:
-        if not (key.isascii() and key.isdigit() and FIRST_LISTED <= int(key) <= MOST_MATERIAL):
+        if key not in numbers:
             raise PolarguideError(
                 f"{path} (materials)",
                 expected=f"numbers from {FIRST_LISTED} to {MOST_MATERIAL}",

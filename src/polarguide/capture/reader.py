@@ -169,15 +169,13 @@ def load_scene(
 def _check_materials(layout: Layout, views: Iterable[ViewData], indices: Mapping[int, float]) -> None:
     """Refuse numbers of materials that nobody explains."""
     for view in views:
-        if view.materials is not None:
-            unknown = set(np.unique(view.materials).tolist()) - {0, 1, 2, *indices}
-            if unknown:
-                raise PolarguideError(
-                    layout.materials[view.name],
-                    expected=f"the numbers {', '.join(map(str, (0, 1, 2, *sorted(indices))))}",
-                    found=str(min(unknown)),
-                    remedy=MATERIAL_REMEDY,
-                )
+        if unknown := view.material_numbers - {0, 1, 2, *indices}:
+            raise PolarguideError(
+                layout.materials[view.name],
+                expected=f"the numbers {', '.join(map(str, (0, 1, 2, *sorted(indices))))}",
+                found=str(min(unknown)),
+                remedy=MATERIAL_REMEDY,
+            )
 
 
 def _held_out(

@@ -91,7 +91,7 @@ class SmallerViews(Sequence[View]):
 def smaller(scene: Scene, longest: int) -> Scene:
     """The training views averaged until none has a side longer than ``longest`` pixels, see ``SmallerView``.
 
-    Masks, materials and ground truth stay behind, and so do the views that are held out.
+    Masks and ground truth stay behind, and so do the views that are held out.
 
     Returns:
         The scene itself where its pictures are small enough.
@@ -114,4 +114,5 @@ def _made(view: SmallerView) -> View:
         view.saturated,
         exposures=view.exposures,
         mount=view.mount,
+        materials=view.materials,
     )

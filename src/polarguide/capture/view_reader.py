@@ -66,6 +66,7 @@ class ViewData:
 
     Attributes:
         name, codes, invalid, mask, materials, ground_truth, exposures: as in ``View``, with arrays instead of tensors.
+        material_numbers: that the picture of materials has as stored.
         size: width and height of the pictures as stored.
         peak: largest stored value over angles, channels and the pixels of a box, [H, W].
         black: whether some pixel of the box is 0 in all angles and channels, [H, W].
@@ -85,6 +86,7 @@ class ViewData:
     digests: dict[Path, str]
     exposures: tuple[Exposure, ...]
     materials: NDArray[np.uint8] | None = None
+    material_numbers: frozenset[int] = frozenset()
 
     def saturated(self, scale: int | None) -> NDArray[np.bool_]:
         """``View.saturated``, given the stored value at which the capture saturates (None: it does not)."""
@@ -151,6 +153,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         ground_truth=ground_truth,
         digests=files.digests,
         exposures=layout.exposures(name),
+        material_numbers=frozenset() if materials is None else frozenset(np.unique(materials).tolist()),
         materials=None
         if materials is None
         else boxes.agreed(materials.astype(np.int32), factor).astype(np.uint8),

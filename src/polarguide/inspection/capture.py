@@ -19,7 +19,7 @@ from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.pictures import decode_picture, read_file
 from polarguide.capture.layout import Layout, find_layout, select_views
-from polarguide.capture.metadata import applied_calibration, refractive_index_of
+from polarguide.capture.metadata import applied_calibration, indices_of, refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
 from polarguide.progress import SILENT, Reporter
@@ -131,6 +131,7 @@ def read_capture(
     factor = downscale or _fitting_factor(layout, names[0])
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())
+    indices_of(metadata, said)  # that it can be read
     return Capture(
         root=root,
         name=root.resolve().name,

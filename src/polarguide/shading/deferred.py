@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -407,12 +408,15 @@ class DeferredShading(ShadingModel):
         """Harmonics, strength and texels; where there is metal, also what that needs."""
         values = {**harmonic_values(gaussians), "share": self.strength(gaussians)}
         notes = [self.local_note] if self.local else []
+        drawn = self.refractive_index
         if self._has_indices(gaussians):
-            values["share"] = self._share_for_one_index(gaussians)
+            own = self.refractive_index + gaussians["index_offset"]
+            drawn = float(own.max())  # so that strengths become less, never more than 1
+            values["share"] = values["share"] * self._at_45_degrees(own) / self._at_45_degrees(drawn)
             notes.append(INDEX_NOTE)
         if self.local:
             values |= {"own_color": gaussians["local_dc"], "own_harmonics": gaussians["local_rest"]}
-        constants: dict[str, Any] = {"blend": self.blend, "index": self.refractive_index}
+        constants: dict[str, Any] = {"blend": self.blend, "index": drawn}
         texels = [light["texels"]]
         if self._has_metal(gaussians):
             if not self.local or self.blend != "fresnel":
@@ -430,13 +434,11 @@ class DeferredShading(ShadingModel):
             notes=notes,
         )
 
-    def _share_for_one_index(self, gaussians: Parameters) -> Tensor:
-        """Strengths [N] with which surfaces of the run's index reflect as much at 45 degrees as those of their own."""
-        own, one = (
-            sum(reflectances_from_cosine(gaussians["index_offset"].new_tensor(0.5).sqrt(), index))
-            for index in (self.refractive_index + gaussians["index_offset"], self.refractive_index)
-        )
-        return (self.strength(gaussians) * own / one).clamp(max=1)
+    @staticmethod
+    def _at_45_degrees(index: Tensor | float) -> Tensor:
+        """Twice the reflectance there."""
+        s, p = reflectances_from_cosine(torch.tensor(math.sqrt(0.5)), index)
+        return s + p
 
 
 def local_light(gaussians: Parameters, directions: Tensor, sh_degree: int) -> Tensor:

@@ -26,7 +26,7 @@ from polarguide.shading.visibility import outward_directions, touched_pixels
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.behind import turned_behind
 from polarguide.training.distributed import ALONE, Ranks
-from polarguide.training.indices import index_offsets
+from polarguide.training.indices import index_offsets, numbers_in
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.search import MetalSearch
 from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
@@ -99,6 +99,7 @@ class Trainer:
         self._set_up()
         self._metals = MetalSearch(scene, recipe, settings, self.shading, backend, ranks, warn)
         self._metals.warn_if_never(self._refreshes())
+        self._warn_of_indices(warn)
 
     def _set_up(self) -> None:
         """What depends on the pictures and the number of steps: those of the search for angles, or of the training."""
@@ -340,6 +341,19 @@ class Trainer:
             self._heed_indices()
             self.state.frozen = self.state.gaussians.snapshot()
             self._sizes.refresh_priors()
+
+    def _warn_of_indices(self, warn: Callable[[str], None]) -> None:
+        """Say where refractive indices of single things, which the scene lists, count for nothing."""
+        indices = self.scene.indices
+        if not indices:
+            return
+        if not self.shading.knows_indices or not any(True for _ in self._refreshes()):
+            why = f"the recipe {self.recipe.name} takes the run's for everything"
+        elif not any(numbers_in(view) & indices.keys() for view in self.scene.train_views):
+            why = "no picture in materials/ of a training view has one of their numbers"
+        else:
+            return
+        warn(f"the refractive indices that scene.json lists under materials are not used: {why}.")
 
     def _heed_indices(self) -> None:
         """Give Gaussians the refractive indices that the user says objects have."""

@@ -58,7 +58,7 @@ class MetalSearch:
 
         Nothing is said of recipes that never refresh their priors, such as controls: they look for no metal.
         """
-        if not self._on or all(view.materials is None for view in self._scene.train_views):
+        if not self._on or not any(_names_metals(view) for view in self._scene.train_views):
             return
         shares = list(refreshes)
         if shares and not any(map(self.is_due, shares)):
@@ -94,3 +94,8 @@ class MetalSearch:
         self._shading.become_metal(gaussians, state.light, metal > 0, reflectance, gain)
         del found
         return_freed_memory()
+
+
+def _names_metals(view: View) -> bool:
+    """Whether the user says of a view which of what it shows is a metal, or none."""
+    return view.materials is not None and bool(((view.materials == 1) | (view.materials == 2)).any())
