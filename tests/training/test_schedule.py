@@ -160,7 +160,12 @@ def test_every_recipe_is_named_described_and_trains_what_it_renders(recipe: Reci
     core = {"means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest"}
     assert core <= set(recipe.rates)
     assert all(set(stage.rate_factors) <= set(recipe.rates) for stage in recipe.stages)
-    assert set(recipe.learning_rates) == set(recipe.shapes) - {"outward", "surface", "metalness"}
+    assert set(recipe.learning_rates) == set(recipe.shapes) - {
+        "outward",
+        "surface",
+        "metalness",
+        "index_offset",
+    }
     assert recipe.shading.reflects == any(stage.reflection for stage in recipe.stages)
     assert recipe.shading.reflects == bool(recipe.light_rates)
     assert list(recipe.sh_fractions) == sorted(recipe.sh_fractions)
