@@ -164,7 +164,9 @@ def test_colors_attributes_and_the_page() -> None:
     assert bool((ours[other] != before[other]).any(dim=1).all())
     assert_close(SHADING.fields(values)["refractive_index"], 1.5 + values["index_offset"])
     assert "refractive_index" not in SHADING.fields(gaussians(others=0))
+    values["index_offset"].requires_grad_()  # as in a run that is opened
     page, plain = SHADING.page(values, light), WITHOUT.page(values, light)
+    values["index_offset"].requires_grad_(False)
     assert page is not None
     assert plain is not None
     assert INDEX_NOTE in page.notes

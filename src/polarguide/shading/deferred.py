@@ -410,7 +410,7 @@ class DeferredShading(ShadingModel):
         notes = [self.local_note] if self.local else []
         drawn = self.refractive_index
         if self._has_indices(gaussians):
-            own = self.refractive_index + gaussians["index_offset"]
+            own = self.refractive_index + gaussians["index_offset"].detach()
             drawn = float(own.max())  # so that strengths become less, never more than 1
             values["share"] = values["share"] * self._at_45_degrees(own) / self._at_45_degrees(drawn)
             notes.append(INDEX_NOTE)
