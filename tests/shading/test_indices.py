@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pytest
+import shaded_gaussians
 import torch
 from instruction_sets import instruction_sets, selected
+from shaded_gaussians import COUNT, camera
 from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
@@ -17,43 +18,19 @@ from polarguide.shading.gbuffer import render
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
 
-COUNT, RESOLUTION = 30, 8
+RESOLUTION = 8
 SHADING = DeferredShading("fresnel", local=True, metal=True, indices=True)
 WITHOUT = DeferredShading("fresnel", local=True, metal=True)
 TRAINED = ("strength_logits", "local_dc", "sh_dc", "quaternions", "opacity_logits")
-
-
-def camera() -> Camera:
-    eye, back = torch.eye(3, dtype=torch.float64), torch.tensor([0.1, -0.2, 4.0], dtype=torch.float64)
-    return Camera(24, 20, 30.0, 30.0, 12.0, 10.0, eye, back)
 
 
 def gaussians(
     dtype: torch.dtype = torch.float32, *, metals: int = 0, others: int = COUNT // 2
 ) -> dict[str, Tensor]:
     """The last of them have other indices, from 1.33 to 1.9 where the run has 1.5."""
-    generator = torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
-
-    number = torch.arange(COUNT)
     offsets = torch.linspace(-0.17, 0.4, COUNT, dtype=torch.float64).to(dtype)
-    return {
-        "means": 0.7 * normal(COUNT, 3),
-        "quaternions": normal(COUNT, 4),
-        "log_scales": -1.5 + 0.5 * normal(COUNT, 3),
-        "opacity_logits": 1 + normal(COUNT),
-        "sh_dc": normal(COUNT, 3),
-        "sh_rest": 0.1 * normal(COUNT, 15, 3),
-        "strength_logits": normal(COUNT),
-        "local_dc": 0.3 * normal(COUNT, 3),
-        "local_rest": 0.1 * normal(COUNT, 15, 3),
-        "metalness": (number < metals).to(dtype),
-        "reflectance_logits": normal(COUNT, 3),
-        "roughness_logits": normal(COUNT),
-        "index_offset": torch.where(number >= COUNT - others, offsets, torch.zeros_like(offsets)),
-    }
+    offsets[: COUNT - others] = 0
+    return {**shaded_gaussians.gaussians(dtype, metals=metals), "index_offset": offsets}
 
 
 def rendered(shading: DeferredShading, values: dict[str, Tensor], **options: bool) -> RenderResult:

@@ -10,10 +10,10 @@ import pytest
 import torch
 from instruction_sets import instruction_sets, selected
 from random_runs import random_state
+from shaded_gaussians import COUNT, camera, gaussians
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
@@ -29,36 +29,9 @@ from polarguide.shading.model import mirrored
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
 
-COUNT, RESOLUTION = 30, 8
+RESOLUTION = 8
 WITHOUT = DeferredShading("fresnel", local=True)
 SHADING = DeferredShading("fresnel", local=True, metal=True)
-
-
-def camera() -> Camera:
-    eye, back = torch.eye(3, dtype=torch.float64), torch.tensor([0.1, -0.2, 4.0], dtype=torch.float64)
-    return Camera(24, 20, 30.0, 30.0, 12.0, 10.0, eye, back)
-
-
-def gaussians(dtype: torch.dtype = torch.float32, *, metals: int = COUNT // 2) -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
-
-    return {
-        "means": 0.7 * normal(COUNT, 3),
-        "quaternions": normal(COUNT, 4),
-        "log_scales": -1.5 + 0.5 * normal(COUNT, 3),
-        "opacity_logits": 1 + normal(COUNT),
-        "sh_dc": normal(COUNT, 3),
-        "sh_rest": 0.1 * normal(COUNT, 15, 3),
-        "strength_logits": normal(COUNT),
-        "local_dc": 0.3 * normal(COUNT, 3),
-        "local_rest": 0.1 * normal(COUNT, 15, 3),
-        "metalness": (torch.arange(COUNT) < metals).to(dtype),
-        "reflectance_logits": normal(COUNT, 3),
-        "roughness_logits": normal(COUNT),
-    }
 
 
 def light(dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:

@@ -17,11 +17,16 @@ from polarguide.capture import load_scene
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions
 from polarguide.progress import Reporter
+from polarguide.raster import choose_backend
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CHECKPOINT
 from polarguide.runs.train import TrainingStopped
+from polarguide.training.feed import Feed
 from polarguide.training.indices import index_offsets, index_picture
+from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
+from polarguide.training.view_store import ViewStore
 
 READING = SceneOptions(downscale=4)
 TABLE = {"3": {"refractive_index": 1.33, "name": "water"}, "4": {"refractive_index": 1.8}}
@@ -116,6 +121,24 @@ def test_many_materials_are_looked_at_in_turns(demo_scene: Path, tmp_path: Path)
         assert torch.equal(found[mine], one[mine])
     metals = {**run.gaussians, "metalness": torch.ones(len(found))}
     assert not bool(index_offsets(metals, [striped], scene.indices, 1.5, rasterize_cpu).any())
+
+
+def test_what_was_measured_is_separated_with_the_index_of_each_pixel(
+    demo_scene: Path, tmp_path: Path
+) -> None:
+    run = polarguide.train(demo_scene, tmp_path / "run", settings=TrainSettings(60), reading=READING)
+    view, recipe = run.scene.train_views[0], RECIPES["polarguide-stokes"]
+    assert isinstance(recipe, Recipe)
+    stage = next(stage for stage in recipe.stages if stage.weights.priors)
+    gaussians = {name: values.detach() for name, values in run.gaussians.items()}
+
+    def separated(index: float, offset: float) -> torch.Tensor:
+        feed = Feed(choose_backend("cpu"), recipe.priors, index, ViewStore(), [view], black=False)
+        own = {**gaussians, "index_offset": torch.full_like(gaussians["index_offset"], offset)}
+        return feed.priors(view, stage, own).diffuse[run.result(view.name).alpha > 0.99]
+
+    as_said, as_of_all, other = separated(1.5, -0.17), separated(1.33, 0.0), separated(1.5, 0.0)
+    assert float((as_said - as_of_all).abs().mean()) < 0.05 * float((as_said - other).abs().mean())
 
 
 class Warned(Reporter):

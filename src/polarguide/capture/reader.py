@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unused_poses
 from polarguide.capture.exposures import FOUR
-from polarguide.capture.formats.pictures import MATERIAL_REMEDY, TRANSFERS
+from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.memory import check_memory, stated_size
 from polarguide.capture.metadata import held_out, indices_of, mount_of, refractive_index_of
@@ -27,7 +27,7 @@ from polarguide.capture.split import chosen_views, far_from_training, held_out_b
 from polarguide.capture.stored_view import StoredView, ViewFiles
 from polarguide.capture.unseen_points import unseen_points
 from polarguide.capture.view import GroundTruth, Scene, listed
-from polarguide.capture.view_reader import Files, ViewData, read_view
+from polarguide.capture.view_reader import Files, ViewData, check_materials, read_view
 from polarguide.errors import PolarguideError
 from polarguide.options import Split, check_choice
 from polarguide.progress import SILENT, Reporter
@@ -137,7 +137,7 @@ def load_scene(
         for item, camera in zip(stored.data, stored.cameras, strict=True)
         if camera is not None
     )
-    _check_materials(layout, stored.data, indices)
+    check_materials(layout, stored.data, indices)
     told_apart = any(item.ground_truth and item.ground_truth.object_ids is not None for item in stored.data)
     warnings = [
         *layout.warnings,
@@ -164,18 +164,6 @@ def load_scene(
         objects=objects_of(root / "scene.json", about) if told_apart else (),
         indices=indices,
     )
-
-
-def _check_materials(layout: Layout, views: Iterable[ViewData], indices: Mapping[int, float]) -> None:
-    """Refuse numbers of materials that nobody explains."""
-    for view in views:
-        if unknown := view.material_numbers - {0, 1, 2, *indices}:
-            raise PolarguideError(
-                layout.materials[view.name],
-                expected=f"the numbers {', '.join(map(str, (0, 1, 2, *sorted(indices))))}",
-                found=str(min(unknown)),
-                remedy=MATERIAL_REMEDY,
-            )
 
 
 def _held_out(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from polarguide.capture.exposures import Exposure
 from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import (
+    MATERIAL_REMEDY,
     decode_mask,
     decode_materials,
     decode_picture,
@@ -158,6 +159,22 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         if materials is None
         else boxes.agreed(materials.astype(np.int32), factor).astype(np.uint8),
     )
+
+
+def check_materials(layout: Layout, views: Iterable[ViewData], indices: Mapping[int, float]) -> None:
+    """Refuse numbers of materials that nobody explains.
+
+    Raises:
+        PolarguideError: a picture has one that ``indices`` have not.
+    """
+    for view in views:
+        if unknown := view.material_numbers - {0, 1, 2, *indices}:
+            raise PolarguideError(
+                layout.materials[view.name],
+                expected=f"the numbers {', '.join(map(str, (0, 1, 2, *sorted(indices))))}",
+                found=str(min(unknown)),
+                remedy=MATERIAL_REMEDY,
+            )
 
 
 def read_codes(

@@ -46,7 +46,7 @@ def index_offsets(
             here = [number for number in numbers if number in said[view.name]]
             target = torch.stack(((kinds == 1) | (kinds == 2), *(kinds == k for k in here)), dim=-1).float()
             columns = [0, *(1 + numbers.index(number) for number in here)]
-            for some, part in zip(batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
+            for some, part in zip(_batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
                 weights[:, some] += shares(gaussians, view, part.contiguous(), rasterize)
     offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
     most, chosen = weights.max(dim=1)
@@ -60,7 +60,7 @@ def numbers_in(view: View) -> set[int]:
     return set() if view.materials is None else set(view.materials.unique().tolist()) - {0, 1, 2}
 
 
-def batched(columns: list[int]) -> list[list[int]]:
+def _batched(columns: list[int]) -> list[list[int]]:
     """So many at a time as a rasterizer takes channels."""
     return [columns[k : k + MAX_CHANNELS] for k in range(0, len(columns), MAX_CHANNELS)]
 
