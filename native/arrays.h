@@ -26,6 +26,14 @@ inline void expect_shape(const Array &array, const char *name, std::initializer_
     throw std::invalid_argument(std::string(name) + ": expected shape [" + wanted + "], found [" + found + "]");
 }
 
+// The texels along an edge of a cubemap [6,R,R,C]; raises ValueError unless it is one.
+inline int64_t cubemap_side(const Array &texture) {
+    const int64_t side = texture.ndim() == 4 ? int64_t(texture.shape(1)) : 0;
+    expect_shape(texture, "texture", {6, side, side, texture.ndim() == 4 ? int64_t(texture.shape(3)) : 0});
+    if (side < 1 || side > 16384) throw std::invalid_argument("texture: expected 1 to 16384 texels along an edge");
+    return side;
+}
+
 // Raises ValueError unless the indices ascend within [0, count).
 inline void expect_ascending(const Indices &indices, const char *name, int64_t count) {
     int64_t least = 0;

@@ -72,13 +72,9 @@ std::tuple<double, double> photometric(const Array &prediction, const Array &tar
 }
 
 CubemapArgs cubemap_args(const Array &texture, const Array &directions) {
-    const int64_t side = texture.ndim() == 4 ? int64_t(texture.shape(1)) : 0;
-    const int64_t channels = texture.ndim() == 4 ? int64_t(texture.shape(3)) : 0;
-    expect_shape(texture, "texture", {6, side, side, channels});
-    if (side < 1 || side > 16384) throw std::invalid_argument("texture: expected 1 to 16384 texels along an edge");
     expect_shape(directions, "directions", {rows(directions), 3});
     CubemapArgs a{};
-    a.resolution = int(side), a.channels = int(channels);
+    a.resolution = int(cubemap_side(texture)), a.channels = int(texture.shape(3));
     a.texture = texture.data(), a.directions = directions.data();
     return a;
 }

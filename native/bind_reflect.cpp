@@ -3,9 +3,11 @@
 #include "parallel.h"
 
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/vector.h>
 
 #include <optional>
 #include <stdexcept>
+#include <vector>
 
 namespace nb = nanobind;
 using namespace polarguide;
@@ -43,7 +45,7 @@ GBufferArgs gbuffer_args(const Array &alpha, int64_t channels) {
     return a;
 }
 
-const float *optional_rows(const MaybeArray &array, const char *name, int64_t n) {
+float *optional_rows(const MaybeArray &array, const char *name, int64_t n) {
     if (!array) return nullptr;
     expect_shape(*array, name, {n, 3});
     return array->data();
@@ -134,30 +136,50 @@ void bind_metal(nb::module_ &module) {
 void bind_reflect(nb::module_ &module) {
     bind_metal(module);
     module.def(
-        "reflect_directions",
-        [](const Array &features, const Array &rays, Array directions) {
-            ReflectArgs a = reflect_args(features, rays, false, false, 1.5f, -1);
-            const int64_t n = int64_t(rays.shape(0));
-            expect_shape(directions, "directions", {n, 3});
-            a.directions = directions.data();
-            run(POLARGUIDE_DISPATCH(reflect_directions), a, n);
+        "turn",
+        [](const Array &directions, const std::vector<float> &rotation, Array out) {
+            const int64_t n = directions.ndim() == 2 ? int64_t(directions.shape(0)) : 0;
+            expect_shape(directions, "directions", {n, 3}), expect_shape(out, "out", {n, 3});
+            if (rotation.size() != 9) throw std::invalid_argument("rotation: expected 9 numbers");
+            run(POLARGUIDE_DISPATCH(turn), TurnArgs{rotation.data(), directions.data(), out.data()}, n);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("directions"), "Rays mirrored at the blended normals.");
+        nb::arg("directions"), nb::arg("rotation"), nb::arg("out"), "Rows times a rotation.");
     module.def(
-        "reflect_layers",
-        [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,
-           int index, Array final_picture, Array specular, Array diffuse, Array reflection) {
+        "reflect_forward",
+        [](const Array &features, const Array &rays, const Array &texture, bool fresnel, bool local, float refractive_index,
+           int index, MaybeArray directions, MaybeArray seen, Array final_picture, Array specular, Array diffuse, Array reflection) {
             ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index, index);
-            const int64_t n = int64_t(rays.shape(0));
-            expect_shape(seen, "seen", {n, 3}), expect_shape(final_picture, "final", {n, 3});
-            expect_shape(specular, "specular", {n, 3}), expect_shape(diffuse, "diffuse", {n, 3});
-            expect_shape(reflection, "reflection", {n, 3});
-            a.seen = seen.data(), a.final_picture = final_picture.data(), a.specular = specular.data();
-            a.diffuse = diffuse.data(), a.reflection = reflection.data();
-            run(POLARGUIDE_DISPATCH(reflect_layers), a, n);
+            const int64_t n = int64_t(rays.shape(0)), side = cubemap_side(texture);
+            expect_shape(texture, "texture", {6, side, side, 3});
+            expect_shape(final_picture, "final", {n, 3}), expect_shape(specular, "specular", {n, 3});
+            expect_shape(diffuse, "diffuse", {n, 3}), expect_shape(reflection, "reflection", {n, 3});
+            float *all_directions = optional_rows(directions, "directions", n), *all_seen = optional_rows(seen, "seen", n);
+            CubemapArgs look{};
+            look.resolution = int(side), look.channels = 3, look.texture = texture.data();
+            nb::gil_scoped_release release;
+            // A piece at a time goes through all three, so that what one leaves the next finds near.
+            std::vector<float> own(size_t(thread_count()) * 6 * item_chunk);
+            auto body = [&](int64_t b, int64_t e, int worker) {
+                float *spare = own.data() + int64_t(worker) * 6 * item_chunk;
+                ReflectArgs part = a;
+                part.features += b * a.channels, part.rays += 3 * b;
+                part.directions = all_directions ? all_directions + 3 * b : spare;
+                POLARGUIDE_DISPATCH(reflect_directions)(part, 0, e - b);
+                CubemapArgs here = look;
+                here.directions = part.directions;
+                here.out = all_seen ? all_seen + 3 * b : spare + 3 * item_chunk;
+                POLARGUIDE_DISPATCH(cubemap_forward)(here, 0, e - b);
+                part.seen = here.out;
+                part.final_picture = final_picture.data() + 3 * b, part.specular = specular.data() + 3 * b;
+                part.diffuse = diffuse.data() + 3 * b, part.reflection = reflection.data() + 3 * b;
+                POLARGUIDE_DISPATCH(reflect_layers)(part, 0, e - b);
+            };
+            parallel_chunks(n, item_chunk, body);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("seen"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"), nb::arg("index"),
-        nb::arg("final"), nb::arg("specular"), nb::arg("diffuse"), nb::arg("reflection"), "The layers of the picture.");
+        nb::arg("features"), nb::arg("rays"), nb::arg("texture"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
+        nb::arg("index"), nb::arg("directions").none(), nb::arg("seen").none(), nb::arg("final"), nb::arg("specular"),
+        nb::arg("diffuse"), nb::arg("reflection"),
+        "The layers of the picture; fills mirrored rays, and what the look-up gave, where they are not None.");
     module.def(
         "reflect_backward_layers",
         [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,

@@ -82,6 +82,13 @@ POLARGUIDE_DECLARE(void axes_forward(const AxesArgs &a, int64_t begin, int64_t e
 POLARGUIDE_DECLARE(void axes_backward(const AxesArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void mirrored_forward(const AxesArgs &a, int64_t begin, int64_t end))
 
+// Directions from one set of axes into another: rows times the rotation.
+struct TurnArgs {
+    const float *rotation, *directions; // [9] row-major, [P,3]
+    float *out;                         // [P,3]
+};
+POLARGUIDE_DECLARE(void turn(const TurnArgs &a, int64_t begin, int64_t end))
+
 // Deferred reflection per pixel. Features are base color, normal, strength and, with `local`, three of light; others
 // may follow. `seen` is what the look-up of `directions` gave.
 struct ReflectArgs {

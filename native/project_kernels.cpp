@@ -12,8 +12,11 @@ constexpr float blur = 0.1f; // px^2, added to the projected covariance
 constexpr float natural = 0.693147181f;
 constexpr float minimum_opacity = 1.0f / 255.0f;
 
-alignas(64) const float lane_tile[16] = {0, 16, 32, 48, 64, 80, 96, 112, 128, 144, 160, 176, 192, 208, 224, 240};
-static_assert(tile_size == 16, "lane_tile says where the next tiles begin");
+// A Gaussian's tiles are looked at in groups, four side by side and as many rows of them as fill a register.
+constexpr int group_columns = 4, group_rows = reg_lanes / group_columns;
+alignas(64) const float lane_column[16] = {0, 16, 32, 48, 0, 16, 32, 48, 0, 16, 32, 48, 0, 16, 32, 48};
+alignas(64) const float lane_row[16] = {0, 0, 0, 0, 16, 16, 16, 16, 32, 32, 32, 32, 48, 48, 48, 48};
+static_assert(tile_size == 16, "lane_column and lane_row say where a group's tiles begin");
 
 // All that the forward and the backward projection share, of as many Gaussians as a register has lanes. What a culled
 // one's lane holds has no meaning.
@@ -144,17 +147,23 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
         int32_t *out = args.tiles + args.offset[g], n = 0;
         const float *s = args.screen + g * screen_values;
         const float to_y = -0.5f * s[3] / s[4], to_x = -0.5f * s[3] / s[2];
-        for (int ty = box[2]; ty < box[3]; ++ty) {
+        for (int ty = box[2]; ty < box[3]; ty += group_rows) {
             // The largest exponent over a tile's pixel centers: on one of the two sides facing the center.
-            const reg y0 = reg_splat(float(ty * tile_size) + 0.5f - s[1]), y1 = y0 + side, cy = clamp(reg{}, y0, y1);
-            for (int tx = box[0]; tx < box[1]; tx += reg_lanes) {
-                const reg x0 = reg_load(lane_tile) + (float(tx * tile_size) + 0.5f - s[0]), x1 = x0 + side;
+            const reg y0 = reg_load(lane_row) + (float(ty * tile_size) + 0.5f - s[1]), y1 = y0 + side;
+            const reg cy = clamp(reg{}, y0, y1);
+            const int rows = box[3] - ty < group_rows ? box[3] - ty : group_rows;
+            for (int tx = box[0]; tx < box[1]; tx += group_columns) {
+                const reg x0 = reg_load(lane_column) + (float(tx * tile_size) + 0.5f - s[0]), x1 = x0 + side;
                 const reg cx = clamp(reg{}, x0, x1), ey = clamp(cx * to_y, y0, y1), ex = clamp(cy * to_x, x0, x1);
                 const reg q1 = s[2] * cx * cx + s[3] * cx * ey + s[4] * ey * ey;
                 const reg q2 = s[2] * ex * ex + s[3] * ex * cy + s[4] * cy * cy;
-                uint32_t touched = bits(max(q1, q2) + s[5] >= -7.9945f);
-                if (box[1] - tx < reg_lanes) touched &= (1u << (box[1] - tx)) - 1;
-                for (; touched; touched &= touched - 1) out[n++] = ty * args.tiles_x + tx + __builtin_ctz(touched);
+                uint32_t touched = bits(at_least(max(q1, q2) + s[5], reg_splat(-7.9945f)));
+                if (box[1] - tx < group_columns) touched &= ((1u << (box[1] - tx)) - 1) * 0x1111u;
+                touched &= (1u << rows * group_columns) - 1;
+                for (; touched; touched &= touched - 1) {
+                    const int lane = __builtin_ctz(touched);
+                    out[n++] = (ty + lane / group_columns) * args.tiles_x + tx + lane % group_columns;
+                }
             }
         }
         args.touched[g] = n;

@@ -49,16 +49,17 @@ struct RasterArgs {
     const float *screen;            // [N,6]
     const float *features;          // [N, channels_real]
     const int32_t *permutation;     // [channels_real] statistic channels first
+    bool in_order;                  // it leaves every channel where it is
     const int64_t *tile_begin;      // [tiles + 1]
     const int32_t *gaussians;       // [instances] by tile, in depth order
-    const int64_t *instances;       // [instances] row in the instance gradient buffer
+    const int64_t *instances;       // [instances] row in the instance gradient buffer; as the following two
     // What the forward pass gathered, and the backward pass then reads; null: for this picture there is none.
     float *rows;                    // [instances, channels + 6] by tile: x, y relative to its center, A, B, C, L, features
     uint16_t *blocks;               // [instances] one bit for each of the tile's blocks that the Gaussian touches
     // Forward, out
     float *out;                     // [H,W,channels_real]
     float *alpha;                   // [H,W]
-    float *transmittance;           // [H,W]
+    float *transmittance;           // [H,W], for the backward pass; null: for this picture there is none
     int64_t *pairs;                 // optional [tiles]: contributing pixel-Gaussian pairs
     float surface_width;            // of what is blended around the median depth, in shares of that
     // Backward, in (out and transmittance are read)

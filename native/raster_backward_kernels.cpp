@@ -147,9 +147,7 @@ POLARGUIDE_INLINE void backward_block(const RasterArgs &a, const Tile &t, int co
         for (int p = 0; p < parts; ++p) {
             const int l = p * reg_lanes;
             const Alpha at = alpha_at(row, pixels[p]);
-            const reg next = live[p] - live[p] * at.value;
-            const ireg go = next >= minimum_transmittance;
-            const reg weight = go ? live[p] * at.value : reg{};
+            const Blended next = blended(live[p], at.value);
             reg dot = {}, dot_statistic = {};
             if (S == statistic_any)
                 for (int k = 0; k < a.statistic_channels; ++k) dot_statistic += row[6 + k] * reg_load(gradients.g[k] + l);
@@ -158,18 +156,18 @@ POLARGUIDE_INLINE void backward_block(const RasterArgs &a, const Tile &t, int co
                 dot += row[6 + k] * reg_load(gradients.g[k] + l);
             }
             if (D == S) dot_statistic = dot;
-            remaining[p] -= weight * dot;
+            remaining[p] -= next.weight * dot;
             const reg inverse = reciprocal(1.0f - at.value);
-            const reg factor = go & ~at.capped ? at.value : reg{};
-            reg_store(batch.weight[batch.size] + l, weight);
+            const reg factor = where(lane_mask(next.go & at.free), at.value);
+            reg_store(batch.weight[batch.size] + l, next.weight);
             reg_store(batch.value[batch.size] + l, (live[p] * dot - remaining[p] * inverse) * factor);
             if (S) {
-                remaining_statistic[p] -= weight * dot_statistic;
+                remaining_statistic[p] -= next.weight * dot_statistic;
                 reg_store(batch.statistic[batch.size] + l,
                           (live[p] * dot_statistic - remaining_statistic[p] * inverse) * factor);
             }
-            live[p] = next; // never rises again where a pixel has ended
-            going |= any(go);
+            live[p] = next.live;
+            going |= any(next.go);
         }
         batch.local[batch.size++] = s.list[i];
         if (batch.size == 16) flush<D, S != 0>(batch, gradients, b.center_x, b.center_y, s.moments);

@@ -5,9 +5,26 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
+// Channels and transmittance of a block's pixels, to where they lie in the picture.
+template <int D> POLARGUIDE_INLINE void write_block(const RasterArgs &a, const Block &b, const float (*values)[16]) {
+    const int real = a.channels_real;
+    const int rows = a.height - b.y < 4 ? a.height - b.y : 4, columns = a.width - b.x < 4 ? a.width - b.x : 4;
+    for (int j = 0; j < rows; ++j) {
+        const int64_t first = int64_t(b.y + j) * a.width + b.x;
+        for (int i = 0; i < columns; ++i) {
+            float *out = a.out + (first + i) * real;
+            if (in_order<D>(a))
+                for (int k = 0; k < D; ++k) out[k] = values[k][4 * j + i];
+            else
+                for (int k = 0; k < real; ++k) out[a.permutation[k]] = values[k][4 * j + i];
+            a.alpha[first + i] = 1.0f - values[D][4 * j + i];
+        }
+        if (a.transmittance) __builtin_memcpy(a.transmittance + first, values[D] + 4 * j, sizeof(float) * columns);
+    }
+}
+
 template <int D> void forward_tile(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
     const Tile t = gather_tile<D>(a, tile, s);
-    const int real = a.channels_real;
     int64_t pairs = 0;
     for (int block = 0; block < 16; ++block) {
         Block b;
@@ -20,28 +37,17 @@ template <int D> void forward_tile(const RasterArgs &a, int64_t tile, const Rast
             reg live = reg_splat(1.0f), final = live; // transmittance; `live` never rises again where a pixel has ended
             for (int i = 0; i < n; ++i) {
                 const float *row = t.rows + int64_t(s.list[i]) * (D + 6);
-                const Alpha at = alpha_at(row, pixels);
-                const reg next = live - live * at.value;
-                const ireg go = next >= minimum_transmittance;
-                const reg weight = go ? live * at.value : reg{};
-                for (int k = 0; k < D; ++k) acc[k] += weight * row[6 + k];
-                if (__builtin_expect(a.pairs != nullptr, 0)) pairs += __builtin_popcount(bits(weight > 0.0f));
-                final = go ? next : final;
-                live = next;
-                if (!any(go)) break;
+                const Blended next = blended(live, alpha_at(row, pixels).value);
+                for (int k = 0; k < D; ++k) acc[k] += next.weight * row[6 + k];
+                if (__builtin_expect(a.pairs != nullptr, 0)) pairs += __builtin_popcount(bits(next.weight > 0.0f));
+                final = where(next.go, next.live, final);
+                live = next.live;
+                if (!any(next.go)) break;
             }
             for (int k = 0; k < D; ++k) reg_store(values[k] + l, acc[k]);
             reg_store(values[D] + l, final);
         }
-        const int rows = a.height - b.y < 4 ? a.height - b.y : 4, columns = a.width - b.x < 4 ? a.width - b.x : 4;
-        for (int j = 0; j < rows; ++j)
-            for (int i = 0; i < columns; ++i) {
-                int64_t pixel = int64_t(b.y + j) * a.width + b.x + i;
-                float *out = a.out + pixel * real;
-                for (int k = 0; k < real; ++k) out[a.permutation[k]] = values[k][4 * j + i];
-                a.transmittance[pixel] = values[D][4 * j + i];
-                a.alpha[pixel] = 1.0f - values[D][4 * j + i];
-            }
+        write_block<D>(a, b, values);
     }
     if (a.pairs) a.pairs[tile] = pairs;
 }

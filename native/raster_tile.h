@@ -29,7 +29,7 @@ POLARGUIDE_INLINE uint32_t touched_blocks(const float *row) {
         const reg a = reg_splat(row[2]), b = reg_splat(row[3]), c = reg_splat(row[4]);
         const reg ey = clamp(cx * to_y, y0, y1), ex = clamp(cy * to_x, x0, x1);
         const reg q1 = a * cx * cx + b * cx * ey + c * ey * ey, q2 = a * ex * ex + b * ex * cy + c * cy * cy;
-        blocks |= bits(max(q1, q2) + row[5] >= log2_minimum - 1e-4f) << l;
+        blocks |= bits(at_least(max(q1, q2) + row[5], reg_splat(log2_minimum - 1e-4f))) << l;
     }
     return blocks;
 }
@@ -51,6 +51,9 @@ POLARGUIDE_INLINE Tile open_tile(const RasterArgs &a, int64_t tile, const float 
     return t;
 }
 
+// Whether a Gaussian's features are read and written as they lie: a copy whose length the compiler knows.
+template <int D> POLARGUIDE_INLINE bool in_order(const RasterArgs &a) { return a.in_order && a.channels_real == D; }
+
 // Gathers the tile's Gaussians into contiguous rows and finds the blocks that they touch.
 template <int D> POLARGUIDE_INLINE Tile gather_tile(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
     const int64_t begin = a.tile_begin[tile];
@@ -70,9 +73,13 @@ template <int D> POLARGUIDE_INLINE Tile gather_tile(const RasterArgs &a, int64_t
         const float *screen = a.screen + g * screen_values, *features = a.features + g * real;
         float *row = rows + int64_t(i) * (D + 6);
         row[0] = screen[0] - t.center_x, row[1] = screen[1] - t.center_y;
-        for (int k = 2; k < 6; ++k) row[k] = screen[k];
-        for (int k = 0; k < real; ++k) row[6 + k] = features[a.permutation[k]];
-        for (int k = real; k < D; ++k) row[6 + k] = 0.0f;
+        __builtin_memcpy(row + 2, screen + 2, (screen_values - 2) * sizeof(float));
+        if (in_order<D>(a)) {
+            __builtin_memcpy(row + 6, features, D * sizeof(float));
+        } else {
+            for (int k = 0; k < real; ++k) row[6 + k] = features[a.permutation[k]];
+            for (int k = real; k < D; ++k) row[6 + k] = 0.0f;
+        }
         blocks[i] = uint16_t(touched_blocks(row));
     }
     return t;
@@ -104,16 +111,30 @@ POLARGUIDE_INLINE Pixels pixels_from(const Block &b, int l) {
 }
 
 struct Alpha {
-    reg value; // 0 where the Gaussian does not contribute
-    ireg capped;
+    reg value;      // 0 where the Gaussian does not contribute
+    lane_mask free; // where the cap does not hold it
 };
 POLARGUIDE_INLINE Alpha alpha_at(const float *row, const Pixels &p) {
     Alpha r;
     const reg dx = p.x - row[0], dy = p.y - row[1];
-    const reg e = (dx * row[2] + dy * row[3]) * dx + (dy * row[4]) * dy + row[5];
-    const reg alpha = exp2(e); // of no meaning far below the threshold, and not used there
-    r.capped = alpha > maximum_alpha;
-    r.value = e >= log2_minimum ? min(alpha, reg_splat(maximum_alpha)) : reg{};
+    const reg e = (dx * row[2] + dy * row[3]) * dx + ((dy * row[4]) * dy + row[5]);
+    const reg alpha = exp2_looked_up(e), most = reg_splat(maximum_alpha); // of no meaning far below the threshold, and not used there
+    r.free = at_least(most, alpha);
+    r.value = where(at_least(e, reg_splat(log2_minimum)), min(alpha, most));
+    return r;
+}
+
+// One Gaussian more before some pixels of a transmittance, which never rises again where a pixel has ended.
+struct Blended {
+    reg weight, live; // 0 where the pixel has ended; the transmittance behind it
+    lane_mask go;     // where it has not
+};
+POLARGUIDE_INLINE Blended blended(reg live, reg alpha) {
+    Blended r;
+    const reg share = live * alpha;
+    r.live = live - share;
+    r.go = at_least(r.live, reg_splat(minimum_transmittance));
+    r.weight = where(r.go, share);
     return r;
 }
 
@@ -127,6 +148,7 @@ POLARGUIDE_INLINE Alpha alpha_at(const float *row, const Pixels &p) {
     case 4: return function<4>(a, tile, s);                                                                            \
     case 7: return function<7>(a, tile, s);                                                                            \
     case 8: return function<8>(a, tile, s);                                                                            \
+    case 11: return function<11>(a, tile, s);                                                                          \
     case 12: return function<12>(a, tile, s);                                                                          \
     case 16: return function<16>(a, tile, s);                                                                          \
     default: return function<32>(a, tile, s);                                                                          \

@@ -44,7 +44,7 @@ std::vector<int32_t> depth_order(const float *depth, const int32_t *touched, int
 } // namespace
 
 int padded_channels(int channels) {
-    for (int d : {3, 4, 7, 8, 12, 16, 32})
+    for (int d : {3, 4, 7, 8, 11, 12, 16, 32})
         if (channels <= d) return d;
     return 0;
 }
@@ -54,7 +54,7 @@ Rasterizer::Rasterizer(const PinholeCamera &camera, std::vector<int32_t> permuta
       channels_(padded_channels(int(permutation_.size()))), tiles_x_((camera.width + tile_size - 1) / tile_size),
       tiles_y_((camera.height + tile_size - 1) / tile_size) {}
 
-void Rasterizer::bin(int64_t count) {
+void Rasterizer::bin(int64_t count, bool for_backward) {
     // Candidate tiles of each Gaussian's box, of which it keeps those it really touches.
     std::vector<int64_t> offset(size_t(count) + 1, 0);
     for (int64_t g = 0; g < count; ++g) {
@@ -72,12 +72,13 @@ void Rasterizer::bin(int64_t count) {
     first[0] = 0;
     for (int64_t g = 0; g < count; ++g) first[g + 1] = first[g] + touched.get()[g];
     instance_count_ = first[count];
-    gaussians_.resize(instance_count_), instances_.resize(instance_count_);
-    sort_into_tiles(depth_order(depth_.get(), touched.get(), count), tiles.get(), offset.data(), touched.get());
+    gaussians_.resize(instance_count_);
+    if (for_backward) instances_.resize(instance_count_);
+    sort_into_tiles(depth_order(depth_.get(), touched.get(), count), tiles.get(), offset.data(), touched.get(), for_backward);
 }
 
 void Rasterizer::sort_into_tiles(const std::vector<int32_t> &order, const int32_t *tiles, const int64_t *offset,
-                                 const int32_t *touched) {
+                                 const int32_t *touched, bool for_backward) {
     // The order is cut into parts, one a thread. What a part has in a tile comes behind what the parts before it have
     // there, so that the result is the same for any number of them.
     const int64_t tile_count = int64_t(tiles_x_) * tiles_y_, parts = thread_count();
@@ -121,7 +122,8 @@ void Rasterizer::sort_into_tiles(const std::vector<int32_t> &order, const int32_
         each(part, [&](int32_t g, const int32_t *t, int32_t n) {
             for (int32_t i = 0; i < n; ++i) {
                 const int64_t slot = here[t[i]]++;
-                gaussians_.get()[slot] = g, instances_.get()[slot] = first[g] + i;
+                gaussians_.get()[slot] = g;
+                if (for_backward) instances_.get()[slot] = first[g] + i;
             }
         });
     };
@@ -133,9 +135,12 @@ RasterArgs Rasterizer::raster_args(const GaussianInputs &in) const {
     a.channels = channels_, a.channels_real = in.channels;
     a.width = camera_.width, a.height = camera_.height, a.tiles_x = tiles_x_, a.tiles_y = tiles_y_;
     a.screen = screen_.get(), a.features = in.features, a.permutation = permutation_.data();
-    a.tile_begin = tile_begin_.get(), a.gaussians = gaussians_.get(), a.instances = instances_.get();
-    a.transmittance = transmittance_.get();
-    if (kept_) a.rows = rows_.get(), a.blocks = blocks_.get();
+    a.in_order = std::is_sorted(permutation_.begin(), permutation_.end());
+    a.tile_begin = tile_begin_.get(), a.gaussians = gaussians_.get();
+    if (kept_) {
+        a.instances = instances_.get(), a.rows = rows_.get(), a.blocks = blocks_.get();
+        a.transmittance = transmittance_.get();
+    }
     a.statistic_channels = statistic_channels_;
     return a;
 }
@@ -161,21 +166,23 @@ template <class F> void Rasterizer::for_tiles(F &&body) {
     parallel_chunks(int64_t(tiles_x_) * tiles_y_, 2, run);
 }
 
-void Rasterizer::project(const GaussianInputs &in, float *radius) {
+void Rasterizer::project(const GaussianInputs &in, float *radius, bool for_backward) {
     screen_.resize(in.count * screen_values), depth_.resize(in.count), box_.resize(in.count * 4);
     ProjectArgs project_args{in.count, in.means, in.quaternions, in.scales, in.opacities, camera_,
                              screen_.get(), depth_.get(), radius, box_.get()};
     auto project_chunk = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(project)(project_args, b, e); };
     parallel_chunks(in.count, gaussian_chunk, project_chunk);
-    bin(in.count);
+    bin(in.count, for_backward);
 }
 
 void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs,
                          bool for_backward) {
-    transmittance_.resize(int64_t(camera_.width) * camera_.height);
-    project(in, radius);
+    project(in, radius, for_backward);
     kept_ = for_backward;
-    if (kept_) rows_.resize(instance_count_ * (channels_ + 6) + 16), blocks_.resize(instance_count_ + 16);
+    if (kept_) {
+        rows_.resize(instance_count_ * (channels_ + 6) + 16), blocks_.resize(instance_count_ + 16);
+        transmittance_.resize(int64_t(camera_.width) * camera_.height);
+    }
     RasterArgs args = raster_args(in);
     args.out = out, args.alpha = alpha;
     std::vector<int64_t> pairs;
@@ -188,7 +195,7 @@ void Rasterizer::forward(const GaussianInputs &in, float *out, float *alpha, flo
 void Rasterizer::surface(const GaussianInputs &in, float width, float *out) {
     Buffer<float> radius;
     radius.resize(in.count);
-    project(in, radius.get());
+    project(in, radius.get(), false);
     kept_ = false;
     RasterArgs args = raster_args(in);
     args.out = out, args.surface_width = width;

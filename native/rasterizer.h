@@ -50,11 +50,11 @@ class Rasterizer {
     int64_t instances() const { return instance_count_; }
 
   private:
-    void project(const GaussianInputs &in, float *radius);
-    void bin(int64_t count);
+    void project(const GaussianInputs &in, float *radius, bool for_backward);
+    void bin(int64_t count, bool for_backward);
     // From the visible Gaussians in order of depth, and the tiles that each touches, to each tile's list of them.
     void sort_into_tiles(const std::vector<int32_t> &order, const int32_t *tiles, const int64_t *offset,
-                         const int32_t *touched);
+                         const int32_t *touched, bool for_backward);
     RasterArgs raster_args(const GaussianInputs &in) const;
     template <class F> void for_tiles(F &&body);
 

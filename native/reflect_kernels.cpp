@@ -88,6 +88,17 @@ POLARGUIDE_INLINE Blend blend_of(const ReflectArgs &a, int64_t i, int n, reg str
 
 } // namespace
 
+void turn(const TurnArgs &a, int64_t begin, int64_t end) {
+    const float *r = a.rotation;
+    for (int64_t i = begin; i < end; i += reg_lanes) {
+        const int n = count_at(i, end);
+        reg from[3], to[3];
+        load_columns<3>(a.directions + 3 * i, n, from);
+        for (int k = 0; k < 3; ++k) to[k] = from[0] * r[k] + from[1] * r[3 + k] + from[2] * r[6 + k];
+        store_columns<3>(a.out + 3 * i, n, to);
+    }
+}
+
 void reflect_directions(const ReflectArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += reg_lanes) {
         const int n = count_at(i, end);

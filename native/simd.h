@@ -65,6 +65,21 @@ POLARGUIDE_INLINE uint32_t bits(ireg mask) {
     return result;
 #endif
 }
+// Comparisons for loops that ask about all lanes at once: where AVX-512 has a register of bits for them, GCC would carry
+// a comparison's result there by way of a vector.
+#if defined(__AVX512F__)
+typedef __mmask16 lane_mask;
+POLARGUIDE_INLINE lane_mask at_least(reg a, reg b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+POLARGUIDE_INLINE uint32_t bits(lane_mask mask) { return mask; }
+POLARGUIDE_INLINE bool any(lane_mask mask) { return mask != 0; }
+POLARGUIDE_INLINE reg where(lane_mask mask, reg a, reg b) { return _mm512_mask_blend_ps(mask, b, a); }
+POLARGUIDE_INLINE reg where(lane_mask mask, reg a) { return _mm512_maskz_mov_ps(mask, a); } // 0 elsewhere
+#else
+typedef ireg lane_mask;
+POLARGUIDE_INLINE lane_mask at_least(reg a, reg b) { return a >= b; }
+POLARGUIDE_INLINE reg where(lane_mask mask, reg a, reg b) { return mask ? a : b; }
+POLARGUIDE_INLINE reg where(lane_mask mask, reg a) { return mask ? a : reg{}; }
+#endif
 // The same as of the templates above, NaN included: GCC would compare and select.
 #if defined(__AVX512F__)
 POLARGUIDE_INLINE reg min(reg a, reg b) { return _mm512_min_ps(a, b); }
@@ -134,6 +149,25 @@ template <class V> POLARGUIDE_INLINE V exp2(V x) {
     V p = ((((f * 0.00132764719f + 0.00967553685f) * f + 0.0555071325f) * f + 0.240221197f) * f + 0.693146967f) * f +
           1.00000007f;
     return (V)((I)p + ((I)shifted << 23));
+}
+
+// The same, relative error about 5e-7. Where one instruction looks sixteen values up, three multiplications shorter.
+POLARGUIDE_INLINE reg exp2_looked_up(reg x) {
+#if defined(__AVX512F__)
+    // 2^(k/16) as integers, less what k adds to the exponent below.
+    const __m512i powers =
+        _mm512_setr_epi32(0x3f800000, 0x3f7daac3, 0x3f7b95c2, 0x3f79c3d3, 0x3f7837f0, 0x3f76f532, 0x3f75fed7, 0x3f75583f,
+                          0x3f7504f3, 0x3f7508a4, 0x3f75672a, 0x3f76248c, 0x3f7744fd, 0x3f78ccdf, 0x3f7ac0c7, 0x3f7d257d);
+    const float magic = 786432.0f; // 1.5 * 2^19: adding it rounds to the nearest sixteenth
+    const reg shifted = x + magic;
+    const reg f = x - (shifted - magic);
+    const __m512i sixteenths = _mm512_castps_si512(shifted);
+    const reg power = _mm512_castsi512_ps(
+        _mm512_add_epi32(_mm512_permutexvar_epi32(sixteenths, powers), _mm512_slli_epi32(sixteenths, 19)));
+    return power * ((f * 0.240226507f + 0.693187833f) * f + 1.0f);
+#else
+    return exp2(x);
+#endif
 }
 
 // log2 of positive normal numbers, to about 1e-7 of its value.

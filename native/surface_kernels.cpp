@@ -13,13 +13,11 @@ POLARGUIDE_INLINE int blended_weights(const Tile &t, const int32_t *list, int co
     reg live = reg_splat(1.0f), sum = reg{};
     for (int i = 0; i < count; ++i) {
         const Alpha at = alpha_at(t.rows + int64_t(list[i]) * (surface_channels + 6), pixels);
-        const reg next = live - live * at.value;
-        const ireg go = next >= minimum_transmittance;
-        const reg weight = go ? live * at.value : reg{};
-        reg_store(weights + int64_t(i) * reg_lanes, weight);
-        sum += weight;
-        live = next; // never rises again
-        if (!any(go)) {
+        const Blended next = blended(live, at.value);
+        reg_store(weights + int64_t(i) * reg_lanes, next.weight);
+        sum += next.weight;
+        live = next.live;
+        if (!any(next.go)) {
             count = i + 1;
             break;
         }

@@ -41,7 +41,7 @@ PARTS = {
         "mirrored_forward",
     ),
     "reflection": (
-        *("reflect_directions", "cubemap_forward", "reflect_layers"),
+        *("turn", "reflect_forward"),
         *("reflect_backward_layers", "cubemap_backward", "reflect_backward_directions"),
         *("gbuffer_split", "gbuffer_join", "metal_directions", "mips_forward", "metal_layers"),
         *("metal_backward_layers", "mips_backward", "metal_backward_directions"),

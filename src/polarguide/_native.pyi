@@ -187,15 +187,17 @@ def metal_backward_directions(
     grad_level: Tensor,
     grad_features: Tensor,
 ) -> None: ...
-def reflect_directions(features: Tensor, rays: Tensor, directions: Tensor) -> None: ...
-def reflect_layers(
+def turn(directions: Tensor, rotation: Sequence[float], out: Tensor) -> None: ...
+def reflect_forward(
     features: Tensor,
     rays: Tensor,
-    seen: Tensor,
+    texture: Tensor,
     fresnel: bool,
     local: bool,
     refractive_index: float,
     index: int,
+    directions: Tensor | None,
+    seen: Tensor | None,
     final: Tensor,
     specular: Tensor,
     diffuse: Tensor,

@@ -9,7 +9,7 @@ from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.shading.deferred import DeferredShading, reflect_reference
 from polarguide.shading.model import GBuffer, ShadingModel
-from polarguide.shading.native import reflect_native
+from polarguide.shading.native import reflect_native, world_rays_native
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 8
 MODELS = [
@@ -97,6 +97,32 @@ def test_threads_do_not_change_the_result() -> None:
         results.append([*layers, *gradients])
     for one, other in zip(*results, strict=True):
         assert torch.equal(one, other)
+
+
+def test_layers_without_gradients_have_the_same_bits(simd: str) -> None:
+    """Many times as many pixels as are worked on at once, and some: then mirrored rays are kept of those alone."""
+    features, texels = buffers()
+    many = features.flatten(0, 1).repeat(15, 1)[:-3]
+    rays = camera().world_rays().flatten(0, 1).repeat(15, 1)[:-3]
+
+    def layers(texels: Tensor) -> tuple[Tensor, ...]:
+        return reflect_native(many, rays, texels, fresnel=True, local=True, refractive_index=1.5)
+
+    learning = layers(texels.clone().requires_grad_())
+    assert learning[0].requires_grad
+    for one, other in zip(layers(texels), learning, strict=True):
+        assert torch.equal(one, other.detach())
+
+
+def test_world_rays_in_one_pass(simd: str) -> None:
+    exact = camera().world_rays(dtype=torch.float64).flatten(0, 1)
+    assert_close(world_rays_native(camera()).double(), exact, rtol=0, atol=3e-7)
+
+
+def test_a_cubemap_of_other_colors_is_refused() -> None:
+    features, texels = buffers()
+    with pytest.raises(ValueError, match=r"texture: expected shape \[6, 8, 8, 3\], found \[6, 8, 8, 4\]"):
+        native(features, torch.cat((texels, texels[..., :1]), dim=-1), MODELS[0])
 
 
 def test_too_few_channels_are_refused() -> None:

@@ -104,14 +104,17 @@ def cubemap(rng: random.Random) -> None:
 def reflect(rng: random.Random) -> None:
     n, d, local = rng.choice((*SIZES, 5000)), rng.randint(5, 12), rng.random() < 0.5
     features, rays, three = array(rng, n, d), array(rng, n, 3), [array(rng, n, 3) for _ in range(7)]
-    _native.reflect_directions(features, rays, three[0])
+    _native.turn(rays, [rng.uniform(-1, 1) for _ in range(rng.choice((9, 9, 9, 8)))], three[0])
     model = (
         rng.random() < 0.5,
         local,
         rng.choice((1.5, 0.0, np.nan)),
         rng.choice((-1, -1, 0, d - 1, d, 2**31 - 1)),
     )
-    _native.reflect_layers(features, rays, three[0], *model, *three[1:5])
+    side = rng.choice((1, 2, 5))
+    texels = array(rng, 6, side, side, rng.choice((3, 3, 3, 4)))
+    looked_up = maybe(rng, three[0]), maybe(rng, three[5])
+    _native.reflect_forward(features, rays, texels, *model, *looked_up, *three[1:5])
     layers = [maybe(rng, values) for values in (*three[1:5], *three[1:3])]
     by_look_up = three[5], maybe(rng, three[6])
     _native.reflect_backward_layers(features, rays, three[0], *model, *layers, *by_look_up, array(rng, n, d))

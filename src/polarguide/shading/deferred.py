@@ -52,7 +52,7 @@ from polarguide.shading.model import (
     harmonic_values,
     mirrored,
 )
-from polarguide.shading.native import MetalArguments, reflect_native
+from polarguide.shading.native import MetalArguments, reflect_native, world_rays_native
 from polarguide.shading.result import LAYERS, HeldLayers
 from polarguide.vectors import dot, unit
 
@@ -340,7 +340,7 @@ class DeferredShading(ShadingModel):
             levels = metal_mips(self.radiance(texels))
         found = reflect_native(
             pixels,
-            camera.world_rays().flatten(0, 1),
+            world_rays_native(camera),
             texels,
             fresnel=self.blend == "fresnel",
             local=self.local,

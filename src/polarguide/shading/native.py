@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
+from polarguide.camera import Camera
 from polarguide.shading.mips import mips_backward
 
 
@@ -49,11 +50,10 @@ class _Reflect(torch.autograd.Function):
         *levels: Tensor,
     ) -> tuple[Tensor, ...]:
         features, rays, texels = (t.detach().contiguous() for t in (features, rays, texels))
-        directions, seen = torch.empty_like(rays), torch.empty_like(rays)
+        learns = any(ctx.needs_input_grad)
+        directions, seen = (torch.empty_like(rays) if learns else None for _ in range(2))
         layers = [torch.empty_like(rays) for _ in range(4)]
-        _native.reflect_directions(features, rays, directions)
-        _native.cubemap_forward(texels, directions, seen)
-        _native.reflect_layers(features, rays, seen, fresnel, local, ior, index, *layers)
+        _native.reflect_forward(features, rays, texels, fresnel, local, ior, index, directions, seen, *layers)
         ctx.model, ctx.metal = (fresnel, local, ior, index), metal
         ctx.set_materialize_grads(False)
         found: list[Tensor] = []
@@ -107,6 +107,14 @@ class _Reflect(torch.autograd.Function):
             given = [features, rays, *ctx.metal, to_mirrored, to_level, to_features]
             _native.metal_backward_directions(*given)
         return to_features, None, to_texels, None, None, None, None, None, None, *to_levels
+
+
+def world_rays_native(camera: Camera) -> Tensor:
+    """``Camera.world_rays`` in float32 on the CPU, in one pass: [P, 3]."""
+    rays = camera.rays().flatten(0, 1)
+    turned = torch.empty_like(rays)
+    _native.turn(rays, camera.pose(torch.float32, rays.device).rotation.flatten().tolist(), turned)
+    return turned
 
 
 def reflect_native(
