@@ -80,3 +80,15 @@ def test_without_a_terminal_a_line_every_so_often(capsys: pytest.CaptureFixture[
     assert said[0] == "training 150/1000, 0:01:25 left  loss 150"
     assert len(said) == 7
     assert said[-1] == "training 1000/1000  loss 1000"
+
+
+def test_the_time_left_follows_from_the_last_minutes(capsys: pytest.CaptureFixture[str]) -> None:
+    """As of a training whose second half looks at pictures of four times the size."""
+    now = [0.0]
+    told = Lines("training", 2000, clock=lambda: now[0])
+    for step in range(0, 1501, 10):
+        now[0] = min(step, 1000) / 10 + max(0, step - 1000)
+        told(step)
+    said = capsys.readouterr().out.splitlines()
+    assert "training 900/2000, 0:01:50 left" in said
+    assert said[-1] == "training 1490/2000, 0:08:30 left"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -15,6 +16,8 @@ from polarguide.progress import Advance, Reporter
 
 LINE_SECONDS = 15.0
 """Between two lines of progress where there is no terminal."""
+SPEED_SECONDS = 180.0
+"""The speed of so long tells the time left: of a training whose pictures grow, the steps of the beginning are cheap."""
 
 
 def bars(memory_seconds: float = 30.0) -> Progress:
@@ -42,21 +45,23 @@ class Lines:
 
     def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
         self._label, self._total, self._clock = label, total, clock
-        self._begin = self._last = clock()
-        self._first: int | None = None
+        self._last = clock()
+        self._seen: deque[tuple[float, int]] = deque()  # when how much was done, about once a second
         self._line = ""
 
     def __call__(self, done: int, *, total: int | None = None, note: str = "") -> None:
         """See ``progress.Advance``."""
         now = self._clock()
         self._total = total or self._total
-        if self._first is None:
-            # A training that goes on does not begin at 0: the speed is that of this call.
-            self._first, self._begin = done, now
+        if not self._seen or now - self._seen[-1][0] >= 1:
+            self._seen.append((now, done))
+        while len(self._seen) > 2 and now - self._seen[1][0] >= SPEED_SECONDS:
+            self._seen.popleft()
+        begin, first = self._seen[0]  # a training that goes on does not begin at 0
         finished = self._total is not None and done >= self._total
         left = ""
-        if self._total is not None and done > self._first and not finished:
-            seconds = round((now - self._begin) * (self._total - done) / (done - self._first))
+        if self._total is not None and done > first and not finished:
+            seconds = round((now - begin) * (self._total - done) / (done - first))
             left = f", {seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d} left"
         of = "" if self._total is None else f"/{self._total}"
         self._line = f"{self._label} {done}{of}{left}" + (f"  {note}" if note else "")
