@@ -158,11 +158,12 @@ void bind_reflect(nb::module_ &module) {
             look.resolution = int(side), look.channels = 3, look.texture = texture.data();
             nb::gil_scoped_release release;
             // A piece at a time goes through all three, so that what one leaves the next finds near.
-            std::vector<float> own(size_t(thread_count()) * 6 * item_chunk);
+            std::vector<float> own(size_t(thread_count()) * 7 * item_chunk);
             auto body = [&](int64_t b, int64_t e, int worker) {
-                float *spare = own.data() + int64_t(worker) * 6 * item_chunk;
+                float *spare = own.data() + int64_t(worker) * 7 * item_chunk;
                 ReflectArgs part = a;
                 part.features += b * a.channels, part.rays += 3 * b;
+                part.along = spare + 6 * item_chunk;
                 part.directions = all_directions ? all_directions + 3 * b : spare;
                 POLARGUIDE_DISPATCH(reflect_directions)(part, 0, e - b);
                 CubemapArgs here = look;

@@ -100,6 +100,7 @@ struct ReflectArgs {
     const float *rays;     // [P,3] unit
     const float *seen;     // [P,3]
     float *directions;     // [P,3]
+    float *along;          // [P] ray . normal
     float *final_picture, *specular, *diffuse, *reflection;
     // Each may be null. The held ones are by the same layers, and have no part in the normal's gradient.
     const float *grad_final, *grad_specular, *grad_diffuse, *grad_reflection, *grad_held_specular, *grad_held_diffuse;

@@ -142,6 +142,8 @@ void project(const ProjectArgs &p, int64_t begin, int64_t end) {
 
 void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
     constexpr float side = tile_size - 1; // between the outermost pixel centers
+    alignas(64) int32_t lane_tile[lanes]; // the tiles of a group, from its first
+    for (int l = 0; l < lanes; ++l) lane_tile[l] = l / group_columns * args.tiles_x + l % group_columns;
     for (int64_t g = begin; g < end; ++g) {
         const int32_t *box = args.box + 4 * g;
         int32_t *out = args.tiles + args.offset[g], n = 0;
@@ -160,10 +162,8 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
                 uint32_t touched = bits(at_least(max(q1, q2) + s[5], reg_splat(-7.9945f)));
                 if (box[1] - tx < group_columns) touched &= ((1u << (box[1] - tx)) - 1) * 0x1111u;
                 touched &= (1u << rows * group_columns) - 1;
-                for (; touched; touched &= touched - 1) {
-                    const int lane = __builtin_ctz(touched);
-                    out[n++] = (ty + lane / group_columns) * args.tiles_x + tx + lane % group_columns;
-                }
+                const bool room = args.offset[g] + n + lanes <= args.offset[end]; // behind lie another worker's
+                n += pack_lanes(touched, lane_tile, ty * args.tiles_x + tx, room, out + n);
             }
         }
         args.touched[g] = n;

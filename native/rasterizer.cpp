@@ -14,7 +14,7 @@ constexpr int64_t gaussian_chunk = 512;
 std::vector<int32_t> depth_order(const float *depth, const int32_t *touched, int64_t count) {
     std::vector<int32_t> order, other;
     std::vector<uint32_t> keys, other_keys;
-    order.reserve(size_t(count)), keys.reserve(size_t(count));
+    order.reserve(size_t(count)), keys.reserve(size_t(count)); // touched: its depth is positive, and ordered as its bits
     for (int64_t g = 0; g < count; ++g)
         if (touched[g] > 0) {
             uint32_t key;
@@ -22,9 +22,15 @@ std::vector<int32_t> depth_order(const float *depth, const int32_t *touched, int
             order.push_back(int32_t(g)), keys.push_back(key);
         }
     other.resize(order.size()), other_keys.resize(keys.size());
-    constexpr int digit = 11, buckets = 1 << digit;
-    std::vector<int64_t> begin(buckets);
-    for (int shift = 0; shift < 32; shift += digit) {
+    // Depths of one picture mostly differ by a factor of some hundred: less the least of them, two digits are enough.
+    uint32_t least = ~0u, most = 0;
+    for (uint32_t k : keys) least = std::min(least, k), most = std::max(most, k);
+    for (uint32_t &k : keys) k -= least;
+    int bits = 1;
+    while (bits < 32 && (most - least) >> bits) ++bits;
+    const int digit = bits <= 26 ? 13 : 11, buckets = 1 << digit;
+    std::vector<int64_t> begin(static_cast<size_t>(buckets));
+    for (int shift = 0; shift < bits; shift += digit) {
         std::fill(begin.begin(), begin.end(), 0);
         for (uint32_t k : keys) ++begin[(k >> shift) & (buckets - 1)];
         int64_t sum = 0;

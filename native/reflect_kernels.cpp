@@ -103,8 +103,10 @@ void reflect_directions(const ReflectArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += reg_lanes) {
         const int n = count_at(i, end);
         reg out[3];
-        mirrored_ray(mirror_at(a, i, n), out);
+        const Mirror m = mirror_at(a, i, n);
+        mirrored_ray(m, out);
         store_columns<3>(a.directions + 3 * i, n, out);
+        store_columns<1>(a.along + i, n, &m.along);
     }
 }
 
@@ -115,7 +117,9 @@ void reflect_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
         columns_of<3>(a.features + a.channels * i, a.channels, 0, n, base);
         columns_of<1>(a.features + a.channels * i, a.channels, 6, n, &strength);
         const Light light = light_at(a, i, n);
-        const Blend blend = blend_of(a, i, n, strength, a.fresnel ? mirror_at(a, i, n).along : reg{});
+        reg along;
+        load_columns<1>(a.along + i, n, &along);
+        const Blend blend = blend_of(a, i, n, strength, along);
         for (int k = 0; k < 3; ++k) {
             specular[k] = strength * blend.share * light.value[k], diffuse[k] = blend.kept * base[k];
             final_picture[k] = specular[k] + diffuse[k];

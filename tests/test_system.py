@@ -208,6 +208,23 @@ def test_memory_is_given_back_near_the_limit_and_no_more_often_than_it_helps(
     assert returned == [901, 910, 951, 905]
 
 
+def test_nothing_lets_a_process_keep_more_than_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    returned: list[int] = []
+    held = 0
+    monkeypatch.setattr(system, "resident_memory", lambda: held)
+    monkeypatch.setattr(system, "return_freed_memory", lambda: returned.append(held))
+    bound = MemoryBound(1000)
+    for held in (905, 990, 980, 990, 1001):  # noqa: B007, a twentieth more than 990 were too much
+        bound.keep()
+    assert returned == [905, 1001]
+    held = 500
+    bound.clear()
+    assert returned == [905, 1001]
+    held = 501
+    bound.clear()
+    assert returned == [905, 1001, 501]
+
+
 @pytest.mark.parametrize("libc", [OSError(), TypeError(), object()], ids=["none", "Windows", "another"])
 def test_elsewhere_the_allocator_is_left_alone(libc: object, monkeypatch: pytest.MonkeyPatch) -> None:
     def load(name: None) -> object:

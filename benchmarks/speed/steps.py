@@ -2,14 +2,15 @@
 
     python benchmarks/speed/steps.py [SCENE_OR_RUN] [--recipes 3dgs polarguide-stokes] [--threads 1 2 4] [--downscale 1]
 
-A run gives its trained Gaussians, with which all its steps are those of its longest stage; a scene those of the first
-step, scattered by the points of its model. Each view is looked at once before it is timed, so that priors, which are
-computed once between two refreshes, are a line of their own. Parts are timed around the native calls.
+A run gives its trained Gaussians, with which all its steps are those of the longest stage at full size; a scene those
+of the first step, scattered by the points of its model. Each view is looked at once before it is timed, so that priors,
+which are computed once between two refreshes, are a line of their own. Parts are timed around the native calls.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import statistics
 import time
@@ -86,13 +87,17 @@ class Clock:
 
 def measured(trainer: Trainer, clock: Clock, steps: int) -> tuple[dict[str, float], float]:
     """Medians of the parts of a step in the longest stage, and of the priors of a view; milliseconds."""
-    longest = max(trainer.recipe.stages, key=lambda stage: stage.fraction)
     schedule, last = trainer.schedule, trainer.settings.steps
-    every = trainer.recipe.densification.every
+    every, coarse = trainer.recipe.densification.every, trainer.recipe.coarse
+    largest = max(view.camera.width * view.camera.height for view in trainer.scene.train_views)
+    # Pictures as they are: large ones are smaller in the first steps.
+    first = math.ceil(coarse.share * last) if largest >= coarse.pixels else 1
+    names = [schedule.at(step).stage.name for step in range(first, last - 1)]
+    longest = statistics.mode(names)
     calm = [
         step
-        for step in range(1, last - 1)
-        if schedule.at(step).stage is longest and not schedule.at(step).actions and (step + 1) % every
+        for step, name in enumerate(names, first)
+        if name == longest and not schedule.at(step).actions and (step + 1) % every
     ][:steps]
     rows, priors = [], []
     for place, step in enumerate((calm[0], *calm)):

@@ -202,7 +202,7 @@ class MemoryBound:
     """
 
     def __init__(self, limit: int) -> None:
-        self._least = NEARLY * limit
+        self._limit, self._least = limit, NEARLY * limit
         self._bound, self._most, self._waits = self._least, 0, 0
 
     def keep(self) -> None:
@@ -212,10 +212,16 @@ class MemoryBound:
             return
         if self._waits:  # steps take what they need again: under the most of it there is nothing to return
             self._most, self._waits = max(self._most, held), self._waits - 1
-            self._bound = max(self._least, GROWTH * self._most)
+            self._bound = min(max(self._least, GROWTH * self._most), self._limit)
         elif held > self._bound:
             return_freed_memory()
             self._most, self._waits = 0, SETTLED
+
+    def clear(self) -> None:
+        """Called before what takes and frees more than a step, as a look at all views does."""
+        held = resident_memory()
+        if held is not None and held > self._limit / 2:
+            return_freed_memory()
 
 
 def keep_freed_memory() -> None:

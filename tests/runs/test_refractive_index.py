@@ -12,9 +12,11 @@ import polarguide
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions
 from polarguide.progress import Reporter
+from polarguide.recipes import recipe_named
 from polarguide.runs import train as training
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.train import TrainingStopped
+from polarguide.training.schedule import Schedule
 from polarguide.training.settings import TrainSettings
 
 READING = SceneOptions(downscale=4)
@@ -95,7 +97,8 @@ def test_a_training_keeps_within_its_memory_after_every_step(
     demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limits: list[int] = []
-    steps = 0
+    cleared: list[int] = []
+    steps, every = 0, 10
 
     class Bound:
         def __init__(self, limit: int) -> None:
@@ -105,10 +108,17 @@ def test_a_training_keeps_within_its_memory_after_every_step(
             nonlocal steps
             steps += 1
 
+        def clear(self) -> None:
+            cleared.append(steps)
+
     monkeypatch.setattr(training, "MemoryBound", Bound)
     polarguide.train(
-        demo_scene, tmp_path / "run", settings=TrainSettings(3), reading=SceneOptions(4, memory=2.0)
+        demo_scene, tmp_path / "run", settings=TrainSettings(every), reading=SceneOptions(4, memory=2.0)
     )
-    assert steps == 3
+    assert steps == every
+    # Before the views are looked at anew: with the first step that is guided, and with the first of the last stage.
+    schedule = Schedule(recipe_named("polarguide-stokes"), every)
+    assert cleared == [step for step in range(every) if schedule.at(step).actions]
+    assert {1, 8} <= set(cleared)
     (limit,) = limits
     assert 10**8 < limit <= 2 << 30

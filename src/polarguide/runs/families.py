@@ -53,6 +53,10 @@ class AnyTrainer(Protocol):
         """Those of them that are done."""
 
     @property
+    def acts(self) -> bool:
+        """Whether more happens in the next step than a step: a look at all views, say."""
+
+    @property
     def state(self) -> AnyState:
         """Between two steps."""
 

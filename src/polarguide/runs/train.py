@@ -201,6 +201,8 @@ class _Loop:
             # Several ranks stop after the same step, so they have to ask each other, which takes time.
             if (ranks.world == 1 or trainer.state.step % LOG_EVERY == 0) and ranks.any(self._should_stop()):
                 return True
+            if trainer.acts:
+                self._memory.clear()
             meter.take(trainer.step())
             self._memory.keep()
             if trainer.state.step % self._session.checkpoint_every == 0:

@@ -100,8 +100,11 @@ Split = tuple[Tensor, Tensor | None, Tensor | None]
 
 
 def split(features: Tensor, alpha: Tensor, *, normals: bool, depth: bool) -> Split:
-    """What a result holds of its G-buffer: ``split_reference``, on the CPU in float32 with one native gradient pass."""
-    if normals and features.shape[-1] > 6 and fits(features):
+    """What a result holds of its G-buffer: ``split_reference``, on the CPU in float32 with one native gradient pass.
+
+    Without a gradient and a depth there is nothing to do natively: the normal is a part of the features.
+    """
+    if normals and features.shape[-1] > 6 and fits(features) and (depth or features.requires_grad):
         return split_native(features, alpha, depth=depth)
     return split_reference(features, alpha, normals=normals, depth=depth)
 

@@ -137,6 +137,11 @@ class Trainer:
         before = self.polarizers.searched if self.begins_again else 0
         return before + self.state.step
 
+    @property
+    def acts(self) -> bool:
+        """Whether more happens in the next step than a step: a look at all views, say."""
+        return bool(self.schedule.at(self.state.step).actions)
+
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
         """Train until the last step (or ``until``), reporting each step."""
         while self.state.step < (self.settings.steps if until is None else until):
