@@ -1,5 +1,5 @@
 // Normals of flat Gaussians, their shortest axes turned outward, and directions mirrored at them.
-#include "image.h"
+#include "gaussians.h"
 #include "simd.h"
 
 #include <math.h>

@@ -29,12 +29,12 @@ constexpr int64_t row_chunk = 8, item_chunk = 2048, merge_chunk = 16384;
 class PhotometricMemory {
   public:
     PhotometricMemory(PhotometricArgs &a, int workers)
-        : planes_(new float[size_t(a.stride) * size_t(a.height) * 5]), sums_(new double[size_t(a.height) * 2]),
+        : planes_(new float[size_t(a.stride) * size_t(a.height) * 5]), sums_(new double[size_t(a.height) * 3]),
           size_(photometric_scratch(a.stride)), scratch_(new float[size_t(size_) * size_t(workers)]) {
         float *next = planes_.get();
         for (float **plane : {&a.shown, &a.goal, &a.parts[0], &a.parts[1], &a.parts[2]})
             *plane = next, next += a.stride * a.height;
-        a.row_l1 = sums_.get(), a.row_ssim = a.row_l1 + a.height;
+        a.row_l1 = sums_.get(), a.row_squares = a.row_l1 + a.height, a.row_ssim = a.row_squares + a.height;
     }
     float *scratch(int worker) { return scratch_.get() + worker * size_; }
 
@@ -45,13 +45,13 @@ class PhotometricMemory {
     std::unique_ptr<float[]> scratch_;
 };
 
-std::tuple<double, double> photometric(const Array &prediction, const Array &target, std::optional<Array> weight,
+std::tuple<double, double, double> photometric(const Array &prediction, const Array &target, std::optional<Array> weight,
                                        double weight_sum, float ssim_weight, std::optional<Array> gradient) {
     const int64_t height = rows(prediction), width = prediction.ndim() > 1 ? int64_t(prediction.shape(1)) : 0;
     expect_shape(prediction, "prediction", {height, width, 3}), expect_shape(target, "target", {height, width, 3});
     if (weight) expect_shape(*weight, "weight", {height, width});
     if (gradient) expect_shape(*gradient, "gradient", {height, width, 3});
-    if (height * width == 0) return {0.0, 0.0};
+    if (height * width == 0) return {0.0, 0.0, 0.0};
     PhotometricArgs a{};
     a.height = int(height), a.width = int(width), a.stride = (3 * width + 15) / 16 * 16;
     a.prediction = prediction.data(), a.target = target.data(), a.weight = weight ? weight->data() : nullptr;
@@ -66,9 +66,10 @@ std::tuple<double, double> photometric(const Array &prediction, const Array &tar
     run(POLARGUIDE_DISPATCH(photometric_show));
     run(POLARGUIDE_DISPATCH(photometric_statistics));
     if (gradient) run(POLARGUIDE_DISPATCH(photometric_gradient));
-    double l1 = 0.0, ssim = 0.0;
-    for (int64_t y = 0; y < height; ++y) l1 += a.row_l1[y], ssim += a.row_ssim[y];
-    return {l1 / (3.0 * weight_sum), ssim / (3.0 * weight_sum)};
+    double l1 = 0.0, squares = 0.0, ssim = 0.0;
+    for (int64_t y = 0; y < height; ++y) l1 += a.row_l1[y], squares += a.row_squares[y], ssim += a.row_ssim[y];
+    const double values = 3.0 * weight_sum;
+    return {l1 / values, ssim / values, squares / values};
 }
 
 CubemapArgs cubemap_args(const Array &texture, const Array &directions) {
@@ -128,23 +129,12 @@ int64_t texels_of(const MipArgs &a) {
     return a.begin[a.levels - 1] / a.channels + 6 * last * last;
 }
 
-HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &center, const Array &dc, const Array &rest) {
-    if (degree < 0 || degree > 3)
-        throw std::invalid_argument("degree: expected 0 to 3, found " + std::to_string(degree));
-    const int64_t n = rows(means);
-    expect_shape(means, "means", {n, 3}), expect_shape(center, "center", {3}), expect_shape(dc, "dc", {n, 3});
-    expect_shape(rest, "rest", {n, 15, 3});
-    HarmonicsArgs a{};
-    a.degree = degree, a.means = means.data(), a.center = center.data(), a.dc = dc.data(), a.rest = rest.data();
-    return a;
-}
-
 } // namespace
 
 void bind_image(nb::module_ &module) {
     module.def("photometric", &photometric, nb::arg("prediction"), nb::arg("target"), nb::arg("weight").none(),
                nb::arg("weight_sum"), nb::arg("ssim_weight"), nb::arg("gradient").none(),
-               "Mean absolute difference and mean SSIM of shown pictures; fills the gradient of their mix.");
+               "Mean absolute difference, SSIM and squared difference of shown pictures; fills the gradient of the first two's mix.");
     module.def(
         "cubemap_forward",
         [](const Array &texture, const Array &directions, Array out) {
@@ -206,35 +196,4 @@ void bind_image(nb::module_ &module) {
         },
         nb::arg("textures"), nb::arg("directions"), nb::arg("level"), nb::arg("grad_out"), nb::arg("grad_textures").none(),
         nb::arg("grad_directions"), nb::arg("grad_level"), "Gradients; those of the textures in a row, if not None.");
-    module.def(
-        "harmonics_forward",
-        [](int degree, const Array &means, const Array &center, const Array &dc, const Array &rest, Array out) {
-            HarmonicsArgs a = harmonics_args(degree, means, center, dc, rest);
-            const int64_t n = rows(means);
-            expect_shape(out, "out", {n, 3});
-            a.out = out.data();
-            nb::gil_scoped_release release;
-            auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_forward)(a, b, e); };
-            parallel_chunks(n, item_chunk, body);
-        },
-        nb::arg("degree"), nb::arg("means"), nb::arg("center"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"),
-        "Sum of the harmonics toward each Gaussian.");
-    module.def(
-        "harmonics_backward",
-        [](int degree, const Array &means, const Array &center, const Array &dc, const Array &rest,
-           const Array &grad_out, std::optional<Array> grad_means, Array grad_dc, std::optional<Array> grad_rest) {
-            HarmonicsArgs a = harmonics_args(degree, means, center, dc, rest);
-            const int64_t n = rows(means);
-            expect_shape(grad_out, "grad_out", {n, 3});
-            if (grad_means) expect_shape(*grad_means, "grad_means", {n, 3});
-            expect_shape(grad_dc, "grad_dc", {n, 3});
-            if (grad_rest) expect_shape(*grad_rest, "grad_rest", {n, 15, 3});
-            a.grad_out = grad_out.data(), a.grad_means = grad_means ? grad_means->data() : nullptr, a.grad_dc = grad_dc.data();
-            a.grad_rest = grad_rest ? grad_rest->data() : nullptr;
-            nb::gil_scoped_release release;
-            auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(harmonics_backward)(a, b, e); };
-            parallel_chunks(n, item_chunk, body);
-        },
-        nb::arg("degree"), nb::arg("means"), nb::arg("center"), nb::arg("dc"), nb::arg("rest"), nb::arg("grad_out"),
-        nb::arg("grad_means").none(), nb::arg("grad_dc"), nb::arg("grad_rest").none(), "Fills the gradients that are not None.");
 }

@@ -11,7 +11,7 @@ namespace nb = nanobind;
 
 void bind_raster(nb::module_ &module);
 void bind_image(nb::module_ &module);
-void bind_axes(nb::module_ &module);
+void bind_gaussians(nb::module_ &module);
 void bind_reflect(nb::module_ &module);
 void bind_terms(nb::module_ &module);
 
@@ -32,7 +32,7 @@ NB_MODULE(_native, module) {
         nb::arg("name"), "Choose 'auto', 'baseline', 'avx2' or 'avx512'.");
     bind_raster(module);
     bind_image(module);
-    bind_axes(module);
+    bind_gaussians(module);
     bind_reflect(module);
     bind_terms(module);
 }

@@ -1,5 +1,5 @@
 // Spherical harmonics to degree 3 in the order and with the signs of the 3DGS release, sixteen Gaussians at a time.
-#include "image.h"
+#include "gaussians.h"
 #include "simd.h"
 
 namespace polarguide {
@@ -80,9 +80,9 @@ template <int D> POLARGUIDE_INLINE void load_rest(const float *rest, int n, floa
         transpose16(rest + first, rest_values, columns + first * lanes, lanes);
     }
 }
-template <int D> POLARGUIDE_INLINE void store_rest(float *rest, int n, float *spare, const float *columns) {
-    float *out = n < lanes ? spare : rest;
-    ask_ahead<1>(rest);
+template <int D> POLARGUIDE_INLINE void store_rest(float *rest, int n, bool streams, float *spare, const float *columns) {
+    float *out = n < lanes || streams ? spare : rest;
+    if (!streams) ask_ahead<1>(rest);
     for (int t = 0; t < Columns<D>::tiles; ++t) {
         const int first = Columns<D>::first[t];
         transpose16(columns + first * lanes, lanes, out + first, rest_values);
@@ -92,6 +92,8 @@ template <int D> POLARGUIDE_INLINE void store_rest(float *rest, int n, float *sp
         for (int i = kept; i < rest_values; ++i) out[l * rest_values + i] = 0.0f;
     if (n < lanes)
         for (int i = 0; i < n * rest_values; ++i) rest[i] = spare[i];
+    else if (streams)
+        for (int i = 0; i < lanes * rest_values; i += lanes) stream(rest + i, load(spare + i));
 }
 
 // Unit directions from the center; a Gaussian at the center has direction zero. Returns 1 / distance.
@@ -124,6 +126,7 @@ template <int D> void forward(const HarmonicsArgs &a, int64_t begin, int64_t end
 }
 
 template <int D> void backward(const HarmonicsArgs &a, int64_t begin, int64_t end) {
+    const bool streams = a.streams && reinterpret_cast<uintptr_t>(a.grad_rest + rest_values * begin) % 64 == 0;
     alignas(64) float columns[48 * lanes], spare[lanes * rest_values];
     for (int64_t first = begin; first < end; first += lanes) {
         const int n = end - first < lanes ? int(end - first) : lanes;
@@ -152,8 +155,9 @@ template <int D> void backward(const HarmonicsArgs &a, int64_t begin, int64_t en
         }
         store_columns<3>(a.grad_dc + 3 * first, n, to_dc);
         if (a.grad_means) store_columns<3>(a.grad_means + 3 * first, n, to_means);
-        if (a.grad_rest) store_rest<D>(a.grad_rest + rest_values * first, n, spare, columns);
+        if (a.grad_rest) store_rest<D>(a.grad_rest + rest_values * first, n, streams, spare, columns);
     }
+    if (streams) end_stream();
 }
 
 } // namespace

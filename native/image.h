@@ -1,4 +1,4 @@
-// Kernels of pictures and colors: photometric loss, cubemap look-up, spherical harmonics, normals.
+// Kernels of pictures: photometric loss, cubemap look-up, the layers of a G-buffer.
 #pragma once
 #include "kernels.h"
 
@@ -17,7 +17,7 @@ struct PhotometricArgs {
     float ssim_weight, inverse_count; // 1 / (3 * sum of weights)
     float *shown, *goal;              // planes: sRGB of the clipped prediction; target
     float *parts[3];                  // planes: derivative of the SSIM sum by the mean of x, by that of xx and of xy
-    double *row_l1, *row_ssim;        // [height]
+    double *row_l1, *row_squares, *row_ssim; // [height]
     float *gradient;                  // [H,W,3]; null: not wanted
 };
 constexpr int photometric_margin = 16; // floats on both sides of a scratch line
@@ -57,30 +57,6 @@ POLARGUIDE_DECLARE(void mips_forward(const MipArgs &a, int64_t begin, int64_t en
 POLARGUIDE_DECLARE(void mips_backward(const MipArgs &a, int64_t begin, int64_t end))
 // Adds to `sums`, in the order of the directions.
 POLARGUIDE_DECLARE(void mips_backward_textures(const MipArgs &a, int64_t begin, int64_t end, float *sums))
-
-struct HarmonicsArgs {
-    int degree;
-    const float *means, *center, *dc, *rest; // [N,3] [3] [N,3] [N,15,3]
-    float *out;                              // [N,3]
-    const float *grad_out;
-    float *grad_means, *grad_dc, *grad_rest; // of means and rest each may be null: not wanted
-};
-POLARGUIDE_DECLARE(void harmonics_forward(const HarmonicsArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void harmonics_backward(const HarmonicsArgs &a, int64_t begin, int64_t end))
-
-// Shortest axes of Gaussians turned outward, their gradient, and rays mirrored at them.
-struct AxesArgs {
-    const float *means, *quaternions, *log_scales, *center; // [N,3] [N,4] [N,3] [3]
-    const float *outward;                                   // [N,3] or null
-    float grazing;                                          // cosine under which `outward` decides
-    const float *normals;                                   // [N,3], of mirrored_forward
-    float *out;                                             // [N,3]
-    const float *grad_out;
-    float *grad_quaternions;
-};
-POLARGUIDE_DECLARE(void axes_forward(const AxesArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void axes_backward(const AxesArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void mirrored_forward(const AxesArgs &a, int64_t begin, int64_t end))
 
 // Directions from one set of axes into another: rows times the rotation.
 struct TurnArgs {

@@ -128,14 +128,15 @@ void photometric_show(const PhotometricArgs &a, int64_t begin, int64_t end, floa
     const Lines l = lay_out(a, scratch);
     for (int64_t y = begin; y < end; ++y) {
         if (a.weight || y == begin) spread_weights(a, y, l.weight);
-        reg sum = reg{};
+        reg sum = {}, squares = {};
         for (int64_t x = 0; x < a.stride; x += reg_lanes) {
             const reg value = show(load_some(a.prediction + y * used + x, used - x));
             const reg goal = load_some(a.target + y * used + x, used - x), d = value - goal;
             reg_store(a.shown + y * a.stride + x, value), reg_store(a.goal + y * a.stride + x, goal);
-            sum += (d < reg{} ? -d : d) * reg_load(l.weight + x);
+            const reg weight = reg_load(l.weight + x);
+            sum += (d < reg{} ? -d : d) * weight, squares += d * d * weight;
         }
-        a.row_l1[y] = sum_of(sum);
+        a.row_l1[y] = sum_of(sum), a.row_squares[y] = sum_of(squares);
     }
 }
 

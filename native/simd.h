@@ -29,6 +29,23 @@ typedef float v4f __attribute__((vector_size(16), aligned(4), may_alias));
 POLARGUIDE_INLINE vf splat(float x) { return vf{} + x; }
 POLARGUIDE_INLINE vf load(const float *p) { return *reinterpret_cast<const vf_unaligned *>(p); }
 POLARGUIDE_INLINE void store(float *p, vf x) { *reinterpret_cast<vf_unaligned *>(p) = x; }
+// To memory past the caches, where the processor can: for what is more than they hold. `p` at a multiple of 64 bytes.
+// `end_stream` comes before another thread reads it.
+POLARGUIDE_INLINE void stream(float *p, vf x) {
+#if defined(__AVX512F__)
+    _mm512_stream_ps(p, reinterpret_cast<__m512 &>(x));
+#elif defined(__SSE2__)
+    const __m128 *parts = reinterpret_cast<const __m128 *>(&x);
+    for (int i = 0; i < 4; ++i) _mm_stream_ps(p + 4 * i, parts[i]);
+#else
+    store(p, x);
+#endif
+}
+POLARGUIDE_INLINE void end_stream() {
+#if defined(__SSE2__)
+    _mm_sfence();
+#endif
+}
 template <class V> POLARGUIDE_INLINE V min(V a, V b) { return a < b ? a : b; }
 template <class V> POLARGUIDE_INLINE V max(V a, V b) { return a > b ? a : b; }
 template <class V> POLARGUIDE_INLINE V clamp(V x, V low, V high) { return max(low, min(x, high)); }

@@ -72,6 +72,57 @@ class Rasterizer:
     @property
     def instances(self) -> int: ...
 
+class Splatting:
+    def __init__(
+        self,
+        means: Tensor,
+        quaternions: Tensor,
+        log_scales: Tensor,
+        opacity_logits: Tensor,
+        dc: Tensor,
+        rest: Tensor,
+        degree: int,
+        center: Tensor,
+        forward: Tensor | None,
+        normals: bool,
+        grazing: float,
+        outward: Tensor | None,
+        strength: Tensor | None,
+        light_dc: Tensor | None,
+        light_rest: Tensor | None,
+        metalness: Tensor | None,
+        further: Tensor | None,
+    ) -> None: ...
+    @property
+    def channels(self) -> int: ...
+    def forward(
+        self, scales: Tensor, opacities: Tensor, features: Tensor, mirrored: Tensor | None
+    ) -> None: ...
+    def backward(
+        self,
+        scales: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        mirrored: Tensor | None,
+        grad_means: Tensor,
+        grad_quaternions: Tensor,
+        grad_scales: Tensor,
+        grad_opacities: Tensor,
+        grad_features: Tensor,
+        to_means: Tensor,
+        to_quaternions: Tensor,
+        to_log_scales: Tensor,
+        to_opacity_logits: Tensor,
+        to_dc: Tensor,
+        to_rest: Tensor,
+        to_strength: Tensor | None,
+        to_light_dc: Tensor | None,
+        to_light_rest: Tensor | None,
+        to_further: Tensor | None,
+    ) -> None: ...
+
+def shortest_sum(log_scales: Tensor, radii: Tensor) -> tuple[float, float]: ...
+def shortest_gradient(log_scales: Tensor, radii: Tensor, factor: float, gradient: Tensor) -> None: ...
 def photometric(
     prediction: Tensor,
     target: Tensor,
@@ -79,7 +130,7 @@ def photometric(
     weight_sum: float,
     ssim_weight: float,
     gradient: Tensor | None,
-) -> tuple[float, float]: ...
+) -> tuple[float, float, float]: ...
 def cubemap_forward(texture: Tensor, directions: Tensor, out: Tensor) -> None: ...
 def cubemap_backward(
     texture: Tensor,

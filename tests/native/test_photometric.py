@@ -14,6 +14,8 @@ from polarguide.training.photometric import (
     photometric_loss,
     photometric_loss_explicit,
     photometric_loss_reference,
+    photometric_terms,
+    photometric_terms_reference,
 )
 
 sizes = pytest.mark.parametrize(
@@ -121,6 +123,22 @@ def test_ssim_agrees_with_scikit_image(simd: str) -> None:
     assert float(reference) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize("weighted", [False, True])
+def test_squared_difference_as_shown(simd: str, weighted: bool) -> None:
+    prediction, target = pictures(33, 47)
+    weight = some_weights(33, 47) if weighted else None
+    found = photometric_terms(prediction, target, weight)
+    reference = photometric_terms_reference(
+        prediction.double(), target.double(), None if weight is None else weight.double()
+    )
+    squares = (srgb_encode(prediction.double().clamp(0, 1)) - target.double()).square().numpy()
+    expected = squares[weight.numpy() > 0].mean() if weight is not None else squares.mean()
+    assert float(found.error) == pytest.approx(float(expected), rel=2e-6)
+    assert float(reference.error) == pytest.approx(float(expected), rel=1e-9)
+    assert torch.equal(found.loss, photometric_loss(prediction, target, weight))
+    assert float(photometric_terms(prediction, target, torch.zeros(33, 47)).error) == 0
+
+
 def exact_srgb(value: float) -> float:
     return 12.92 * value if value <= 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
 
@@ -129,7 +147,7 @@ def test_kernel_srgb_is_exact_to_a_millionth(simd: str) -> None:
     """One pixel against black: the L1 term is the mean of the shown values."""
     values = [0.0, 1e-30, 1e-5, 0.0031307, 0.0031309, 1.0, 1.5, *torch.linspace(0.004, 1, 400).tolist()]
     for value in values:
-        l1, _ = _native.photometric(torch.full((1, 1, 3), value), torch.zeros(1, 1, 3), None, 1.0, 0.2, None)
+        l1, *_ = _native.photometric(torch.full((1, 1, 3), value), torch.zeros(1, 1, 3), None, 1.0, 0.2, None)
         exact = exact_srgb(min(float(torch.tensor(value)), 1.0))
         assert l1 == pytest.approx(exact, rel=1e-6, abs=1e-35)
 

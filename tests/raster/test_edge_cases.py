@@ -203,6 +203,28 @@ def test_gaussians_across_the_near_plane() -> None:
     assert max(worst["features"], worst["alpha"], worst["gradient of features"]) < 1e-4, worst
 
 
+@pytest.mark.parametrize("nearest", [1.0, 0.011], ids=["less than 256 times", "10,000 times"])
+def test_depths_of_any_range_are_in_order(nearest: float) -> None:
+    """Depths are sorted by digits of their bits, of which a range beyond 256 needs one more."""
+    count, generator = 300, torch.Generator().manual_seed(4)
+    depth = nearest * (110 / nearest) ** torch.rand(count, generator=generator)
+    depth[:4] = torch.tensor([nearest, 110.0, 50.0, 50.0])  # of two at one depth the first is in front
+    splats = Splats(
+        torch.stack((torch.zeros(count), torch.zeros(count), depth), dim=1),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4),
+        (0.2 * depth)[:, None].expand(count, 3),  # all as large in the picture
+        torch.full((count,), 0.02),
+        torch.randn(count, 3, generator=generator),
+    )
+    camera = looking_ahead(17, 16)
+    found = outcome(rasterize_cpu, splats, camera)
+    expected = outcome(rasterize_reference, splats, camera, dtype=torch.float64)
+    assert differences(found, expected)["features"] < 1e-5
+    assert differences(found, expected)["gradient of features"] < 1e-5
+    swapped = splats._replace(means=splats.means.flip(0), scales=splats.scales.flip(0))
+    assert difference(outcome(rasterize_cpu, swapped, camera).features, expected.features) > 0.01
+
+
 @BOTH
 def test_radii_are_zero_outside_the_picture_and_three_sigma_inside(rasterize: Rasterize) -> None:
     camera = looking_ahead(20, 20, focal=100.0)

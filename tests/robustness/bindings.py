@@ -143,6 +143,40 @@ def axes(rng: random.Random) -> None:
     _native.mirrored_forward(given[0], given[3], array(rng, n, 3), array(rng, n, 3))
 
 
+def splatting(rng: random.Random) -> None:
+    n, degree, k = rng.choice((*SIZES, 3000)), rng.randint(-1, 4), rng.choice((0, 1, 5, 6, 30))
+    core = [array(rng, n, *shape) for shape in ((3,), (4,), (3,), (), (3,), (15, 3))]
+    light = rng.random() < 0.5
+    others = [
+        maybe(rng, array(rng, n, 3)),
+        maybe(rng, array(rng, n)),
+        array(rng, n, 3) if light else None,
+        array(rng, n, 15, 3) if light else None,
+        maybe(rng, array(rng, n)),
+        maybe(rng, array(rng, n, k)),
+    ]
+    normals = light or rng.random() < 0.5
+    made = _native.Splatting(
+        *core, degree, array(rng, 3), maybe(rng, array(rng, 3)), normals, rng.choice((0.3, np.nan)), *others
+    )
+    d = made.channels
+    results = array(rng, n, 3), array(rng, n), array(rng, n, d)
+    mirrored = array(rng, n, 3) if light else None
+    with contextlib.suppress(ValueError, TypeError):
+        made.forward(*results, maybe(rng, mirrored) if light else None)
+    by = [array(rng, n, *shape) for shape in ((3,), (4,), (3,), (), (d,))]
+    learned = (others[1], others[2], others[3], others[5])
+    to = [None if given is None else np.zeros_like(given) for given in (*core, *learned)]
+    made.backward(*results, mirrored, *by, *to)
+
+
+def shortest(rng: random.Random) -> None:
+    n = rng.choice((*SIZES, 9000))
+    given = array(rng, n, 3), array(rng, n)
+    _native.shortest_sum(*given)
+    _native.shortest_gradient(*given, rng.choice((1.0, np.nan)), array(rng, n, 3))
+
+
 def finite(rng: random.Random) -> None:
     _native.first_not_finite(array(rng, *(rng.choice(SIZES) for _ in range(rng.randint(0, 3)))))
 
@@ -224,7 +258,7 @@ def consistency(rng: random.Random) -> None:
 
 KINDS = (
     rasterizer, photometric, cubemap, reflect, harmonics, axes, finite, gbuffer, polarization, direction,
-    consistency, metal, mips,
+    consistency, metal, mips, splatting, shortest,
 )  # fmt: skip
 
 

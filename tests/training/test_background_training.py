@@ -101,7 +101,7 @@ def test_a_step_is_pulled_to_emptiness_where_the_background_is_black(
 
 def summed_weights(made: Trainer, number: int) -> list[float]:
     """What one Gaussian adds to each training view, by pictures with it white among black ones."""
-    from polarguide.shading.gbuffer import splats
+    from polarguide.shading.splatting import splats
 
     given = splats(made.state.gaussians)
     features = torch.zeros(len(given.means), 1)

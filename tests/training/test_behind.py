@@ -118,3 +118,12 @@ def test_shares_by_depth() -> None:
     share = shares_before(depth, 2.0, 4.0)[2]
     third = (1 / 3 - 1 / 4) / (1 / 2 - 1 / 4)
     assert torch.allclose(share, torch.tensor([1, 1, 1, third, third, 0, 0]))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 6), (7, 1), (5, 8)])
+def test_a_pixel_is_as_far_as_the_farthest_of_its_neighbors(size: tuple[int, int]) -> None:
+    near, far = 2.0, 5.0
+    depth = 1 + 6 * torch.rand(size, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    farthest = torch.nn.functional.max_pool2d(depth[None], 3, 1, 1)[0]
+    expected = ((1 / farthest - 1 / far) / (1 / near - 1 / far)).clamp(0, 1)
+    torch.testing.assert_close(shares_before(depth, near, far), expected)

@@ -209,7 +209,7 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         flatness=0.9,
         stokes=1.1,
     )
-    total, photometric = step_loss(
+    total, photometric, error = step_loss(
         rendered, shown, valid, weights, priors, ssim_weight=0.3, shading=GLASS, log_scales=SCALES, extent=2.0
     )
     assert rendered.specular is not None
@@ -228,6 +228,8 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
     )
     assert float(total) == pytest.approx(float(expected), rel=1e-5)
     assert float(photometric) == pytest.approx(float(expected_photometric), rel=1e-6)
+    squares = (srgb_encode(rendered.final.clamp(0, 1)) - shown).square().mean(dim=-1)
+    assert float(error) == pytest.approx(float((valid * squares).sum() / valid.sum()), rel=1e-5)
 
 
 def test_few_polarized_pixels_pull_no_harder_than_many(priors: ViewPriors) -> None:
@@ -266,7 +268,7 @@ def test_layers_of_half_the_picture_weigh_half(priors: ViewPriors) -> None:
     some = replace(priors, separated=half)
 
     def layers(given: ViewPriors) -> float:
-        total, photometric = step_loss(
+        total, photometric, _ = step_loss(
             rendered,
             srgb_encode(picture(6)),
             None,
@@ -287,7 +289,7 @@ def test_a_perfect_picture_costs_nothing(priors: ViewPriors) -> None:
     assert priors.separated.all()
     rendered = result(final=picture(6), specular=picture(3), diffuse=picture(4), normal=priors.normal)
     weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
-    total, _ = step_loss(
+    total, *_ = step_loss(
         rendered,
         srgb_encode(picture(6)),
         None,
@@ -304,11 +306,11 @@ def test_a_perfect_picture_costs_nothing(priors: ViewPriors) -> None:
 def test_layers_that_a_recipe_lacks_are_left_out(priors: ViewPriors) -> None:
     weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
     shown = srgb_encode(picture(6))
-    total, photometric = step_loss(
+    total, photometric, _ = step_loss(
         result(), shown, None, weights, priors, ssim_weight=0.2, shading=GLASS, log_scales=SCALES, extent=2.0
     )
     assert torch.equal(total, photometric)
-    total, photometric = step_loss(
+    total, photometric, _ = step_loss(
         result(normal=unit(1)),
         shown,
         None,

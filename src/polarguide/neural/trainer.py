@@ -75,8 +75,7 @@ class FieldTrainer:
         """Those of them that are done."""
         return self.state.step
 
-    @property
-    def acts(self) -> bool:
+    def make_room(self) -> bool:
         """Whether more happens in the next step than a step."""
         return False
 

@@ -52,9 +52,8 @@ class AnyTrainer(Protocol):
     def done(self) -> int:
         """Those of them that are done."""
 
-    @property
-    def acts(self) -> bool:
-        """Whether more happens in the next step than a step: a look at all views, say."""
+    def make_room(self) -> bool:
+        """Whether more happens in the next step than a step: a look at all views, say. What it makes anew goes now."""
 
     @property
     def state(self) -> AnyState:

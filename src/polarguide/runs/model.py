@@ -11,9 +11,10 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.raster import Backend
 from polarguide.raster.in_front import alpha_in_front
-from polarguide.shading.gbuffer import render, splats
+from polarguide.shading.gbuffer import render
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
+from polarguide.shading.splatting import splats
 from polarguide.training.state import TrainingState
 
 

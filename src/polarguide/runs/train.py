@@ -201,7 +201,7 @@ class _Loop:
             # Several ranks stop after the same step, so they have to ask each other, which takes time.
             if (ranks.world == 1 or trainer.state.step % LOG_EVERY == 0) and ranks.any(self._should_stop()):
                 return True
-            if trainer.acts:
+            if trainer.make_room():
                 self._memory.clear()
             meter.take(trainer.step())
             self._memory.keep()

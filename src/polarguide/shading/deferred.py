@@ -40,6 +40,7 @@ from polarguide.shading.metal import (
 from polarguide.shading.mips import mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
+    ChannelParameters,
     GBuffer,
     Light,
     PageShading,
@@ -216,6 +217,23 @@ class DeferredShading(ShadingModel):
         if self._has_indices(gaussians):
             channels.append(gaussians["index_offset"].detach()[:, None])
         return channels
+
+    def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
+        """What ``channels`` reads; None for a class with other channels."""
+        if type(self).channels is not DeferredShading.channels:
+            return None
+        metal, further = self._has_metal(gaussians), []
+        if metal:
+            further.append(self._metals(gaussians))
+        if self._has_indices(gaussians):
+            further.append(gaussians["index_offset"].detach()[:, None])
+        return ChannelParameters(
+            gaussians["strength_logits"],
+            gaussians["local_dc"] if self.local else None,
+            gaussians["local_rest"] if self.local else None,
+            gaussians["metalness"].detach() if metal else None,
+            torch.cat(further, dim=1) if further else None,
+        )
 
     @property
     def knows_indices(self) -> bool:

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.native import fits
-from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
+from polarguide.raster.interface import Rasterize, ScreenStatistic
 from polarguide.raster.surface import surface_picture
 from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
 from polarguide.shading.native import split_native
 from polarguide.shading.result import RenderResult
+from polarguide.shading.splatting import splatting
 
 COLOR_CHANNELS = (0, 1, 2)
 NORMAL_CHANNELS = (3, 4, 5)
@@ -50,20 +50,10 @@ def render(
         surface: normals and depth are those around the median depth, without gradients; the layers are shaded as ever.
         statistic: see ``ScreenStatistic``; the color channels come first.
     """
-    pose = camera.pose(gaussians["means"].dtype, gaussians["means"].device)
-    center, means = pose.center, gaussians["means"]
-    if normals := normals or shading.needs_normals:
-        axes = shortest_axis_normals(
-            means, gaussians["quaternions"], gaussians["log_scales"], center, gaussians.get("outward")
-        )
-    else:
-        axes = means.new_empty(len(means), 0)
-    channels = shading.channels(gaussians, axes, center, sh_degree)
-    channels.insert(1, axes)
-    if depth:
-        channels.append(((means - center) @ pose.rotation[2])[:, None])
+    normals = normals or shading.needs_normals
+    given = splatting(gaussians, camera, shading, sh_degree=sh_degree, normals=normals, depth=depth)
     picture = rasterize(
-        splats(gaussians, torch.cat(channels, dim=1)),
+        given,
         camera,
         statistic=statistic,
         still=NORMAL_CHANNELS if still and normals else (),
@@ -76,7 +66,8 @@ def render(
         layers, again = shading.shade(splatted, light, camera), None
     blended = None
     if surface and (normals or depth):
-        found = surface_picture(splats(gaussians, axes if normals else torch.zeros_like(means)), camera)
+        directions = given.features[:, 3:6] if normals else torch.zeros_like(given.means)
+        found = surface_picture(given._replace(features=directions), camera)
         camera_depth = found.depth if depth else None
         if normals:
             normal, blended = picture.alpha[..., None] * found.directions, normal
@@ -118,15 +109,3 @@ def split_reference(features: Tensor, alpha: Tensor, *, normals: bool, depth: bo
     """
     normal = features[..., 3:6] if normals else None
     return features, normal, features[..., -1] / alpha.clamp(min=1e-6) if depth else None
-
-
-def splats(gaussians: Parameters, features: Tensor | None = None) -> Splats:
-    """Gaussians as a rasterizer takes them, with features [N, D]; none: one that is zero."""
-    means = gaussians["means"]
-    return Splats(
-        means,
-        gaussians["quaternions"],
-        gaussians["log_scales"].exp(),
-        torch.sigmoid(gaussians["opacity_logits"]),
-        means.new_zeros(len(means), 1) if features is None else features,
-    )

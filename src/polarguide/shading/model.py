@@ -56,6 +56,23 @@ class Parameter(NamedTuple):
     reset_minimum: float | None = None
 
 
+class ChannelParameters(NamedTuple):
+    """What a shading model's channels are made of, for the native pass; all without what is None.
+
+    Attributes:
+        strength_logits: [N] raw reflection strength.
+        light_dc, light_rest: [N, 3] and [N, 15, 3] harmonics of the mirrored direction: light of the Gaussians' own.
+        metalness: [N] 1 of those without color and strength, else 0; without a gradient.
+        further: [N, K] channels behind these, as they are.
+    """
+
+    strength_logits: Tensor | None = None
+    light_dc: Tensor | None = None
+    light_rest: Tensor | None = None
+    metalness: Tensor | None = None
+    further: Tensor | None = None
+
+
 class GBuffer(NamedTuple):
     """What was splatted for a picture that is shaded afterwards.
 
@@ -253,6 +270,10 @@ class ShadingModel(ABC):
             normals: [N, 3] unit, world axes. center: [3] of the camera. degree: of the base color's harmonics, 0 to 3.
         """
 
+    def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
+        """The same as ``channels``, where it is the base color and no more than these; None: it is not."""
+        return None
+
     @abstractmethod
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
         """Layers of a picture by their names in ``RenderResult``; ``final`` at least. And ``metal``, where there is."""
@@ -344,6 +365,10 @@ class PlainShading(ShadingModel):
     def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
         """Base color [N, 3]."""
         return [base_colors(gaussians, center, degree)]
+
+    def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
+        """Nothing but the color; None for a class with other channels."""
+        return ChannelParameters() if type(self).channels is PlainShading.channels else None
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final`` [H, W, 3]."""

@@ -11,8 +11,9 @@ from torch import Tensor
 from polarguide.camera import Camera, seen_at
 from polarguide.capture import View
 from polarguide.raster import Rasterize
-from polarguide.shading.gbuffer import render, splats
+from polarguide.shading.gbuffer import render
 from polarguide.shading.model import Parameters
+from polarguide.shading.splatting import splats
 from polarguide.vectors import unit
 
 # A Gaussian at most this much behind the rendered surface, relative to its depth, is seen.

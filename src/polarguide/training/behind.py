@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from polarguide.shading.result import RenderResult
 
@@ -35,5 +35,13 @@ def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult
 
 def shares_before(depth: Tensor, near: float, far: float) -> Tensor:
     """From 1 up to ``near`` to 0 from ``far`` on, of the farthest of the 3 x 3 neighbors; [H, W] like the depth."""
-    farthest = max_pool2d(depth[None], 3, 1, 1)[0].clamp(min=near)
+    farthest = _largest_of_three(_largest_of_three(depth).T).T.clamp(min=near)
     return ((1 / farthest - 1 / far) / (1 / near - 1 / far)).clamp(min=0)
+
+
+def _largest_of_three(values: Tensor) -> Tensor:
+    """Of each row and its two neighbors, [H, W]; many times as fast as pooling."""
+    largest = values.clone()
+    torch.maximum(values[1:], values[:-1], out=largest[1:])
+    torch.maximum(largest[:-1], values[1:], out=largest[:-1])
+    return largest

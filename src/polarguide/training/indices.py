@@ -11,9 +11,9 @@ from polarguide._native import MAX_CHANNELS
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.raster import Rasterize
-from polarguide.shading.gbuffer import splats
 from polarguide.shading.metal import any_given
 from polarguide.shading.model import Parameters
+from polarguide.shading.splatting import splats
 from polarguide.training.metals.looks import shares
 
 # Pixels of a Gaussian in all views from which on what they say counts.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
+from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.native import fits
@@ -24,7 +25,7 @@ from polarguide.training.native_terms import (
     pixel_terms,
 )
 from polarguide.training.partial import PartialView, partial_terms
-from polarguide.training.photometric import photometric_loss
+from polarguide.training.photometric import photometric_loss, photometric_terms
 from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Weights
 from polarguide.vectors import dot, unit
@@ -129,36 +130,43 @@ def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel)
     return (priors.stokes_weight * distance).mean()
 
 
-class _Shortest(torch.autograd.Function):
-    """Sum of the shortest scales where ``visible`` is 1.
+def flatness_loss_reference(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
+    """The reference implementation of ``flatness_loss``: plain torch, any dtype and device."""
+    visible = (radii > 0).to(log_scales)
+    total = (log_scales.min(dim=1).values.exp() * visible).sum()
+    return 100 / extent * total / visible.sum().clamp(min=1)
 
-    One entry in three has a gradient, which autograd would find by comparing all of them with their minimum.
-    """
 
+class _Flatness(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, log_scales: Tensor, visible: Tensor) -> Tensor:
-        shortest, which = log_scales.min(dim=1)
-        scales = shortest.exp_().mul_(visible)
-        ctx.save_for_backward(scales, which)
-        return scales.sum()
+    def forward(ctx: Any, log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
+        kept = log_scales.detach().contiguous(), radii.detach().contiguous()
+        total, count = _native.shortest_sum(*kept)
+        ctx.save_for_backward(*kept)
+        ctx.factor = 100 / extent / max(count, 1.0)
+        return log_scales.new_tensor(ctx.factor * total)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        scales, which = ctx.saved_tensors
-        to = scales.new_zeros(len(scales), 3)
-        return to.scatter_(1, which[:, None], (scales * grad)[:, None]), None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        log_scales, radii = ctx.saved_tensors
+        to = torch.empty_like(log_scales)
+        _native.shortest_gradient(log_scales, radii, ctx.factor * float(grad), to)
+        return to, None, None
 
 
 def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
     """Mean shortest scale of the visible Gaussians in percent of the scene's extent.
 
+    On the CPU in float32 it is a native pass; ``flatness_loss_reference`` is the reference implementation.
+
     Args:
         log_scales: [N, 3]. radii: [N], 0 where not visible. extent: of the scene.
     """
-    visible = (radii > 0).to(log_scales)
-    total: Tensor = _Shortest.apply(log_scales, visible)
-    return 100 / extent * total / visible.sum().clamp(min=1)
+    if not fits(log_scales, radii):
+        return flatness_loss_reference(log_scales, radii, extent)
+    loss: Tensor = _Flatness.apply(log_scales, radii, extent)
+    return loss
 
 
 def coverage_loss(alpha: Tensor, empty: Tensor) -> Tensor:
@@ -168,6 +176,19 @@ def coverage_loss(alpha: Tensor, empty: Tensor) -> Tensor:
         alpha: [H, W]. empty: [H, W] 1 where the picture shows nothing.
     """
     return (alpha * empty).sum() / empty.sum().clamp(min=1)
+
+
+class StepLoss(NamedTuple):
+    """What a step minimizes, and what it tells about itself.
+
+    Attributes:
+        total: the weighted sum of a stage's terms. photometric: that term alone, for the display.
+        error: mean squared difference of picture and photograph as shown, where the photograph counts; no gradient.
+    """
+
+    total: Tensor
+    photometric: Tensor
+    error: Tensor
 
 
 def step_loss(
@@ -184,8 +205,8 @@ def step_loss(
     camera: Camera | None = None,
     empty: Tensor | None = None,
     partial: PartialView | None = None,
-) -> tuple[Tensor, Tensor]:
-    """The weighted sum of a stage's terms, and its photometric term alone (for the display).
+) -> StepLoss:
+    """The weighted sum of a stage's terms, and how far the picture is from the photograph.
 
     Args:
         result: the rendered layers.
@@ -204,11 +225,11 @@ def step_loss(
         specular, diffuse, metal = result.held
         result = replace(result, specular=specular, diffuse=diffuse, metal=metal)
     if partial is None:
-        photometric = photometric_loss(result.final, shown, valid, ssim_weight)
-        total = weights.photometric * photometric
+        picture = photometric_terms(result.final, shown, valid, ssim_weight)
+        total = weights.photometric * picture.loss
     else:
         assert camera is not None
-        total, photometric = partial_terms(
+        total, picture = partial_terms(
             result,
             partial,
             weights,
@@ -226,7 +247,7 @@ def step_loss(
         total = total + COVERAGE * coverage_loss(result.alpha, empty)
     if total.device.type == "cpu":
         refuse_diverged(total.detach())
-    return total, photometric
+    return StepLoss(total, *picture)
 
 
 def refuse_diverged(total: Tensor) -> None:

@@ -17,7 +17,7 @@ from polarguide.capture.exposures import analyzers, radiance_places
 from polarguide.color import srgb_encode
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
-from polarguide.training.photometric import photometric_loss
+from polarguide.training.photometric import Photometric, photometric_terms
 from polarguide.training.recipe import Weights
 
 
@@ -88,7 +88,7 @@ def partial_terms(
     ssim_weight: float,
     shading: ShadingModel,
     camera: Camera,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Photometric]:
     """The weighted photometric and polarization terms of a view, and the photometric one alone.
 
     The photometric term compares what was measured with what the layers predict of it: S0/2 where that is measured,
@@ -106,11 +106,11 @@ def partial_terms(
     layers = result.specular, result.diffuse, result.normal
     predicts = shading.reflects and all(layer is not None for layer in layers)
     if not (weights.stokes and len(view.intensities) and predicts):
-        photometric = photometric_loss(result.final, view.shown, valid, ssim_weight)
-        return weights.photometric * photometric, photometric
+        picture = photometric_terms(result.final, view.shown, valid, ssim_weight)
+        return weights.photometric * picture.loss, picture
     stokes = shading.predicted_stokes(result, camera)
     expected = result.final if view.mix is None else result.final + behind_analyzer(stokes, view.mix)
-    photometric = photometric_loss(expected, view.shown, valid, ssim_weight)
+    picture = photometric_terms(expected, view.shown, valid, ssim_weight)
     half = result.final.detach()
     common: Tensor | float = 0.0
     if view.measures_radiance:
@@ -121,5 +121,5 @@ def partial_terms(
     for intensity, analyzer in zip(view.intensities, view.analyzers, strict=True):
         difference = 2 * (intensity - half) - 2 * behind_analyzer(stokes, analyzer - common)
         distance = distance + (weight * difference.abs().mean(dim=-1)).mean()
-    total = weights.photometric * photometric + weights.stokes * distance / len(view.intensities)
-    return total, photometric
+    total = weights.photometric * picture.loss + weights.stokes * distance / len(view.intensities)
+    return total, picture

@@ -8,7 +8,7 @@ between. ``photometric_loss_reference`` is the reference implementation.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,6 +22,18 @@ from polarguide.native import fits
 _WINDOW = 11
 _SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
+
+
+class Photometric(NamedTuple):
+    """How far a picture is from a photograph.
+
+    Attributes:
+        loss: as of ``photometric_loss``.
+        error: mean squared difference as shown, over the same pixels and colors; without a gradient.
+    """
+
+    loss: Tensor
+    error: Tensor
 
 
 class _Clip(torch.autograd.Function):
@@ -54,10 +66,10 @@ def _blur(planes: Tensor) -> Tensor:
     return conv2d(stack, window[None, None, :, None], padding=(_WINDOW // 2, 0))[:, 0]
 
 
-def photometric_loss_reference(
+def photometric_terms_reference(
     prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
-) -> Tensor:
-    """The reference implementation of ``photometric_loss``: plain torch, any dtype and device."""
+) -> Photometric:
+    """The reference implementation of ``photometric_terms``: plain torch, any dtype and device."""
     shown = srgb_encode(_Clip.apply(prediction))
     weight = (torch.ones_like(prediction[..., 0]) if weight is None else weight)[..., None]
     x, y = shown.permute(2, 0, 1), target.permute(2, 0, 1)
@@ -67,25 +79,39 @@ def photometric_loss_reference(
     ssim = (numerator / denominator).permute(1, 2, 0)
     per_value = (1 - ssim_weight) * (shown - target).abs() + ssim_weight * (1 - ssim)
     total = 3 * weight.sum()
-    return (weight * per_value).sum() / torch.where(total > 0, total, torch.ones_like(total))
+    count = torch.where(total > 0, total, torch.ones_like(total))
+    squared = (shown - target).detach().square()
+    return Photometric((weight * per_value).sum() / count, (weight * squared).sum() / count)
+
+
+def photometric_loss_reference(
+    prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
+) -> Tensor:
+    """The loss alone of ``photometric_terms_reference``."""
+    return photometric_terms_reference(prediction, target, weight, ssim_weight).loss
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         prediction, target = prediction.detach().contiguous(), target.detach().contiguous()
         weight = None if weight is None else weight.detach().contiguous()
         total = prediction.shape[0] * prediction.shape[1] if weight is None else float(weight.sum())
         gradient = torch.empty_like(prediction) if ctx.needs_input_grad[0] else None
-        l1, ssim = _native.photometric(prediction, target, weight, total or 1.0, ssim_weight, gradient)
+        l1, ssim, squares = _native.photometric(
+            prediction, target, weight, total or 1.0, ssim_weight, gradient
+        )
         ctx.save_for_backward(gradient)
-        return prediction.new_tensor((1 - ssim_weight) * l1 + ssim_weight * (bool(total) - ssim))
+        loss = prediction.new_tensor((1 - ssim_weight) * l1 + ssim_weight * (bool(total) - ssim))
+        error = prediction.new_tensor(squares)
+        ctx.mark_non_differentiable(error)
+        return loss, error
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None, None]:
+    def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor | None, None, None, None]:
         (gradient,) = ctx.saved_tensors
         return gradient * grad, None, None, None
 
@@ -96,7 +122,7 @@ class _Explicit(_Photometric):
     @staticmethod
     def forward(
         ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         clipped = prediction.detach().clamp(0, 1)
         x, y = srgb_encode(clipped).permute(2, 0, 1), target.permute(2, 0, 1)
         count = x.new_full((), x[0].numel()) if weight is None else weight.sum()
@@ -126,15 +152,17 @@ class _Explicit(_Photometric):
             gradient = to_x * slope
             stuck = ((prediction < 0) & (gradient > 0)) | ((prediction > 1) & (gradient < 0))
             ctx.save_for_backward(gradient.masked_fill(stuck, 0.0))
-        return loss
+        error = (share * difference.square()).sum()
+        ctx.mark_non_differentiable(error)
+        return loss, error
 
 
 def photometric_loss_explicit(
     prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Tensor:
     """``photometric_loss`` as other devices than the CPU compute it."""
-    result: Tensor = _Explicit.apply(prediction, target, weight, ssim_weight)
-    return result
+    result: tuple[Tensor, Tensor] = _Explicit.apply(prediction, target, weight, ssim_weight)
+    return result[0]
 
 
 def _check(prediction: Tensor, target: Tensor, weight: Tensor | None) -> None:
@@ -171,12 +199,18 @@ def photometric_loss(
     Raises:
         ValueError: if a shape is not as above.
     """
+    return photometric_terms(prediction, target_shown, weight, ssim_weight).loss
+
+
+def photometric_terms(
+    prediction: Tensor, target_shown: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
+) -> Photometric:
+    """``photometric_loss``, and the mean squared difference as shown, which costs next to nothing beside it."""
     _check(prediction, target_shown, weight)
     target_shown = target_shown.detach().to(prediction)
     weight = None if weight is None else weight.detach().to(prediction)
     if fits(prediction):
-        result: Tensor = _Photometric.apply(prediction, target_shown, weight, ssim_weight)
-        return result
+        return Photometric(*_Photometric.apply(prediction, target_shown, weight, ssim_weight))
     if prediction.device.type == "cpu":
-        return photometric_loss_reference(prediction, target_shown, weight, ssim_weight)
-    return photometric_loss_explicit(prediction, target_shown, weight, ssim_weight)
+        return photometric_terms_reference(prediction, target_shown, weight, ssim_weight)
+    return Photometric(*_Explicit.apply(prediction, target_shown, weight, ssim_weight))

@@ -15,7 +15,6 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.capture.background import has_black_background
 from polarguide.capture.smaller import smaller
-from polarguide.color import srgb_encode
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
 from polarguide.gaussians.initialize import orbit, scene_extent
@@ -137,10 +136,12 @@ class Trainer:
         before = self.polarizers.searched if self.begins_again else 0
         return before + self.state.step
 
-    @property
-    def acts(self) -> bool:
-        """Whether more happens in the next step than a step: a look at all views, say."""
-        return bool(self.schedule.at(self.state.step).actions)
+    def make_room(self) -> bool:
+        """Whether more happens in the next step than a step: a look at all views, say. What it makes anew goes now."""
+        actions = self.schedule.at(self.state.step).actions
+        if "refresh_priors" in actions:
+            self._sizes.refresh_priors()
+        return bool(actions)
 
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
         """Train until the last step (or ``until``), reporting each step."""
@@ -244,7 +245,7 @@ class Trainer:
             near, far = (share * self._reach for share in stage.behind)
             result = turned_behind(result, near, far)
         shown = self._sizes.feed(state.step).shown(view)
-        loss, photometric = step_loss(
+        loss = step_loss(
             result,
             shown.picture,
             shown.valid,
@@ -258,12 +259,13 @@ class Trainer:
             empty=shown.empty,
             partial=shown.partial,
         )
-        loss.backward()
+        loss.total.backward()
         gradient = statistic.gradient if statistic else None
         if counts and gradient is not None and result.radii is not None:
             self.whole = False
             state.statistics.add(gradient, result.radii, view.camera.width, view.camera.height, slot)
-        return torch.stack((photometric.detach(), _psnr(result.final, shown.picture), loss.detach()))
+        psnr = -10 * torch.log10(loss.error.clamp(min=1e-10))
+        return torch.stack((loss.photometric.detach(), psnr, loss.total.detach()))
 
     def _join_gradients(self, *, idle: bool) -> None:
         """From the gradients of this rank's views to the mean over the views of all."""
@@ -392,9 +394,3 @@ class Trainer:
             self._act("refresh_priors")
         assert self.state.frozen is not None
         return self._sizes.feed(self.state.step).priors(view, stage, self.state.frozen)
-
-
-@torch.no_grad()
-def _psnr(final: Tensor, shown: Tensor) -> Tensor:
-    error = (srgb_encode(final.clamp(0, 1)) - shown).square().mean()
-    return -10 * torch.log10(error.clamp(min=1e-10))

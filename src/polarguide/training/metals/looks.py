@@ -12,9 +12,10 @@ from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.raster import Rasterize
-from polarguide.shading.gbuffer import render, splats
+from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import any_metal
 from polarguide.shading.model import Parameters
+from polarguide.shading.splatting import splats
 from polarguide.training.priors import guide_normals
 from polarguide.vectors import dot
 

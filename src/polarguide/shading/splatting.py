@@ -1,0 +1,144 @@
+"""What is splatted of the Gaussians, from their parameters: positions, scales, opacities, and rows of features.
+
+On the CPU in float32 one native pass each way does what a shading model describes with ``ChannelParameters``;
+``splatting_reference`` asks it for its ``channels``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from polarguide import _native
+from polarguide.camera import Camera
+from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
+from polarguide.native import fits
+from polarguide.raster.interface import Splats
+from polarguide.shading.model import Parameters, ShadingModel
+
+
+def splats(gaussians: Parameters, features: Tensor | None = None) -> Splats:
+    """Gaussians as a rasterizer takes them, with features [N, D]; none: one that is zero."""
+    means = gaussians["means"]
+    return Splats(
+        means,
+        gaussians["quaternions"],
+        gaussians["log_scales"].exp(),
+        torch.sigmoid(gaussians["opacity_logits"]),
+        means.new_zeros(len(means), 1) if features is None else features,
+    )
+
+
+def splatting(
+    gaussians: Parameters,
+    camera: Camera,
+    shading: ShadingModel,
+    *,
+    sh_degree: int,
+    normals: bool,
+    depth: bool,
+) -> Splats:
+    """Gaussians as a rasterizer takes them, with what a shading model splats.
+
+    Features are its color [N, 3], with ``normals`` unit normals (``shortest_axis_normals``) in world axes [N, 3], its
+    further channels, and with ``depth`` the camera depth [N, 1] at last.
+
+    Args:
+        gaussians: with the parameters of the shading model; with ``outward`` where normals are turned to the side from
+            which they are seen. sh_degree: of the base color, 0 to 3.
+
+    Returns:
+        Differentiable in the Gaussians; the same bits for any number of threads.
+
+    Raises:
+        ValueError: the degree, or a shape, is not as above.
+    """
+    described = shading.channel_parameters(gaussians)
+    core = [gaussians[name] for name in _CORE]
+    outward = gaussians.get("outward") if normals else None
+    if described is None or not fits(*core, outward, *described):
+        return splatting_reference(
+            gaussians, camera, shading, sh_degree=sh_degree, normals=normals, depth=depth
+        )
+    pose = camera.pose(torch.float32, core[0].device)
+    forward = pose.rotation[2].contiguous() if depth else None
+    settings = _Settings(sh_degree, pose.center.contiguous(), forward, normals)
+    return Splats(*_Splatting.apply(settings, *core, outward, *described))
+
+
+def splatting_reference(
+    gaussians: Parameters,
+    camera: Camera,
+    shading: ShadingModel,
+    *,
+    sh_degree: int,
+    normals: bool,
+    depth: bool,
+) -> Splats:
+    """The reference implementation of ``splatting``: plain torch around the model's channels, any dtype and device."""
+    means = gaussians["means"]
+    pose = camera.pose(means.dtype, means.device)
+    if normals:
+        shape = means, gaussians["quaternions"], gaussians["log_scales"]
+        axes = shortest_axis_normals(*shape, pose.center, gaussians.get("outward"))
+    else:
+        axes = means.new_empty(len(means), 0)
+    channels = shading.channels(gaussians, axes, pose.center, sh_degree)
+    channels.insert(1, axes)
+    if depth:
+        channels.append(((means - pose.center) @ pose.rotation[2])[:, None])
+    return splats(gaussians, torch.cat(channels, dim=1))
+
+
+_CORE = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
+
+
+class _Settings(NamedTuple):
+    degree: int
+    center: Tensor
+    forward: Tensor | None
+    normals: bool
+
+
+def _native_splatting(settings: _Settings, core: Any, others: Any) -> Any:
+    """The native pass for these Gaussians, which it holds."""
+    degree, center, forward, normals = settings
+    return _native.Splatting(*core, degree, center, forward, normals, GRAZING, *others)
+
+
+class _Splatting(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, settings: _Settings, *given: Tensor | None) -> tuple[Tensor, ...]:
+        means, quaternions, *_ = given
+        assert means is not None
+        assert quaternions is not None
+        contiguous = [None if t is None else t.detach().contiguous() for t in given]
+        core = [t for t in contiguous[: len(_CORE)] if t is not None]
+        made = _native_splatting(settings, core, contiguous[len(_CORE) :])
+        count, light = len(means), given[len(_CORE) + 2]
+        scales, opacities = means.new_empty(count, 3), means.new_empty(count)
+        features = means.new_empty(count, made.channels)
+        learns = any(ctx.needs_input_grad)
+        mirrored = means.new_empty(count, 3) if learns and light is not None else None
+        made.forward(scales, opacities, features, mirrored)
+        if learns:
+            ctx.settings = settings
+            ctx.save_for_backward(*contiguous, scales, opacities, features, mirrored)
+        return means.view_as(means), quaternions.view_as(quaternions), scales, opacities, features
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        *given, scales, opacities, features, mirrored = ctx.saved_tensors
+        core, (outward, strength, dc, rest, metalness, further) = given[: len(_CORE)], given[len(_CORE) :]
+        others = [outward, strength, dc, rest, metalness, further]
+        to_core = [torch.empty_like(t) for t in core]
+        to_learned = [None if t is None else torch.empty_like(t) for t in (strength, dc, rest, further)]
+        results = scales, opacities, features, mirrored
+        by_results = [g.contiguous() for g in grads]
+        _native_splatting(ctx.settings, core, others).backward(*results, *by_results, *to_core, *to_learned)
+        to_strength, to_dc, to_rest, to_further = to_learned
+        return None, *to_core, None, to_strength, to_dc, to_rest, None, to_further
