@@ -105,8 +105,8 @@ class _Settings(NamedTuple):
 
 def _native_splatting(settings: _Settings, core: Any, others: Any) -> Any:
     """The native pass for these Gaussians, which it holds."""
-    degree, center, forward, normals = settings
-    return _native.Splatting(*core, degree, center, forward, normals, GRAZING, *others)
+    given: list[Any] = [*core, *settings, GRAZING, *others]
+    return _native.Splatting(*given)
 
 
 class _Splatting(torch.autograd.Function):
