@@ -34,13 +34,7 @@ DEMO = Path(__file__).resolve().parents[2] / "src/polarguide/data/demo"
 PARTS = {
     "rasterizer forward": ("Rasterizer.forward",),
     "rasterizer backward": ("Rasterizer.backward",),
-    "harmonics, axes": (
-        "harmonics_forward",
-        "harmonics_backward",
-        "axes_forward",
-        "axes_backward",
-        "mirrored_forward",
-    ),
+    "what is splatted": ("Splatting.forward", "Splatting.backward"),
     "reflection": (
         *("turn", "reflect_forward"),
         *("reflect_backward_layers", "cubemap_backward", "reflect_backward_directions"),
@@ -49,6 +43,7 @@ PARTS = {
     ),
     "photometric terms": ("photometric",),
     "normals, Stokes": ("polarization", "direction", "consistency"),
+    "flatness": ("shortest_sum", "shortest_gradient"),
 }
 
 
