@@ -126,7 +126,7 @@ template <int D> void forward(const HarmonicsArgs &a, int64_t begin, int64_t end
 }
 
 template <int D> void backward(const HarmonicsArgs &a, int64_t begin, int64_t end) {
-    const bool streams = a.streams && reinterpret_cast<uintptr_t>(a.grad_rest + rest_values * begin) % 64 == 0;
+    const bool streams = a.streams && a.grad_rest && reinterpret_cast<uintptr_t>(a.grad_rest + rest_values * begin) % 64 == 0;
     alignas(64) float columns[48 * lanes], spare[lanes * rest_values];
     for (int64_t first = begin; first < end; first += lanes) {
         const int n = end - first < lanes ? int(end - first) : lanes;

@@ -151,3 +151,21 @@ def test_errors_name_what_was_expected() -> None:
         sh_basis(means, 4)
     with pytest.raises(ValueError, match=r"dc: expected shape \[4, 3\], found \[3, 3\]"):
         _native.harmonics_forward(1, means, CENTER, dc[:3], rest, torch.empty(4, 3))
+
+
+@degrees
+def test_gradients_that_are_more_than_caches_hold_are_the_same(simd: str, degree: int) -> None:
+    """They are written past the caches; those of a few Gaussians are not."""
+    count, few = 50_003, slice(49_984, None)  # over 8 MiB; the last block is short
+    means, dc, rest = gaussians(count)
+    gradient = torch.randn(count, 3, generator=torch.Generator().manual_seed(3))
+
+    def backward(of: slice) -> list[Tensor]:
+        given = [t[of].contiguous() for t in (means, dc, rest, gradient)]
+        to = [torch.full_like(t, torch.nan) for t in given[:3]]
+        _native.harmonics_backward(degree, given[0], CENTER, given[1], given[2], given[3], *to)
+        return to
+
+    for many, alone in zip(backward(slice(None)), backward(few), strict=True):
+        assert torch.equal(many[few], alone)
+        assert torch.isfinite(many).all()

@@ -213,25 +213,26 @@ class DeferredShading(ShadingModel):
             channels.append(local_light(gaussians, directions, degree))
         if self._has_metal(gaussians):
             body = 1 - gaussians["metalness"].detach()[:, None]
-            channels = [channels[0] * body, channels[1] * body, *channels[2:], self._metals(gaussians)]
+            channels = [channels[0] * body, channels[1] * body, *channels[2:]]
+        return channels + self._further(gaussians)
+
+    def _further(self, gaussians: Parameters) -> list[Tensor]:
+        """The channels of metals and of refractive indices, where there are some."""
+        further = [self._metals(gaussians)] if self._has_metal(gaussians) else []
         if self._has_indices(gaussians):
-            channels.append(gaussians["index_offset"].detach()[:, None])
-        return channels
+            further.append(gaussians["index_offset"].detach()[:, None])
+        return further
 
     def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
         """What ``channels`` reads; None for a class with other channels."""
         if type(self).channels is not DeferredShading.channels:
             return None
-        metal, further = self._has_metal(gaussians), []
-        if metal:
-            further.append(self._metals(gaussians))
-        if self._has_indices(gaussians):
-            further.append(gaussians["index_offset"].detach()[:, None])
+        further = self._further(gaussians)
         return ChannelParameters(
             gaussians["strength_logits"],
             gaussians["local_dc"] if self.local else None,
             gaussians["local_rest"] if self.local else None,
-            gaussians["metalness"].detach() if metal else None,
+            gaussians["metalness"].detach() if self._has_metal(gaussians) else None,
             torch.cat(further, dim=1) if further else None,
         )
 
