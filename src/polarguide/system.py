@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import importlib
+import math
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 from polarguide.errors import PolarguideError
 
@@ -23,6 +24,10 @@ NEARLY, GROWTH, SETTLED = 0.9, 1.05, 3
 """Of a limit, from which on freed memory is given back; of the most that steps then hold, until it is again; and how
 many steps tell the most, some of which take more than others.
 """
+PARTLY = 0.5
+"""Of a limit, from which on freed memory is given back before what takes more than a step."""
+
+Item = TypeVar("Item")
 
 
 def _posix(module: str) -> Any | None:
@@ -198,12 +203,12 @@ class MemoryBound:
     growth of the Gaussians: pieces of former sizes lie free between those in use.
 
     Args:
-        limit: bytes that the process may hold.
+        limit: bytes that the process may hold; without one, nothing is done.
     """
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: float = math.inf) -> None:
         self._limit, self._least = limit, NEARLY * limit
-        self._bound, self._most, self._waits = self._least, 0, 0
+        self._bound, self._most, self._waits = self._least, 0.0, 0
 
     def keep(self) -> None:
         """Called between steps that each take and free the like of what the one before took."""
@@ -215,13 +220,22 @@ class MemoryBound:
             self._bound = min(max(self._least, GROWTH * self._most), self._limit)
         elif held > self._bound:
             return_freed_memory()
-            self._most, self._waits = 0, SETTLED
+            self._most, self._waits = 0.0, SETTLED
 
     def clear(self) -> None:
-        """Called before what takes and frees more than a step, as a look at all views does."""
+        """Called before what takes and frees other sizes than the work before it, as a view's targets and steps do."""
         held = resident_memory()
-        if held is not None and held > self._limit / 2:
+        if held is not None and held > PARTLY * self._limit:
             return_freed_memory()
+
+    def between(self, items: Iterable[Item]) -> Iterator[Item]:
+        """The items, each after a call of ``clear``: of what is kept of each, the next would lie beside gaps."""
+        for item in items:
+            self.clear()
+            yield item
+
+
+UNBOUNDED = MemoryBound()
 
 
 def keep_freed_memory() -> None:

@@ -75,10 +75,6 @@ class FieldTrainer:
         """Those of them that are done."""
         return self.state.step
 
-    def make_room(self) -> bool:
-        """Whether more happens in the next step than a step."""
-        return False
-
     def step(self) -> StepReport:
         """One optimizer step."""
         state, settings, field = self.state, self.settings, self.state.field

@@ -25,6 +25,7 @@ from polarguide.runs.memory import MemoryPlan, plan_field_memory, plan_memory
 from polarguide.runs.model import GaussianModel, Model
 from polarguide.runs.point_cloud import write_run_ply
 from polarguide.shading.model import ShadingModel
+from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import StepReport, TrainSettings
@@ -51,9 +52,6 @@ class AnyTrainer(Protocol):
     @property
     def done(self) -> int:
         """Those of them that are done."""
-
-    def make_room(self) -> bool:
-        """Whether more happens in the next step than a step: a look at all views, say. What it makes anew goes now."""
 
     @property
     def state(self) -> AnyState:
@@ -113,6 +111,7 @@ class Family(ABC):
         ranks: Ranks,
         store: ViewStore,
         reporter: Reporter,
+        memory: MemoryBound,
     ) -> AnyTrainer:
         """What trains; it says what it takes for granted about the scene."""
 
@@ -172,9 +171,10 @@ class GaussianFamily(Family):
         ranks: Ranks,
         store: ViewStore,
         reporter: Reporter,
+        memory: MemoryBound,
     ) -> Trainer:
         """See ``Family``."""
-        made = Trainer(scene, method, settings, backend, state, ranks, store, reporter.warn)
+        made = Trainer(scene, method, settings, backend, state, ranks, store, reporter.warn, memory)
         if made.black and settings.background == "auto":
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
         if made.polarizers.ignored:
@@ -237,6 +237,7 @@ class FieldFamily(Family):
         ranks: Ranks,
         store: ViewStore,
         reporter: Reporter,
+        memory: MemoryBound,
     ) -> FieldTrainer:
         """See ``Family``."""
         if not all(view.is_determined for view in scene.train_views):

@@ -137,7 +137,8 @@ def train(
                 reporter.say(expected.sentence())
         return_freed_memory()  # of decoded files, and of what was only measured
         store = locked.enter_context(closing(_store(plan, backend, out, reporter)))
-        trainer = family.trainer(loaded, chosen, settings, backend, state, ranks, store, reporter)
+        bound = MemoryBound(plan.peak)
+        trainer = family.trainer(loaded, chosen, settings, backend, state, ranks, store, reporter, bound)
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
@@ -146,7 +147,6 @@ def train(
                     if problem := _unsuitable(out, resume):  # another training has begun meanwhile
                         raise problem
                 configuration.save(out)
-            bound = MemoryBound(plan.peak)
             seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound).run()
         model = family.model(trainer.state, chosen, settings, backend)
         if expected is not None:
@@ -201,8 +201,6 @@ class _Loop:
             # Several ranks stop after the same step, so they have to ask each other, which takes time.
             if (ranks.world == 1 or trainer.state.step % LOG_EVERY == 0) and ranks.any(self._should_stop()):
                 return True
-            if trainer.make_room():
-                self._memory.clear()
             meter.take(trainer.step())
             self._memory.keep()
             if trainer.state.step % self._session.checkpoint_every == 0:

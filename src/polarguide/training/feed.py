@@ -13,6 +13,7 @@ from polarguide.capture.background import empty_pixels
 from polarguide.color import srgb_encode
 from polarguide.raster import Backend
 from polarguide.shading.gbuffer import render
+from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.flat import Flat, flat_surfaces
 from polarguide.training.indices import index_picture
 from polarguide.training.metals.looks import metalness_share
@@ -52,6 +53,7 @@ class Feed:
         black: whether nothing is behind the subject.
         store: keeps what is computed of the views. views: that are trained on.
         label: of what is kept; views of another size have another.
+        memory: gives back what was freed before and after the priors of a view are made.
     """
 
     def __init__(
@@ -64,9 +66,10 @@ class Feed:
         *,
         black: bool,
         label: str = "",
+        memory: MemoryBound = UNBOUNDED,
     ) -> None:
         self._backend, self._settings, self._index, self._black = backend, priors, index, black
-        self._store, self._views = store, views
+        self._store, self._views, self._memory = store, views, memory
         self._shown, self._unguided, self._priors = (label + kind for kind in ("shown", "unguided", "priors"))
         self._flat: dict[str, Flat] | None = None
         self._partial: dict[str, PartialView] = {}
@@ -116,10 +119,17 @@ class Feed:
             guide: Gaussians whose normals resolve what polarization leaves open.
         """
         fields = fields_read(stage.weights)
-        entry = self._store.get(self._priors, view.name, lambda: self._new_priors(view, fields, guide))
+
+        def make() -> Entry:
+            self._memory.clear()
+            entry = self._new_priors(view, fields, guide)
+            self._memory.clear()  # before there is a picture, which takes memory, too
+            return entry
+
+        entry = self._store.get(self._priors, view.name, make)
         if not holds(entry, fields):  # the stage reads more than the one before
             self._store.drop(self._priors, view.name)
-            entry = self._store.get(self._priors, view.name, lambda: self._new_priors(view, fields, guide))
+            entry = self._store.get(self._priors, view.name, make)
         return unpack_priors(entry, view.camera, self._settings)
 
     def _new_priors(self, view: View, fields: frozenset[str], frozen: Mapping[str, Tensor]) -> Entry:
@@ -145,6 +155,6 @@ class Feed:
         if self._flat is None:
             views = self._views if self._settings.flat else ()
             # On the CPU, so that it is the same wherever one trains.
-            found = flat_surfaces(views, self._index)
+            found = flat_surfaces(self._memory.between(views), self._index)
             self._flat = {name: flat.to(self._backend.device) for name, flat in found.items()}
         return self._flat

@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from polarguide.capture import View
 from polarguide.capture.smaller import SmallerViews
 from polarguide.raster import Backend
+from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.feed import Feed
 from polarguide.training.recipe import Recipe
 from polarguide.training.view_store import ViewStore
@@ -18,7 +19,7 @@ class Sizes:
     Args:
         backend: device and rasterizer. recipe: the method. index: of refraction.
         store: keeps what is computed of the views. views: that are trained on. steps: of the training.
-        black: whether nothing is behind the subject.
+        black: whether nothing is behind the subject. memory: gives back what was freed.
     """
 
     def __init__(
@@ -31,6 +32,7 @@ class Sizes:
         steps: int,
         *,
         black: bool,
+        memory: MemoryBound = UNBOUNDED,
     ) -> None:
         self.until = coarse_steps(recipe, views, steps)
         small = SmallerViews(views, recipe.coarse.factor) if self.until else views
@@ -44,6 +46,7 @@ class Sizes:
                 self._views[coarse],
                 black=black,
                 label="small " if coarse else "",
+                memory=memory,
             )
             for coarse in ((True, False) if self.until else (False,))
         }

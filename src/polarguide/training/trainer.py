@@ -22,6 +22,7 @@ from polarguide.raster import Backend, ScreenStatistic
 from polarguide.shading.gbuffer import COLOR_CHANNELS, render
 from polarguide.shading.model import PLAIN
 from polarguide.shading.visibility import outward_directions, touched_pixels
+from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
 from polarguide.training.behind import turned_behind
 from polarguide.training.distributed import ALONE, Ranks
@@ -62,6 +63,7 @@ class Trainer:
         ranks: the processes that share the views of each step.
         store: keeps what is computed of the views; None: in memory.
         warn: told what the user should know.
+        memory: gives back what was freed before more is taken than a step does.
 
     Attributes:
         shading: the recipe's, for the run's refractive index.
@@ -80,9 +82,10 @@ class Trainer:
         ranks: Ranks = ALONE,
         store: ViewStore | None = None,
         warn: Callable[[str], None] = lambda _: None,
+        memory: MemoryBound = UNBOUNDED,
     ) -> None:
         self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
-        self.ranks, self._device = ranks, backend.device
+        self.ranks, self._device, self._memory = ranks, backend.device, memory
         self.whole = True
         self.shading = recipe.shading.bind(settings.refractive_index)
         self.black = is_black(scene, settings)
@@ -96,7 +99,7 @@ class Trainer:
         self._empty = empty.to(self._device)
         self._store = store or ViewStore()
         self._set_up()
-        self._metals = MetalSearch(scene, recipe, settings, self.shading, backend, ranks, warn)
+        self._metals = MetalSearch(scene, recipe, settings, self.shading, backend, ranks, warn, memory)
         self._metals.warn_if_never(self._refreshes())
         self._warn_of_indices(warn)
 
@@ -114,7 +117,9 @@ class Trainer:
         self._limit = settings.gaussians or int(pixels / recipe.densification.pixels_each)
         store = ViewStore() if self._searches else self._store
         index = settings.refractive_index
-        self._sizes = Sizes(self.backend, recipe, index, store, self._views, steps, black=self.black)
+        self._sizes = Sizes(
+            self.backend, recipe, index, store, self._views, steps, black=self.black, memory=self._memory
+        )
         self._use_batch_rates()
 
     def _first_state(self) -> TrainingState:
@@ -135,13 +140,6 @@ class Trainer:
         """Those of them that are done."""
         before = self.polarizers.searched if self.begins_again else 0
         return before + self.state.step
-
-    def make_room(self) -> bool:
-        """Whether more happens in the next step than a step: a look at all views, say. What it makes anew goes now."""
-        actions = self.schedule.at(self.state.step).actions
-        if "refresh_priors" in actions:
-            self._sizes.refresh_priors()
-        return bool(actions)
 
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
         """Train until the last step (or ``until``), reporting each step."""
@@ -203,7 +201,7 @@ class Trainer:
         state, views, faint = self.state, self._views, self.recipe.densification.faint_pixels
         if not (self.black or faint):
             return
-        cameras = [view.camera for view in views]
+        cameras = self._memory.between(view.camera for view in views)
         touched = touched_pixels(state.gaussians, cameras, self.backend.rasterize)
         for values in touched:
             self.ranks.broadcast(values)
@@ -339,15 +337,15 @@ class Trainer:
             propagate_normals(self.state, self.shading, self.recipe.propagation, generator, rest)
         elif action == "orient_normals":
             gaussians, rasterize = self.state.gaussians, self.backend.rasterize
-            outward = outward_directions(gaussians, self._views, rasterize)
+            outward = outward_directions(gaussians, self._memory.between(self._views), rasterize)
             self.ranks.broadcast(outward)
             gaussians.overwrite("outward", outward)
         else:
+            self._sizes.refresh_priors()  # first: they leave room to look at all views
             if self._metals.is_due(self.state.step / self._steps):
                 self._metals.look(self.state, self._views)
             self._heed_indices()
             self.state.frozen = self.state.gaussians.snapshot()
-            self._sizes.refresh_priors()
 
     def _warn_of_indices(self, warn: Callable[[str], None]) -> None:
         """Say where refractive indices of single things, which the scene lists, count for nothing."""

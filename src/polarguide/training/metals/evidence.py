@@ -14,8 +14,9 @@ from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.raster import Rasterize
 from polarguide.shading.metal import FIRST_REFLECTANCE
 from polarguide.shading.model import Parameters
+from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.metals.explanations import DARK, oblique_light, residuals
-from polarguide.training.metals.looks import seen_by, seen_of
+from polarguide.training.metals.looks import MOST_VIEWS, evenly, seen_by, seen_of
 from polarguide.training.metals.words import LEAST_SEEN, said_by
 from polarguide.vectors import dot
 
@@ -77,15 +78,24 @@ class _Explained(NamedTuple):
 
 @torch.no_grad()
 def evidence(
-    gaussians: Parameters, views: Sequence[View], rasterize: Rasterize, refractive_index: float
+    gaussians: Parameters,
+    views: Sequence[View],
+    rasterize: Rasterize,
+    refractive_index: float,
+    memory: MemoryBound = UNBOUNDED,
 ) -> Evidence:
     """What views say of each Gaussian; see ``training.metals.explanations``.
 
     Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
     """
-    said = said_by(gaussians, views, rasterize)
-    measured = [view for view in views if view.is_determined]
-    explained = _explained(seen_by(gaussians, measured, rasterize), refractive_index) if measured else None
+    said = said_by(gaussians, memory.between(views), rasterize)
+    explained = None
+    if measured := evenly([view for view in views if view.is_determined], MOST_VIEWS):
+        looks = seen_by(gaussians, memory.between(measured), rasterize)
+        memory.clear()
+        explained = _explained(looks, refractive_index)
+        del looks
+    memory.clear()
     near, alike = _neighborhoods(gaussians)
     if explained is None:
         return _nothing_measured(near, alike, said)

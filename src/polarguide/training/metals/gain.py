@@ -11,6 +11,7 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import Light, ShadingModel
+from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.metals.looks import evenly
 
 # Of how many views the gain of the light is taken, and where.
@@ -19,7 +20,12 @@ GAIN_VIEWS, CLEAR_SHARE, LEAST_COVERED, MOST_GAIN = 10, 0.6, 0.003, 4.0
 
 @torch.no_grad()
 def light_gain(
-    gaussians: Gaussians, light: Light, views: Sequence[View], rasterize: Rasterize, shading: ShadingModel
+    gaussians: Gaussians,
+    light: Light,
+    views: Sequence[View],
+    rasterize: Rasterize,
+    shading: ShadingModel,
+    memory: MemoryBound = UNBOUNDED,
 ) -> float:
     """By how much the light should be brighter, as the first metals show it.
 
@@ -30,7 +36,7 @@ def light_gain(
         so little that strengths would have to exceed 1.
     """
     ratios, pixels = [], 0
-    for view in evenly(views, GAIN_VIEWS):
+    for view in memory.between(evenly(views, GAIN_VIEWS)):
         shown = view.photograph().to(gaussians["means"].device).flatten(0, 1)
         metal = render(gaussians, view.camera, rasterize, shading=shading, light=light).metal
         pixels += len(shown)

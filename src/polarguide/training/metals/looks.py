@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -20,6 +20,7 @@ from polarguide.training.priors import guide_normals
 from polarguide.vectors import dot
 
 MOST_VIEWS = 32
+"""That are asked."""
 # A view counts if the Gaussian shows at least this share of what it shows in its best view.
 LEAST_SHARE = 0.3
 # Cosines of zeniths that count: head-on nothing is polarized, at grazing angles normals and reflectances are unsure.
@@ -38,11 +39,11 @@ class Seen(NamedTuple):
     cosine: Tensor
 
 
-def seen_by(gaussians: Parameters, views: Sequence[View], rasterize: Rasterize) -> list[Tensor]:
-    """Sums [N, 11] over the pixels of each view that determines the Stokes vector, at least one; ``MOST_VIEWS`` of them
-    at most, evenly. ``seen_of`` tells what they say of some of the Gaussians.
+def seen_by(gaussians: Parameters, views: Iterable[View], rasterize: Rasterize) -> list[Tensor]:
+    """Sums [N, 11] over the pixels of each view, all of which determine the Stokes vector. ``seen_of`` tells what they
+    say of some of the Gaussians.
     """
-    return [_look(gaussians, view, rasterize) for view in evenly(views, MOST_VIEWS)]
+    return [_look(gaussians, view, rasterize) for view in views]
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:

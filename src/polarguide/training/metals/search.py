@@ -12,7 +12,7 @@ from polarguide.capture.view import listed
 from polarguide.gaussians.initialize import far_away
 from polarguide.raster import Backend
 from polarguide.shading.model import ShadingModel
-from polarguide.system import return_freed_memory
+from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
 from polarguide.training.metals.decision import REACH, decide
 from polarguide.training.metals.evidence import evidence
@@ -30,7 +30,7 @@ class MetalSearch:
         scene: the capture. recipe: says between which shares of the steps metals are looked for.
         settings: the user's choices. shading: the recipe's, for the run's refractive index.
         backend: device and rasterizer. ranks: the processes that share the work.
-        warn: told what the user should know.
+        warn: told what the user should know. memory: gives back what was freed of each view that is looked at.
     """
 
     def __init__(
@@ -42,9 +42,11 @@ class MetalSearch:
         backend: Backend,
         ranks: Ranks,
         warn: Callable[[str], None],
+        memory: MemoryBound,
     ) -> None:
         self._scene, self._between, self._shading = scene, recipe.metals, shading
         self._index, self._backend, self._ranks, self._warn = settings.refractive_index, backend, ranks, warn
+        self._memory = memory
         self._on = shading.knows_metals and settings.materials == "auto"
         self._told = False
 
@@ -74,9 +76,9 @@ class MetalSearch:
         if not any(view.is_determined or view.materials is not None for view in views):
             return
         gaussians, rasterize = state.gaussians, self._backend.rasterize
-        return_freed_memory()  # of steps: what is looked at has other sizes
-        found = evidence(gaussians, views, rasterize, self._index)
-        if not self._told and (wrong := contradicted(gaussians, views, rasterize, found.said)):
+        found = evidence(gaussians, views, rasterize, self._index, self._memory)
+        each = self._memory.between(views)
+        if not self._told and (wrong := contradicted(gaussians, each, rasterize, found.said)):
             self._told = True
             names = listed([f"materials/{name}.png" for name in wrong])
             self._warn(
@@ -90,10 +92,10 @@ class MetalSearch:
         for values in (metal, reflectance):
             self._ranks.broadcast(values)
         shown = [view for view in views if view.is_determined]
-        gain = partial(light_gain, gaussians, state.light, shown, rasterize, self._shading)
+        gain = partial(light_gain, gaussians, state.light, shown, rasterize, self._shading, self._memory)
         self._shading.become_metal(gaussians, state.light, metal > 0, reflectance, gain)
         del found
-        return_freed_memory()
+        self._memory.clear()
 
 
 def _names_metals(view: View) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ LEAST_SEEN = 0.3
 CONTRADICTED = 0.15
 
 
-def said_by(gaussians: Parameters, views: Sequence[View], rasterize: Rasterize) -> Tensor:
+def said_by(gaussians: Parameters, views: Iterable[View], rasterize: Rasterize) -> Tensor:
     """Weight [N, 2] of the pixels that the user calls dielectric and metal, over the views."""
     means = gaussians["means"].detach()
     said = means.new_zeros(len(means), 2)
@@ -29,7 +29,7 @@ def said_by(gaussians: Parameters, views: Sequence[View], rasterize: Rasterize) 
 
 
 def contradicted(
-    gaussians: Parameters, views: Sequence[View], rasterize: Rasterize, said: Tensor
+    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, said: Tensor
 ) -> dict[str, float]:
     """Views whose words the other views contradict, the most contradicted first, with the share of those words of
     which others say anything.
