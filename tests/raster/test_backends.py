@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
 from raster_scenes import Outcome, differences, in_view, outcome, posed, same_bits
 
 from polarguide import _native
-from polarguide.raster import Splats, choose_backend, rasterize_reference
+from polarguide.raster import Splats, choose_backend, cpu, rasterize_reference
 from polarguide.raster.cpu import native_rasterizer, rasterize_cpu
 
 # Float32 against float64. Sums over some hundred pixels and some ten layers round off about 1e-6.
@@ -17,7 +18,8 @@ TOLERANCE = 1e-5
 # A lone pixel's pull is summed about the tile's center, eight pixels away: nothing averages the rounding out.
 LONE_PIXEL_TOLERANCE = 1e-4
 CHANNELS = (1, 3, 4, 5, 7, 8, 11, 12, 16, 20, 32)
-SIZES = ((1, 1), (3, 2), (16, 16), (17, 33), (31, 18), (50, 37))
+# The last has several groups of tiles each way.
+SIZES = ((1, 1), (3, 2), (16, 16), (17, 33), (31, 18), (50, 37), (210, 150))
 STATISTICS = (None, (0, 1, 2), (1, 4), (2,))
 
 
@@ -177,3 +179,28 @@ def test_gradients_follow_inputs_that_are_views_or_not_contiguous() -> None:
     torch.testing.assert_close(turned.grad.T, expected.gradients.means)
     torch.testing.assert_close(wide.grad[:, :4], expected.gradients.features)
     assert not wide.grad[:, 4:].any()
+
+
+@pytest.mark.parametrize("records", [True, False], ids=["gradients", "none"])
+def test_what_a_gradient_needs_is_kept_where_there_can_be_one(
+    monkeypatch: pytest.MonkeyPatch, records: bool
+) -> None:
+    """Parameters say that they need a gradient even where none is recorded."""
+    kept: list[bool] = []
+    made: list[Any] = []
+
+    class Watched:
+        def __init__(self, *arguments: Any) -> None:
+            made.append(native_rasterizer(*arguments))
+
+        def forward(self, *arguments: Any, for_backward: bool) -> None:
+            kept.append(for_backward)
+            made[-1].forward(*arguments, for_backward=for_backward)
+
+    monkeypatch.setattr(cpu, "native_rasterizer", Watched)
+    camera = posed(20, 20)
+    learned = Splats(*(t.requires_grad_() for t in in_view(camera, 10, 3, seed=0)))
+    with torch.set_grad_enabled(records):
+        picture = rasterize_cpu(learned, camera)
+    assert kept == [records]
+    assert picture.features.requires_grad == records

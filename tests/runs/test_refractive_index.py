@@ -117,7 +117,7 @@ def test_a_training_keeps_within_its_memory_after_every_step(
         demo_scene, tmp_path / "run", settings=TrainSettings(every), reading=SceneOptions(4, memory=2.0)
     )
     assert steps == every
-    # Each guided step makes the targets of a view that had none. Each view is looked at after the last step with density
+    # A guided step makes the targets of a view that had none. Each view is looked at after the last step with density
     # control, and before the last stage.
     schedule = Schedule(recipe_named("polarguide-stokes"), every)
     times = [cleared.count(step) for step in range(every)]

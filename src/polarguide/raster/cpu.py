@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from polarguide import _native
 from polarguide.camera import Camera
+from polarguide.native import applied
 from polarguide.raster.interface import (
     NEAR_PLANE,
     Rasterized,
@@ -110,4 +111,4 @@ def rasterize_cpu(
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             found, remedy = f"{tensor.dtype} on {tensor.device}", "Convert it, or use rasterize_reference."
             raise refusal(name, "float32 on the CPU", found, remedy)
-    return Rasterized(*_Rasterize.apply(camera, statistic, still, *splats))
+    return Rasterized(*applied(_Rasterize, camera, statistic, still, *splats))

@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from polarguide import _native
 from polarguide.camera import Camera
+from polarguide.native import applied
 from polarguide.shading.mips import mips_backward
 
 
@@ -151,8 +152,8 @@ def reflect_native(
     Raises:
         ValueError: if a shape is not as above.
     """
-    layers: tuple[Tensor, ...] = _Reflect.apply(
-        features, rays, texels, fresnel, local, refractive_index, index, held, metal, *levels
+    layers: tuple[Tensor, ...] = applied(
+        _Reflect, features, rays, texels, fresnel, local, refractive_index, index, held, metal, *levels
     )
     return layers
 

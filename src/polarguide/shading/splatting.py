@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
-from polarguide.native import fits
+from polarguide.native import applied, fits
 from polarguide.raster.interface import Splats
 from polarguide.shading.model import Parameters, ShadingModel
 
@@ -66,7 +66,7 @@ def splatting(
     pose = camera.pose(torch.float32, core[0].device)
     forward = pose.rotation[2].contiguous() if depth else None
     settings = _Settings(sh_degree, pose.center.contiguous(), forward, normals)
-    return Splats(*_Splatting.apply(settings, *core, outward, *described))
+    return Splats(*applied(_Splatting, settings, *core, outward, *described))
 
 
 def splatting_reference(
