@@ -12,7 +12,7 @@ namespace polarguide {
 
 constexpr int tile_size = 16;   // pixels; a tile is 4 x 4 blocks of 4 x 4 pixels, and one block is one vector
 constexpr int max_channels = 32;
-constexpr int screen_values = 6; // per Gaussian: x, y, and the exponent's factors (see ProjectArgs)
+constexpr int screen_values = 8; // per Gaussian: x, y, the exponent's factors, and where it peaks (see ProjectArgs)
 constexpr int instance_extra = 8; // per instance, behind the D feature gradients: x y, conic a b c, opacity, statistic x y
 
 struct PinholeCamera {
@@ -26,27 +26,33 @@ struct ProjectArgs {
     int64_t count;
     const float *means, *quaternions, *scales, *opacities; // [N,3] [N,4] [N,3] [N]
     PinholeCamera camera;
-    // Out. `screen` rows: x, y (pixels), A, B, C, L with log2(alpha) = A dx^2 + B dx dy + C dy^2 + L.
-    float *screen;  // [N,6]
+    // Out. `screen` rows: x, y (pixels), A, B, C, L with log2(alpha) = A dx^2 + B dx dy + C dy^2 + L, and the dy / dx at
+    // which that is largest for a given dx, and dx / dy for a given dy.
+    float *screen;  // [N,8]
     float *depth;   // [N]
     float *radius;  // [N] three standard deviations of the wider axis in pixels, 0 where culled
     int32_t *box;   // [N,4] first and last-plus-one tile in x and y; empty where culled
 };
 
+// Tiles of one row that lie side by side. What a Gaussian touches of a row is one run: an ellipse is convex.
+struct TileRun {
+    uint16_t row, begin, end; // columns, the last one not included
+};
+
 struct TileEmitArgs {
     const float *screen;
     const int32_t *box;
-    const int64_t *offset;  // [N] where this Gaussian's candidates begin
-    int tiles_x;
-    int32_t *tiles;         // [candidates] the tiles it really touches, packed from its offset on
-    int32_t *touched;       // [N] how many
+    const int64_t *offset;  // [N] where this Gaussian's runs begin
+    TileRun *runs;          // [rows of tiles of all boxes] the tiles it really touches, from its offset on
+    int32_t *count;         // [N] how many runs
+    int32_t *touched;       // [N] how many tiles
 };
 
 struct RasterArgs {
     int channels;     // D of this instantiation (padded)
     int channels_real;
     int width, height, tiles_x, tiles_y;
-    const float *screen;            // [N,6]
+    const float *screen;            // [N,8]
     const float *features;          // [N, channels_real]
     const int32_t *permutation;     // [channels_real] statistic channels first
     bool in_order;                  // it leaves every channel where it is

@@ -18,17 +18,17 @@ alignas(64) const float lane_y[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.
                                       .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
 // The blocks (one bit each) of a tile in which log2(alpha) of a Gaussian can reach the threshold. The maximum of the
-// concave exponent over a block lies on one of the two sides that face the center. `row` is relative to the tile center.
-POLARGUIDE_INLINE uint32_t touched_blocks(const float *row) {
+// concave exponent over a block lies on one of the two sides that face the center. `row` is relative to the tile center;
+// `to_y` and `to_x` are where the exponent peaks, as of ProjectArgs.
+POLARGUIDE_INLINE uint32_t touched_blocks(const float *row, float to_y, float to_x) {
     uint32_t blocks = 0;
-    const float half_ac = -0.5f * row[3], to_y = half_ac / row[4], to_x = half_ac / row[2];
     for (int l = 0; l < lanes; l += reg_lanes) {
         const reg bx = reg_load(lane_x + l) * 4.0f - row[0], by = reg_load(lane_y + l) * 4.0f - row[1];
         const reg x0 = bx - 1.5f, x1 = bx + 1.5f, y0 = by - 1.5f, y1 = by + 1.5f;
         const reg cx = clamp(reg{}, x0, x1), cy = clamp(reg{}, y0, y1);
         const reg a = reg_splat(row[2]), b = reg_splat(row[3]), c = reg_splat(row[4]);
         const reg ey = clamp(cx * to_y, y0, y1), ex = clamp(cy * to_x, x0, x1);
-        const reg q1 = a * cx * cx + b * cx * ey + c * ey * ey, q2 = a * ex * ex + b * ex * cy + c * cy * cy;
+        const reg q1 = (a * cx + b * ey) * cx + c * ey * ey, q2 = (c * cy + b * ex) * cy + a * ex * ex;
         blocks |= bits(at_least(max(q1, q2) + row[5], reg_splat(log2_minimum - 1e-4f))) << l;
     }
     return blocks;
@@ -73,14 +73,14 @@ template <int D> POLARGUIDE_INLINE Tile gather_tile(const RasterArgs &a, int64_t
         const float *screen = a.screen + g * screen_values, *features = a.features + g * real;
         float *row = rows + int64_t(i) * (D + 6);
         row[0] = screen[0] - t.center_x, row[1] = screen[1] - t.center_y;
-        __builtin_memcpy(row + 2, screen + 2, (screen_values - 2) * sizeof(float));
+        __builtin_memcpy(row + 2, screen + 2, 4 * sizeof(float));
         if (in_order<D>(a)) {
             __builtin_memcpy(row + 6, features, D * sizeof(float));
         } else {
             for (int k = 0; k < real; ++k) row[6 + k] = features[a.permutation[k]];
             for (int k = real; k < D; ++k) row[6 + k] = 0.0f;
         }
-        blocks[i] = uint16_t(touched_blocks(row));
+        blocks[i] = uint16_t(touched_blocks(row, screen[6], screen[7]));
     }
     return t;
 }

@@ -3,49 +3,11 @@
 #include "parallel.h"
 
 #include <algorithm>
-#include <cstring>
 
 namespace polarguide {
 namespace {
 
 constexpr int64_t gaussian_chunk = 512;
-
-// Order of the visible Gaussians by depth, ties by index: a radix sort on the bits of the (positive) depths.
-std::vector<int32_t> depth_order(const float *depth, const int32_t *touched, int64_t count) {
-    std::vector<int32_t> order, other;
-    std::vector<uint32_t> keys, other_keys;
-    order.reserve(size_t(count)), keys.reserve(size_t(count)); // touched: its depth is positive, and ordered as its bits
-    for (int64_t g = 0; g < count; ++g)
-        if (touched[g] > 0) {
-            uint32_t key;
-            std::memcpy(&key, depth + g, 4);
-            order.push_back(int32_t(g)), keys.push_back(key);
-        }
-    other.resize(order.size()), other_keys.resize(keys.size());
-    // Depths of one picture mostly differ by a factor of some hundred: less the least of them, two digits are enough.
-    uint32_t least = ~0u, most = 0;
-    for (uint32_t k : keys) least = std::min(least, k), most = std::max(most, k);
-    for (uint32_t &k : keys) k -= least;
-    int bits = 1;
-    while (bits < 32 && (most - least) >> bits) ++bits;
-    const int digit = bits <= 26 ? 13 : 11, buckets = 1 << digit;
-    std::vector<int64_t> begin(static_cast<size_t>(buckets));
-    for (int shift = 0; shift < bits; shift += digit) {
-        std::fill(begin.begin(), begin.end(), 0);
-        for (uint32_t k : keys) ++begin[(k >> shift) & (buckets - 1)];
-        int64_t sum = 0;
-        for (auto &b : begin) {
-            int64_t n = b;
-            b = sum, sum += n;
-        }
-        for (size_t i = 0; i < keys.size(); ++i) {
-            int64_t to = begin[(keys[i] >> shift) & (buckets - 1)]++;
-            other[size_t(to)] = order[i], other_keys[size_t(to)] = keys[i];
-        }
-        order.swap(other), keys.swap(other_keys);
-    }
-    return order;
-}
 
 } // namespace
 
@@ -61,15 +23,13 @@ Rasterizer::Rasterizer(const PinholeCamera &camera, std::vector<int32_t> permuta
       tiles_y_((camera.height + tile_size - 1) / tile_size) {}
 
 void Rasterizer::bin(int64_t count, bool for_backward) {
-    // Candidate tiles of each Gaussian's box, of which it keeps those it really touches.
+    // Of each Gaussian's box, the tiles that it really touches: a run in each row.
     std::vector<int64_t> offset(size_t(count) + 1, 0);
-    for (int64_t g = 0; g < count; ++g) {
-        const int32_t *b = box_.get() + 4 * g;
-        offset[size_t(g) + 1] = offset[size_t(g)] + int64_t(b[1] - b[0]) * (b[3] - b[2]);
-    }
-    Buffer<int32_t> tiles, touched;
-    tiles.resize(offset[size_t(count)] + 1), touched.resize(count);
-    TileEmitArgs args{screen_.get(), box_.get(), offset.data(), tiles_x_, tiles.get(), touched.get()};
+    for (int64_t g = 0; g < count; ++g) offset[size_t(g) + 1] = offset[size_t(g)] + box_.get()[4 * g + 3] - box_.get()[4 * g + 2];
+    Buffer<TileRun> runs;
+    Buffer<int32_t> run_count, touched;
+    runs.resize(offset[size_t(count)] + 1), run_count.resize(count), touched.resize(count);
+    TileEmitArgs args{screen_.get(), box_.get(), offset.data(), runs.get(), run_count.get(), touched.get()};
     auto emit = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(emit_tiles)(args, b, e); };
     parallel_chunks(count, gaussian_chunk, emit);
 
@@ -78,62 +38,7 @@ void Rasterizer::bin(int64_t count, bool for_backward) {
     first[0] = 0;
     for (int64_t g = 0; g < count; ++g) first[g + 1] = first[g] + touched.get()[g];
     instance_count_ = first[count];
-    gaussians_.resize(instance_count_);
-    if (for_backward) instances_.resize(instance_count_);
-    sort_into_tiles(depth_order(depth_.get(), touched.get(), count), tiles.get(), offset.data(), touched.get(), for_backward);
-}
-
-void Rasterizer::sort_into_tiles(const std::vector<int32_t> &order, const int32_t *tiles, const int64_t *offset,
-                                 const int32_t *touched, bool for_backward) {
-    // The order is cut into parts, one a thread. What a part has in a tile comes behind what the parts before it have
-    // there, so that the result is the same for any number of them.
-    const int64_t tile_count = int64_t(tiles_x_) * tiles_y_, parts = thread_count();
-    const int64_t length = (int64_t(order.size()) + parts - 1) / parts;
-    std::vector<int64_t> next(size_t(parts * tile_count), 0); // first how many, then where the next goes
-    const int64_t *first = instance_begin_.get();
-    auto each = [&](int64_t part, auto &&body) { // body(Gaussian, the tiles it touches, how many)
-        constexpr int64_t ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
-        const int64_t end = std::min(int64_t(order.size()), (part + 1) * length);
-        for (int64_t k = part * length; k < end; ++k) {
-            if (k + 2 * ahead < end) {
-                const int32_t later = order[size_t(k + 2 * ahead)];
-                __builtin_prefetch(offset + later), __builtin_prefetch(touched + later), __builtin_prefetch(first + later);
-            }
-            if (k + ahead < end) __builtin_prefetch(tiles + offset[order[size_t(k + ahead)]]);
-            const int32_t g = order[size_t(k)];
-            body(g, tiles + offset[g], touched[g]);
-        }
-    };
-    auto count = [&](int64_t part, int64_t, int) {
-        int64_t *here = next.data() + part * tile_count;
-        each(part, [&](int32_t, const int32_t *t, int32_t n) {
-            for (int32_t i = 0; i < n; ++i) ++here[t[i]];
-        });
-    };
-    parallel_chunks(parts, 1, count);
-    tile_begin_.resize(tile_count + 1);
-    int64_t sum = 0;
-    longest_ = 0;
-    for (int64_t t = 0; t < tile_count; ++t) {
-        tile_begin_.get()[t] = sum;
-        for (int64_t part = 0; part < parts; ++part) {
-            const int64_t n = next[size_t(part * tile_count + t)];
-            next[size_t(part * tile_count + t)] = sum, sum += n;
-        }
-        longest_ = std::max(longest_, sum - tile_begin_.get()[t]);
-    }
-    tile_begin_.get()[tile_count] = sum;
-    auto place = [&](int64_t part, int64_t, int) {
-        int64_t *here = next.data() + part * tile_count;
-        each(part, [&](int32_t g, const int32_t *t, int32_t n) {
-            for (int32_t i = 0; i < n; ++i) {
-                const int64_t slot = here[t[i]]++;
-                gaussians_.get()[slot] = g;
-                if (for_backward) instances_.get()[slot] = first[g] + i;
-            }
-        });
-    };
-    parallel_chunks(parts, 1, place);
+    lists_.sort(args, depth_.get(), first, count, tiles_x_, tiles_y_, for_backward);
 }
 
 RasterArgs Rasterizer::raster_args(const GaussianInputs &in) const {
@@ -142,9 +47,9 @@ RasterArgs Rasterizer::raster_args(const GaussianInputs &in) const {
     a.width = camera_.width, a.height = camera_.height, a.tiles_x = tiles_x_, a.tiles_y = tiles_y_;
     a.screen = screen_.get(), a.features = in.features, a.permutation = permutation_.data();
     a.in_order = std::is_sorted(permutation_.begin(), permutation_.end());
-    a.tile_begin = tile_begin_.get(), a.gaussians = gaussians_.get();
+    a.tile_begin = lists_.begin(), a.gaussians = lists_.gaussians();
     if (kept_) {
-        a.instances = instances_.get(), a.rows = rows_.get(), a.blocks = blocks_.get();
+        a.instances = lists_.instances(), a.rows = rows_.get(), a.blocks = blocks_.get();
         a.transmittance = transmittance_.get();
     }
     a.statistic_channels = statistic_channels_;
@@ -163,8 +68,8 @@ template <class F> void Rasterizer::for_tiles(F &&body) {
     auto run = [&](int64_t begin, int64_t end, int worker) {
         Worker &w = workers[size_t(worker)];
         if (!w.scratch.rows) {
-            w.rows.resize(longest_ * (channels_ + 6) + 16), w.blocks.resize(longest_ + 16), w.list.resize(longest_ + 16);
-            w.moments.resize(longest_ * std::max(channels_ + 9, 16) + 32);
+            w.rows.resize(lists_.longest() * (channels_ + 6) + 16), w.blocks.resize(lists_.longest() + 16), w.list.resize(lists_.longest() + 16);
+            w.moments.resize(lists_.longest() * std::max(channels_ + 9, 16) + 32);
             w.scratch = {w.rows.get(), w.blocks.get(), w.list.get(), w.moments.get()};
         }
         for (int64_t tile = begin; tile < end; ++tile) body(tile, w.scratch);

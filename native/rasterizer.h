@@ -1,24 +1,11 @@
 // One picture: from Gaussians to channels and back. Owns what the backward pass needs from the forward pass.
 #pragma once
 #include "raster.h"
+#include "tile_lists.h"
 
-#include <memory>
 #include <vector>
 
 namespace polarguide {
-
-// An uninitialized array: pages are touched by the threads that use them.
-template <class T> class Buffer {
-  public:
-    void resize(int64_t count) {
-        if (count > capacity_) data_.reset(new T[size_t(count)]), capacity_ = count;
-    }
-    T *get() const { return data_.get(); }
-
-  private:
-    std::unique_ptr<T[]> data_;
-    int64_t capacity_ = 0;
-};
 
 struct GaussianInputs {
     int64_t count;
@@ -52,9 +39,6 @@ class Rasterizer {
   private:
     void project(const GaussianInputs &in, float *radius, bool for_backward);
     void bin(int64_t count, bool for_backward);
-    // From the visible Gaussians in order of depth, and the tiles that each touches, to each tile's list of them.
-    void sort_into_tiles(const std::vector<int32_t> &order, const int32_t *tiles, const int64_t *offset,
-                         const int32_t *touched, bool for_backward);
     RasterArgs raster_args(const GaussianInputs &in) const;
     template <class F> void for_tiles(F &&body);
 
@@ -62,11 +46,12 @@ class Rasterizer {
     std::vector<int32_t> permutation_;
     int statistic_channels_, channels_, tiles_x_, tiles_y_;
     bool kept_ = false;
-    int64_t instance_count_ = 0, longest_ = 0, pairs_ = 0;
+    int64_t instance_count_ = 0, pairs_ = 0;
+    TileLists lists_;
     Buffer<float> screen_, depth_, transmittance_, rows_;
     Buffer<uint16_t> blocks_;
-    Buffer<int32_t> box_, gaussians_;
-    Buffer<int64_t> instance_begin_, tile_begin_, instances_;
+    Buffer<int32_t> box_;
+    Buffer<int64_t> instance_begin_;
 };
 
 } // namespace polarguide

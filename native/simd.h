@@ -137,22 +137,6 @@ POLARGUIDE_INLINE int positions_of_bit(const uint16_t *words, int count, int bit
     return found;
 }
 
-// `first` plus the table's value of every lane whose bit is set, packed; how many they are. With `room` a whole vector may
-// be written.
-POLARGUIDE_INLINE int pack_lanes(uint32_t mask, const int32_t *table, int32_t first, bool room, int32_t *to) {
-#if defined(__AVX512F__)
-    if (room) {
-        const __m512i values = _mm512_add_epi32(_mm512_loadu_si512(table), _mm512_set1_epi32(first));
-        _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(mask), values));
-        return __builtin_popcount(mask);
-    }
-#endif
-    (void)room;
-    int n = 0;
-    for (; mask; mask &= mask - 1) to[n++] = first + table[__builtin_ctz(mask)];
-    return n;
-}
-
 template <class V> POLARGUIDE_INLINE V square_root(V x) {
     alignas(64) float t[sizeof(V) / sizeof(float)];
     __builtin_memcpy(t, &x, sizeof x);

@@ -1,0 +1,147 @@
+#include "tile_lists.h"
+
+#include "parallel.h"
+
+#include <algorithm>
+#include <cstring>
+
+namespace polarguide {
+namespace {
+
+// Order of the visible Gaussians by depth, ties by index: a radix sort on the bits of the (positive) depths.
+std::vector<int32_t> depth_order(const float *depth, const int32_t *touched, int64_t count) {
+    std::vector<int32_t> order, other;
+    std::vector<uint32_t> keys, other_keys;
+    order.reserve(size_t(count)), keys.reserve(size_t(count)); // touched: its depth is positive, and ordered as its bits
+    for (int64_t g = 0; g < count; ++g)
+        if (touched[g] > 0) {
+            uint32_t key;
+            std::memcpy(&key, depth + g, 4);
+            order.push_back(int32_t(g)), keys.push_back(key);
+        }
+    other.resize(order.size()), other_keys.resize(keys.size());
+    // Depths of one picture mostly differ by a factor of some hundred: less the least of them, two digits are enough.
+    uint32_t least = ~0u, most = 0;
+    for (uint32_t k : keys) least = std::min(least, k), most = std::max(most, k);
+    for (uint32_t &k : keys) k -= least;
+    int bits = 1;
+    while (bits < 32 && (most - least) >> bits) ++bits;
+    const int digit = bits <= 26 ? 13 : 11, buckets = 1 << digit;
+    std::vector<int64_t> begin(static_cast<size_t>(buckets));
+    for (int shift = 0; shift < bits; shift += digit) {
+        std::fill(begin.begin(), begin.end(), 0);
+        for (uint32_t k : keys) ++begin[(k >> shift) & (buckets - 1)];
+        int64_t sum = 0;
+        for (auto &b : begin) {
+            int64_t n = b;
+            b = sum, sum += n;
+        }
+        for (size_t i = 0; i < keys.size(); ++i) {
+            int64_t to = begin[(keys[i] >> shift) & (buckets - 1)]++;
+            other[size_t(to)] = order[i], other_keys[size_t(to)] = keys[i];
+        }
+        order.swap(other), keys.swap(other_keys);
+    }
+    return order;
+}
+
+// Runs of tiles by their rows.
+struct Rows {
+    struct Run {
+        int32_t gaussian;
+        uint16_t begin, end; // columns
+    };
+    Buffer<Run> runs;
+    Buffer<int64_t> numbers;                     // of each run's first tile, as a Gaussian touches it; only for the backward pass
+    std::vector<int64_t> begin, instances_begin; // [rows + 1] where a row's runs begin, and what is listed for its tiles
+};
+
+Rows sort_into_rows(const TileEmitArgs &emitted, const std::vector<int32_t> &order, const int64_t *first, int64_t rows,
+                    bool for_backward) {
+    Rows out;
+    // The order is cut into parts, one a thread. What a part has in a row comes behind what the parts before it have there.
+    const int64_t parts = thread_count(), length = (int64_t(order.size()) + parts - 1) / parts;
+    const int64_t *offset = emitted.offset;
+    auto each = [&](int64_t part, auto &&body) { // body(Gaussian, its runs, how many)
+        constexpr int64_t ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
+        const int64_t end = std::min(int64_t(order.size()), (part + 1) * length);
+        for (int64_t k = part * length; k < end; ++k) {
+            if (k + 2 * ahead < end) {
+                const int32_t later = order[size_t(k + 2 * ahead)];
+                __builtin_prefetch(offset + later), __builtin_prefetch(emitted.count + later), __builtin_prefetch(first + later);
+            }
+            if (k + ahead < end) __builtin_prefetch(emitted.runs + offset[order[size_t(k + ahead)]]);
+            const int32_t g = order[size_t(k)];
+            body(g, emitted.runs + offset[g], emitted.count[g]);
+        }
+    };
+    std::vector<int64_t> next(size_t(parts * rows), 0), touched(next); // runs: how many, then where the next goes
+    auto count = [&](int64_t part, int64_t, int) {
+        int64_t *runs_here = next.data() + part * rows, *tiles_here = touched.data() + part * rows;
+        each(part, [&](int32_t, const TileRun *runs, int32_t n) {
+            for (int32_t i = 0; i < n; ++i) ++runs_here[runs[i].row], tiles_here[runs[i].row] += runs[i].end - runs[i].begin;
+        });
+    };
+    parallel_chunks(parts, 1, count);
+    int64_t runs = 0, tiles = 0;
+    out.begin.assign(1, 0), out.instances_begin.assign(1, 0);
+    for (int64_t row = 0; row < rows; ++row) {
+        for (int64_t here = row; here < parts * rows; here += rows) {
+            const int64_t n = next[size_t(here)];
+            next[size_t(here)] = runs, runs += n, tiles += touched[size_t(here)];
+        }
+        out.begin.push_back(runs), out.instances_begin.push_back(tiles);
+    }
+    out.runs.resize(runs);
+    if (for_backward) out.numbers.resize(runs);
+    auto place = [&](int64_t part, int64_t, int) {
+        int64_t *here = next.data() + part * rows;
+        each(part, [&](int32_t g, const TileRun *its, int32_t n) {
+            int64_t number = first[g];
+            for (int32_t i = 0; i < n; ++i) {
+                const int64_t slot = here[its[i].row]++;
+                out.runs.get()[slot] = {g, its[i].begin, its[i].end};
+                if (for_backward) out.numbers.get()[slot] = number;
+                number += its[i].end - its[i].begin;
+            }
+        });
+    };
+    parallel_chunks(parts, 1, place);
+    return out;
+}
+
+} // namespace
+
+// What a row's lists are written to stays in a cache, which the lists of a whole picture do not.
+void TileLists::sort(const TileEmitArgs &emitted, const float *depth, const int64_t *first, int64_t count, int tiles_x,
+                     int tiles_y, bool for_backward) {
+    const Rows rows = sort_into_rows(emitted, depth_order(depth, emitted.touched, count), first, tiles_y, for_backward);
+    const int64_t listed = rows.instances_begin.back();
+    gaussians_.resize(listed), begin_.resize(int64_t(tiles_x) * tiles_y + 1);
+    if (for_backward) instances_.resize(listed);
+    begin_.get()[int64_t(tiles_x) * tiles_y] = listed;
+    std::vector<int64_t> longest(size_t(tiles_y), 0);
+    auto sort_row = [&](int64_t row, int64_t, int) {
+        const Rows::Run *runs = rows.runs.get();
+        const int64_t begin = rows.begin[size_t(row)], end = rows.begin[size_t(row) + 1];
+        std::vector<int64_t> next(size_t(tiles_x) + 1, 0); // how many more than in the tile before, then where the next goes
+        for (int64_t k = begin; k < end; ++k) ++next[runs[k].begin], --next[runs[k].end];
+        int64_t here = 0, to = rows.instances_begin[size_t(row)];
+        for (int column = 0; column < tiles_x; ++column) {
+            here += next[size_t(column)], longest[size_t(row)] = std::max(longest[size_t(row)], here);
+            next[size_t(column)] = begin_.get()[row * tiles_x + column] = to, to += here;
+        }
+        int32_t *gaussians = gaussians_.get();
+        int64_t *instances = instances_.get(), *slots = next.data();
+        for (int64_t k = begin; k < end; ++k) {
+            const Rows::Run run = runs[k];
+            if (for_backward)
+                for (int64_t column = run.begin, n = rows.numbers.get()[k]; column < run.end; ++column, ++n) instances[slots[column]] = n;
+            for (int64_t column = run.begin; column < run.end; ++column) gaussians[slots[column]++] = run.gaussian;
+        }
+    };
+    parallel_chunks(tiles_y, 1, sort_row);
+    longest_ = *std::max_element(longest.begin(), longest.end());
+}
+
+} // namespace polarguide
