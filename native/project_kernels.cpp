@@ -1,6 +1,6 @@
 // EWA projection of the Gaussians, the tiles they touch, and the gradients of both.
+#include "peak.h"
 #include "raster.h"
-#include "simd.h"
 
 #include <math.h>
 
@@ -16,10 +16,12 @@ constexpr float minimum_opacity = 1.0f / 255.0f;
 constexpr int group_columns = 4, group_rows = reg_lanes / group_columns;
 alignas(64) const float lane_column[16] = {0, 16, 32, 48, 0, 16, 32, 48, 0, 16, 32, 48, 0, 16, 32, 48};
 alignas(64) const float lane_row[16] = {0, 0, 0, 0, 16, 16, 16, 16, 32, 32, 32, 32, 48, 48, 48, 48};
-// The lowest and the highest bit of four.
-constexpr int none = 1 << 20;
-const int lowest[16] = {none, 0, 1, 0, 2, 0, 1, 0, 3, 0, 1, 0, 2, 0, 1, 0}, highest[16] = {-none, 0, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3, 3};
 static_assert(tile_size == 16, "lane_column and lane_row say where a group's tiles begin");
+
+// The lowest and the highest bit of a group's row. Of an empty one they are farther off than any column, and the wrong way.
+constexpr int none = 1 << 20;
+const int lowest[16] = {none, 0, 1, 0, 2, 0, 1, 0, 3, 0, 1, 0, 2, 0, 1, 0};
+const int highest[16] = {-none, 0, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3, 3};
 
 // All that the forward and the backward projection share, of as many Gaussians as a register has lanes. What a culled
 // one's lane holds has no meaning.
@@ -104,7 +106,8 @@ POLARGUIDE_INLINE void show(const PinholeCamera &cam, const Projection &o, Shown
     const ireg kept = o.valid & (o.determinant > 0.0f) & (o.determinant < 1e30f) & (x + half_x > 0.0f) &
                           (x - half_x < float(cam.width)) & (y + half_y > 0.0f) & (y - half_y < float(cam.height));
     const reg middle = 0.5f * (o.a + o.c), spread = middle * middle - o.determinant;
-    const reg values[screen_values] = {x, y, -0.5f * o.c * inverse / natural, o.b * inverse / natural, -0.5f * o.a * inverse / natural, level, o.b / o.a, o.b / o.c};
+    const reg scale = inverse / natural;
+    const reg values[screen_values] = {x, y, -0.5f * o.c * scale, o.b * scale, -0.5f * o.a * scale, level, o.b / o.a, o.b / o.c};
     for (int k = 0; k < screen_values; ++k) reg_store(out->screen[k], values[k]);
     reg_store(out->half_x, half_x), reg_store(out->half_y, half_y), reg_store(out->depth, o.t[2]);
     reg_store(out->radius, 3.0f * square_root(middle + square_root(max(spread, reg_splat(0.1f)))));
@@ -151,18 +154,14 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
         int32_t count = 0, touched = 0;
         const float *s = args.screen + g * screen_values;
         for (int ty = box[2]; ty < box[3]; ty += group_rows) {
-            // The largest exponent over a tile's pixel centers: on one of the two sides facing the center.
-            const reg y0 = reg_load(lane_row) + (float(ty * tile_size) + 0.5f - s[1]), y1 = y0 + side;
-            const reg cy = clamp(reg{}, y0, y1);
+            const reg y0 = reg_load(lane_row) + (float(ty * tile_size) + 0.5f - s[1]);
             const int rows = box[3] - ty < group_rows ? box[3] - ty : group_rows;
             int first[group_rows], last[group_rows]; // columns
             for (int r = 0; r < group_rows; ++r) first[r] = none, last[r] = -none;
             for (int tx = box[0]; tx < box[1]; tx += group_columns) {
-                const reg x0 = reg_load(lane_column) + (float(tx * tile_size) + 0.5f - s[0]), x1 = x0 + side;
-                const reg cx = clamp(reg{}, x0, x1), ey = clamp(cx * s[6], y0, y1), ex = clamp(cy * s[7], x0, x1);
-                const reg q1 = (s[2] * cx + s[3] * ey) * cx + s[4] * ey * ey;
-                const reg q2 = (s[4] * cy + s[3] * ex) * cy + s[2] * ex * ex;
-                uint32_t inside = bits(at_least(max(q1, q2) + s[5], reg_splat(-7.9945f)));
+                const reg x0 = reg_load(lane_column) + (float(tx * tile_size) + 0.5f - s[0]);
+                const reg peak = peak_inside(s, s[6], s[7], x0, x0 + side, y0, y0 + side);
+                uint32_t inside = bits(at_least(peak, reg_splat(log2_minimum - 1e-4f)));
                 if (box[1] - tx < group_columns) inside &= ((1u << (box[1] - tx)) - 1) * 0x1111u;
                 for (int r = 0; r < group_rows; ++r, inside >>= group_columns) {
                     const uint32_t here = inside & ((1u << group_columns) - 1);
@@ -171,7 +170,7 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
                 }
             }
             for (int r = 0; r < rows; ++r) {
-                if (first[r] > last[r]) continue;
+                if (first[r] > last[r]) continue; // tiles between count even where rounding says no: no block is touched there
                 runs[count++] = {uint16_t(ty + r), uint16_t(first[r]), uint16_t(last[r] + 1)};
                 touched += last[r] + 1 - first[r];
             }

@@ -1,13 +1,12 @@
 // A tile as both passes of the blending see it: its Gaussians gathered, its blocks, and what a Gaussian covers in them.
 #pragma once
+#include "peak.h"
 #include "raster.h"
-#include "simd.h"
 
 namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-constexpr float log2_minimum = -7.99435344f; // log2(1 / 255)
 constexpr float maximum_alpha = 0.99f;
 constexpr float minimum_transmittance = 1e-4f;
 constexpr float natural = 0.693147181f;
@@ -17,19 +16,14 @@ alignas(64) const float lane_x[16] = {-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 
 alignas(64) const float lane_y[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f,
                                       .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
-// The blocks (one bit each) of a tile in which log2(alpha) of a Gaussian can reach the threshold. The maximum of the
-// concave exponent over a block lies on one of the two sides that face the center. `row` is relative to the tile center;
-// `to_y` and `to_x` are where the exponent peaks, as of ProjectArgs.
+// The blocks (one bit each) of a tile in which log2(alpha) of a Gaussian can reach the threshold. `row` is relative to the
+// tile center, `to_y` and `to_x` are as for `peak_inside`.
 POLARGUIDE_INLINE uint32_t touched_blocks(const float *row, float to_y, float to_x) {
     uint32_t blocks = 0;
     for (int l = 0; l < lanes; l += reg_lanes) {
         const reg bx = reg_load(lane_x + l) * 4.0f - row[0], by = reg_load(lane_y + l) * 4.0f - row[1];
-        const reg x0 = bx - 1.5f, x1 = bx + 1.5f, y0 = by - 1.5f, y1 = by + 1.5f;
-        const reg cx = clamp(reg{}, x0, x1), cy = clamp(reg{}, y0, y1);
-        const reg a = reg_splat(row[2]), b = reg_splat(row[3]), c = reg_splat(row[4]);
-        const reg ey = clamp(cx * to_y, y0, y1), ex = clamp(cy * to_x, x0, x1);
-        const reg q1 = (a * cx + b * ey) * cx + c * ey * ey, q2 = (c * cy + b * ex) * cy + a * ex * ex;
-        blocks |= bits(at_least(max(q1, q2) + row[5], reg_splat(log2_minimum - 1e-4f))) << l;
+        const reg peak = peak_inside(row, to_y, to_x, bx - 1.5f, bx + 1.5f, by - 1.5f, by + 1.5f);
+        blocks |= bits(at_least(peak, reg_splat(log2_minimum - 1e-4f))) << l;
     }
     return blocks;
 }

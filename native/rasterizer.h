@@ -1,5 +1,6 @@
 // One picture: from Gaussians to channels and back. Owns what the backward pass needs from the forward pass.
 #pragma once
+#include "buffer.h"
 #include "raster.h"
 #include "tile_lists.h"
 

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <vector>
 
 namespace polarguide {
 namespace {
@@ -52,7 +53,7 @@ struct Rows {
         uint16_t begin, end; // columns
     };
     Buffer<Run> runs;
-    Buffer<int64_t> numbers;                     // of each run's first tile, as a Gaussian touches it; only for the backward pass
+    Buffer<int64_t> numbers;                     // of each run's first tile (see TileLists::sort), for the backward pass
     std::vector<int64_t> begin, instances_begin; // [rows + 1] where a row's runs begin, and what is listed for its tiles
 };
 

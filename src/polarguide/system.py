@@ -25,7 +25,7 @@ NEARLY, GROWTH, SETTLED = 0.9, 1.05, 3
 many steps tell the most, some of which take more than others.
 """
 PARTLY = 0.5
-"""Of a limit, from which on freed memory is given back before what takes more than a step."""
+"""Of a limit, from which on ``MemoryBound.clear`` gives freed memory back."""
 
 Item = TypeVar("Item")
 
@@ -197,7 +197,8 @@ def return_freed_memory() -> None:
 
 
 class MemoryBound:
-    """Gives freed memory back to the system where this process comes to hold nearly as much as it may.
+    """Gives freed memory back to the system where this process comes to hold nearly as much as it may, or half of it
+    before other work.
 
     An allocator that keeps what is freed (``keep_freed_memory``) holds ever more where sizes change, as with each
     growth of the Gaussians: pieces of former sizes lie free between those in use.
@@ -223,15 +224,23 @@ class MemoryBound:
             self._most, self._waits = 0.0, SETTLED
 
     def clear(self) -> None:
-        """Called before what takes and frees other sizes than the work before it, as a view's targets and steps do."""
+        """Called between two works that take and free other sizes, as a view's targets and a step do."""
         held = resident_memory()
         if held is not None and held > PARTLY * self._limit:
             return_freed_memory()
 
     def between(self, items: Iterable[Item]) -> Iterator[Item]:
-        """The items, each after a call of ``clear``: of what is kept of each, the next would lie beside gaps."""
-        for item in items:
+        """The items, with ``clear`` called before each and after the last.
+
+        What is kept of one would otherwise lie between gaps that the work on those before it has left.
+        """
+        iterator = iter(items)
+        while True:
             self.clear()
+            try:
+                item = next(iterator)
+            except StopIteration:
+                return
             yield item
 
 

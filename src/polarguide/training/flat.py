@@ -115,14 +115,18 @@ def flat_surfaces(views: Iterable[View], refractive_index: float) -> dict[str, F
 
     Views that do not determine the Stokes vector are left out.
     """
-    views = [view for view in views if view.is_determined]
-    found = {view.name: flat for view in views if (flat := flat_surface(view, refractive_index)) is not None}
+    found, determined = dict[str, Flat](), 0
+    for view in views:  # one by one, as they come
+        if view.is_determined:
+            determined += 1
+            if (flat := flat_surface(view, refractive_index)) is not None:
+                found[view.name] = flat
     if not found:
         return {}
     normals = torch.stack([flat.normal for flat in found.values()])
     sizes = torch.stack([flat.where.sum() for flat in found.values()]).to(normals)
     alike = normals @ normals.T > torch.cos(torch.deg2rad(normals.new_tensor(ALIKE)))
-    enough, agreed = max(FEWEST, SHARE * len(views)), {}
+    enough, agreed = max(FEWEST, SHARE * determined), {}
     for (name, flat), others in zip(found.items(), alike, strict=True):
         if int(others.sum()) >= enough:
             agreed[name] = replace(flat, normal=unit((normals * (others * sizes)[:, None]).sum(dim=0)))

@@ -14,7 +14,9 @@ from polarguide.raster import Rasterize
 from polarguide.shading.metal import any_given
 from polarguide.shading.model import Parameters
 from polarguide.shading.splatting import splats
+from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.metals.looks import shares
+from polarguide.training.metals.words import with_words
 
 # Pixels of a Gaussian in all views from which on what they say counts.
 LEAST_SEEN = 0.05
@@ -27,6 +29,7 @@ def index_offsets(
     indices: Mapping[int, float],
     refractive_index: float,
     rasterize: Rasterize,
+    memory: MemoryBound = UNBOUNDED,
 ) -> Tensor:
     """What each Gaussian adds to the run's refractive index, [N].
 
@@ -40,14 +43,14 @@ def index_offsets(
     said = {view.name: numbers_in(view) for view in views}
     numbers = sorted(set().union(*said.values()) & indices.keys())
     weights = means.new_zeros(len(means), 1 + len(numbers))
-    for view in views:
-        if view.materials is not None:
-            kinds = view.materials.to(means.device)
-            here = [number for number in numbers if number in said[view.name]]
-            target = torch.stack(((kinds == 1) | (kinds == 2), *(kinds == k for k in here)), dim=-1).float()
-            columns = [0, *(1 + numbers.index(number) for number in here)]
-            for some, part in zip(_batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
-                weights[:, some] += shares(gaussians, view, part.contiguous(), rasterize)
+    for view in memory.between(with_words(views)):
+        assert view.materials is not None
+        kinds = view.materials.to(means.device)
+        here = [number for number in numbers if number in said[view.name]]
+        target = torch.stack(((kinds == 1) | (kinds == 2), *(kinds == k for k in here)), dim=-1).float()
+        columns = [0, *(1 + numbers.index(number) for number in here)]
+        for some, part in zip(_batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
+            weights[:, some] += shares(gaussians, view, part.contiguous(), rasterize)
     offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
     most, chosen = weights.max(dim=1)
     given = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))

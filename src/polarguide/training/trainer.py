@@ -63,7 +63,7 @@ class Trainer:
         ranks: the processes that share the views of each step.
         store: keeps what is computed of the views; None: in memory.
         warn: told what the user should know.
-        memory: gives back what was freed before more is taken than a step does.
+        memory: gives back what was freed where it would lie between what is kept.
 
     Attributes:
         shading: the recipe's, for the run's refractive index.
@@ -158,6 +158,8 @@ class Trainer:
         state, recipe, views = self.state, self.recipe, self.settings.views_per_step
         position = self.schedule.at(state.step)
         self.whole = not position.actions
+        if "refresh_priors" in position.actions:
+            self._sizes.refresh_priors()  # first: they leave room for looks at all views
         for action in position.actions:
             self._act(action)
         mine = self.ranks.slots(views)
@@ -310,6 +312,7 @@ class Trainer:
         def predicted(view: View) -> Tensor:
             degree = self.schedule.sh_degree(state.step)
             rasterize, shading = self.backend.rasterize, self.shading
+            self._memory.clear()
             result = render(
                 state.gaussians, view.camera, rasterize, sh_degree=degree, shading=shading, light=state.light
             )
@@ -341,7 +344,6 @@ class Trainer:
             self.ranks.broadcast(outward)
             gaussians.overwrite("outward", outward)
         else:
-            self._sizes.refresh_priors()  # first: they leave room to look at all views
             if self._metals.is_due(self.state.step / self._steps):
                 self._metals.look(self.state, self._views)
             self._heed_indices()
@@ -366,7 +368,8 @@ class Trainer:
         if not indices or not self.shading.knows_indices:
             return
         gaussians, rasterize = self.state.gaussians, self.backend.rasterize
-        offsets = index_offsets(gaussians, self._views, indices, self.settings.refractive_index, rasterize)
+        index = self.settings.refractive_index
+        offsets = index_offsets(gaussians, self._views, indices, index, rasterize, self._memory)
         self.ranks.broadcast(offsets)
         gaussians.overwrite("index_offset", offsets)
 

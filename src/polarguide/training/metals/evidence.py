@@ -88,11 +88,10 @@ def evidence(
 
     Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
     """
-    said = said_by(gaussians, memory.between(views), rasterize)
+    said = said_by(gaussians, views, rasterize, memory)
     explained = None
     if measured := evenly([view for view in views if view.is_determined], MOST_VIEWS):
         looks = seen_by(gaussians, memory.between(measured), rasterize)
-        memory.clear()
         explained = _explained(looks, refractive_index)
         del looks
     memory.clear()

@@ -77,8 +77,7 @@ class MetalSearch:
             return
         gaussians, rasterize = state.gaussians, self._backend.rasterize
         found = evidence(gaussians, views, rasterize, self._index, self._memory)
-        each = self._memory.between(views)
-        if not self._told and (wrong := contradicted(gaussians, each, rasterize, found.said)):
+        if not self._told and (wrong := contradicted(gaussians, views, rasterize, found.said, self._memory)):
             self._told = True
             names = listed([f"materials/{name}.png" for name in wrong])
             self._warn(

@@ -1,0 +1,75 @@
+"""A look at all views gives freed memory back view by view."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from itertools import groupby
+from typing import Any
+
+import pytest
+import torch
+
+from polarguide.capture import View
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.shading.visibility import outward_directions
+from polarguide.system import MemoryBound
+from polarguide.training import flat
+from polarguide.training.metals.evidence import evidence
+from polarguide.training.metals.words import contradicted, said_by
+from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
+
+CLEAR, WORK = "clear", "work"
+GAUSSIANS = gaussians_of_the_ball()
+VIEWS = [
+    dataclasses.replace(view, materials=torch.where(view.invalid, 0, 2).to(torch.uint8))
+    for view in views_of("gold")[:5]
+]
+
+
+class Logged(MemoryBound):
+    def __init__(self) -> None:
+        super().__init__()
+        self.log: list[str] = []
+
+    def clear(self) -> None:
+        self.log.append(CLEAR)
+
+    def works(self, does: Callable[..., Any]) -> Callable[..., Any]:
+        def worked(*arguments: Any, **named: Any) -> Any:
+            self.log.append(WORK)
+            return does(*arguments, **named)
+
+        return worked
+
+
+def of_metals(views: list[View], memory: Logged) -> None:
+    without = [dataclasses.replace(view, materials=None) for view in views]
+    evidence(GAUSSIANS, without, memory.works(rasterize_cpu), 1.5, memory)
+
+
+def of_words(views: list[View], memory: Logged) -> None:
+    said_by(GAUSSIANS, views, memory.works(rasterize_cpu), memory)
+
+
+def of_contradictions(views: list[View], memory: Logged) -> None:
+    contradicted(GAUSSIANS, views, memory.works(rasterize_cpu), torch.zeros(900, 2), memory)
+
+
+def of_sides(views: list[View], memory: Logged) -> None:
+    outward_directions(GAUSSIANS, memory.between(views), memory.works(rasterize_cpu))
+
+
+def of_flat_surfaces(views: list[View], memory: Logged) -> None:
+    flat.flat_surfaces(memory.between(views), 1.5)
+
+
+@pytest.mark.parametrize("look", [of_metals, of_words, of_contradictions, of_sides, of_flat_surfaces])
+def test_between_any_two_views_memory_is_given_back(
+    look: Callable[[list[View], Logged], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = Logged()
+    monkeypatch.setattr(flat, "flat_surface", memory.works(flat.flat_surface))
+    look(VIEWS, memory)
+    alternating = [kind for kind, _ in groupby(memory.log)]
+    assert alternating == [CLEAR, *[WORK, CLEAR] * len(VIEWS)]
