@@ -54,7 +54,9 @@ fuzz: $(VENV)/.installed-test
 soak: $(VENV)/.installed-test
 	$(BIN)/python tests/robustness/soak.py --kills $(N)
 
+# pip builds with a nanobind of its own, which is gone afterwards.
 sanitize: $(VENV)/.installed-test
+	$(PIP_INSTALL) 'nanobind>=2.4'
 	PATH=$(CURDIR)/$(BIN):$$PATH bash tests/robustness/sanitize.sh
 
 speed: $(VENV)/.installed
