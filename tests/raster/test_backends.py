@@ -18,8 +18,8 @@ TOLERANCE = 1e-5
 # A lone pixel's pull is summed about the tile's center, eight pixels away: nothing averages the rounding out.
 LONE_PIXEL_TOLERANCE = 1e-4
 CHANNELS = (1, 3, 4, 5, 7, 8, 11, 12, 16, 20, 32)
-# The last has several groups of tiles each way.
-SIZES = ((1, 1), (3, 2), (16, 16), (17, 33), (31, 18), (50, 37), (210, 150))
+# The last two have several groups of tiles side by side, and one above the other.
+SIZES = ((1, 1), (3, 2), (16, 16), (17, 33), (31, 18), (50, 37), (150, 20), (100, 75))
 STATISTICS = (None, (0, 1, 2), (1, 4), (2,))
 
 
