@@ -36,7 +36,7 @@ struct ProjectArgs {
 
 // Tiles of one row that lie side by side. What a Gaussian touches of a row is one run: an ellipse is convex.
 struct TileRun {
-    uint16_t row, begin, end; // of columns, the end not included
+    uint16_t row, begin, end; // begin and end are columns, the end not included
 };
 
 struct TileEmitArgs {
