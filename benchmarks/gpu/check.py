@@ -34,7 +34,7 @@ PARTS = (
 # A part that has begun is not cut before this; none but the first build takes as long.
 LONGEST_SECONDS = 460.0
 # What the parts import beside torch; wheels of the pack stand in for what the machine lacks.
-MODULES = ("numpy", "scipy", "safetensors", "plyfile", "cv2", "rich", "pytest", "tyro", "ninja")
+MODULES = ("numpy", "scipy", "safetensors", "plyfile", "msgspec", "cv2", "rich", "pytest", "tyro", "ninja")
 
 
 def main() -> None:
@@ -110,7 +110,7 @@ def provide(pack: Path, out: Path) -> dict[str, str]:
     if wheels and not site.is_dir():
         pip("--target", str(site), *wheels)
     lacking = [
-        name for name in MODULES if importlib.util.find_spec(name) is None and not (site / name).is_dir()
+        name for name in MODULES if importlib.util.find_spec(name) is None and not any(site.glob(f"{name}*"))
     ]
     if lacking:
         print(f"not installed, and no wheel in the pack: {', '.join(lacking)}", flush=True)

@@ -29,6 +29,7 @@ WHEELS = (
     "packaging",
     "safetensors",
     "plyfile",
+    "msgspec",
     "nanobind",
     "scikit-build-core",
     "pathspec",
