@@ -108,25 +108,34 @@ def test_a_pair_compares_the_radiance_and_a_single_picture_what_it_shows() -> No
     pair = PartialView.of(measured(result, KINDS["pair"]), CPU)
     one = PartialView.of(measured(result, KINDS["one"]), CPU)
     assert pair.mix is None
-    assert pair.measures_radiance
     assert torch.allclose(pair.picture, result.final.detach(), atol=5e-5)
     assert one.mix is not None
-    assert not one.measures_radiance
     # Behind a filter before the lens a pair is not quite one at right angles off the axis.
     behind = PartialView.of(measured(result, KINDS["pair"], "filter"), CPU)
     assert behind.mix is not None
     assert 0.01 < float(behind.mix.norm(dim=0).max()) < 0.5
 
 
-def test_the_intensity_term_leaves_the_picture_alone() -> None:
-    """Brightness is the photometric term's: beside it, only S1 and S2 are pulled."""
+@pytest.mark.parametrize("exposures", KINDS.values(), ids=KINDS)
+def test_too_bright_a_rendering_is_not_explained_by_polarization(exposures: tuple[Exposure, ...]) -> None:
+    """S0 takes no part beside the photometric term: light that an analyzer blocks would run away."""
     result = rendered()
-    view = measured(result, KINDS["one"])
-    view = replace(view, codes=(view.codes.to(torch.int32) // 2).to(torch.uint16))
+    view = measured(result, exposures)
+    brighter = replace(result, final=result.final + 0.2)
     alone = replace(WEIGHTS, photometric=0.0)
-    total, _ = terms(result, view, alone)
-    (of_final,) = torch.autograd.grad(total, result.final, retain_graph=True)
-    assert not bool(of_final.any())
+    total, _ = terms(brighter, view, alone)
+    assert float(total.detach()) == pytest.approx(float(terms(result, view, alone)[0].detach()), abs=1e-7)
+    if len(exposures) == 1:
+        assert float(total.detach()) == 0.0
+
+
+def test_two_pictures_tell_what_polarization_they_differ_by() -> None:
+    result = rendered()
+    view = measured(result, KINDS["askew"])
+    unpolarized = replace(
+        view, codes=view.codes.float().mean(0, keepdim=True).expand(2, -1, -1, -1).to(torch.uint16)
+    )
+    total, _ = terms(result, unpolarized, replace(WEIGHTS, photometric=0.0))
     gradients = torch.autograd.grad(total, (result.specular, result.diffuse, result.normal))
     assert all(bool(g.isfinite().all()) and float(g.abs().max()) > 0 for g in gradients)
 
@@ -144,7 +153,7 @@ def test_without_a_stokes_term_it_is_a_photograph() -> None:
 
 def test_saturated_pixels_say_nothing_about_polarization() -> None:
     result = rendered()
-    view = replace(measured(result, KINDS["one"]), exposures=(Exposure(75.0),))
+    view = replace(measured(result, KINDS["askew"]), exposures=(Exposure(75.0), Exposure(150.0)))
     everywhere = torch.ones(SIZE, dtype=torch.bool)
     total, photometric = terms(result, replace(view, saturated=everywhere))
     assert float(total.detach()) == pytest.approx(float(photometric.detach()))

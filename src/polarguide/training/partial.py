@@ -30,7 +30,6 @@ class PartialView:
         shown: the same as shown (sRGB), clipped.
         mix: what ``picture`` measures beside S0/2, as an analyzer: [2], or [2, H, W] where it depends on the pixel;
             None where it is S0/2.
-        measures_radiance: whether the picture is S0/2, at least on the optical axis.
         intensities: [K, H, W, 3] linear, of the exposures behind a polarizer at a known angle.
         analyzers: of these, [K, 2] or [K, 2, H, W].
         reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or clips.
@@ -39,7 +38,6 @@ class PartialView:
     picture: Tensor
     shown: Tensor
     mix: Tensor | None
-    measures_radiance: bool
     intensities: Tensor
     analyzers: Tensor
     reliable: Tensor
@@ -62,7 +60,6 @@ class PartialView:
             picture=picture,
             shown=srgb_encode(picture.clamp(0, 1)),
             mix=mix,
-            measures_radiance=bool(places),
             intensities=values[polarized],
             analyzers=values.new_zeros(0, 2) if behind is None else behind,
             reliable=(~(view.invalid | view.saturated)).float(),
@@ -92,9 +89,11 @@ def partial_terms(
     """The weighted photometric and polarization terms of a view, and the photometric one alone.
 
     The photometric term compares what was measured with what the layers predict of it: S0/2 where that is measured,
-    else the intensity behind the analyzer. Beside it, in place of the Stokes term and with its weight, there is the
-    mean of ``|2 (I - S0/2) - (S1 c + S2 s)| / sqrt(S0 + 0.01)``, with S0 as measured where it is, else as rendered,
-    without gradient: a picture that is too bright should not be explained by polarization alone.
+    else the mean M of the intensities behind the analyzers. Beside it, in place of the Stokes term and with its weight,
+    there is what the single intensities add to that: the mean of ``2 |(I - M) - (S1 c + S2 s) / 2| / sqrt(2 M + 0.01)``,
+    with c and s of the analyzer less those of M. Both sides are differences, so that S0 takes no part. A view with one
+    picture has none: all that it tells is in the photometric term. (With the rendered S0/2, held, in place of M, a
+    rendering that is too bright would be explained by more light that its analyzer blocks, which makes it brighter.)
 
     Where the weights have no Stokes term, or there are no layers to predict from, the picture counts as a photograph.
 
@@ -111,15 +110,11 @@ def partial_terms(
     stokes = shading.predicted_stokes(result, camera)
     expected = result.final if view.mix is None else result.final + behind_analyzer(stokes, view.mix)
     picture = photometric_terms(expected, view.shown, valid, ssim_weight)
-    half = result.final.detach()
-    common: Tensor | float = 0.0
-    if view.measures_radiance:
-        half = view.picture
-        common = 0.0 if view.mix is None else view.mix
-    weight = view.reliable * (2 * half.mean(dim=-1) + 0.01).rsqrt()
+    common = 0.0 if view.mix is None else view.mix
+    weight = view.reliable * (2 * view.picture.mean(dim=-1) + 0.01).rsqrt()
     distance = result.final.new_zeros(())
     for intensity, analyzer in zip(view.intensities, view.analyzers, strict=True):
-        difference = 2 * (intensity - half) - 2 * behind_analyzer(stokes, analyzer - common)
+        difference = 2 * (intensity - view.picture) - 2 * behind_analyzer(stokes, analyzer - common)
         distance = distance + (weight * difference.abs().mean(dim=-1)).mean()
     total = weights.photometric * picture.loss + weights.stokes * distance / len(view.intensities)
     return total, picture
