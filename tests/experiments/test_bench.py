@@ -135,10 +135,10 @@ def test_the_held_back_half_has_a_folder_of_its_own(
 
 def test_a_part_of_a_half() -> None:
     assert BenchOptions(scenes=("water", "kit")).chosen(BENCH) == ("kit", "water")
-    assert BenchOptions(scenes=("cup",), held_back=True).chosen(BENCH) == ("cup",)
+    assert BenchOptions(scenes=("rough",), held_back=True).chosen(BENCH) == ("rough",)
     assert BenchOptions().chosen(BENCH) == BENCH.development
-    with pytest.raises(PolarguideError, match="found cup, which is held back") as error:
-        BenchOptions(scenes=("cup",)).chosen(BENCH)
+    with pytest.raises(PolarguideError, match="found rough, which is held back") as error:
+        BenchOptions(scenes=("rough",)).chosen(BENCH)
     assert "--held-back" in error.value.remedy
     for options in (BenchOptions(scenes=("proof",)), BenchOptions(scenes=("kit",), held_back=True)):
         with pytest.raises(PolarguideError, match="scenes: expected one of"):

@@ -40,8 +40,8 @@ class Bench:
 
 
 BENCH = Bench(
-    development=("figure", "kit", "car", "water", "metals-a", "ceramic-a"),
-    held_back=("cup", "metals-b", "ceramic-b", "rough", "lacquer"),
+    development=("figure", "kit", "car", "water", "metals-a", "ceramic-a", "cup"),
+    held_back=("metals-b", "ceramic-b", "rough", "lacquer"),
     synth=SynthSettings(size="192x144", samples=64, seed=0, points=5000, test_every=7),
     views=56,
     rows={
