@@ -91,9 +91,10 @@ def partial_terms(
     The photometric term compares what was measured with what the layers predict of it: S0/2 where that is measured,
     else the mean M of the intensities behind the analyzers. Beside it, in place of the Stokes term and with its weight,
     there is what the single intensities add to that: the mean of
-    ``2 |(I - M) - (S1 c + S2 s) / 2| / sqrt(2 M + 0.01)``, with c and s of the analyzer less those of M. Both sides are differences, so that S0 takes no part. A view with one
-    picture has none: all that it tells is in the photometric term. (With the rendered S0/2, held, in place of M, a
-    rendering that is too bright would be explained by more light that its analyzer blocks, which makes it brighter.)
+    ``2 |(I - M) - (S1 c + S2 s) / 2| / sqrt(2 M + 0.01)``, with c and s of the analyzer less those of M. Both sides are
+    differences, so that S0 takes no part. A view with one picture has none: all that it tells is in the photometric
+    term. (With the rendered S0/2, held, in place of M, a rendering that is too bright would be explained by more light
+    that its analyzer blocks, which makes it brighter.)
 
     Where the weights have no Stokes term, or there are no layers to predict from, the picture counts as a photograph.
 
