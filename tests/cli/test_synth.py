@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 from pathlib import Path
 
@@ -64,7 +65,9 @@ def test_a_long_rendering_is_announced_and_asked_for_before_there_is_a_folder(
     choose_variant("rgb", threads=1)
     said = capsys.readouterr()
     assert "LLVM" in said.out
-    assert ("may take about" in said.out) == ("--size" not in options)
+    told = re.search(r"Rendering will take about \d+ (\w+)", said.out)
+    assert told is not None
+    assert told[1] == ("minutes" if "--size" in options else "hours")
     assert status == (130 if begun else 2)
     assert (bool(started), out.exists()) == (begun, begun)
     assert ("expected yes to about" in said.err) != begun

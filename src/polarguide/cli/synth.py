@@ -14,10 +14,7 @@ from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.options import ThreadOptions
 from polarguide.synth.settings import Overrides, SynthSettings, find_scene
-from polarguide.synth.variant import rough_time
-
-LONG_SECONDS = 3600.0
-"""Longer than anybody who typed a command waits beside it: then it should be meant."""
+from polarguide.synth.variant import LONG_SECONDS, rough_time
 
 
 def synth(
@@ -74,15 +71,12 @@ def synth(
 
 
 def _confirm(seconds: float, yes: bool) -> None:
-    """Say that a rendering takes long, and ask on a terminal whether it is meant.
+    """Ask before a rendering that takes long, if somebody sits at a terminal.
 
     Raises:
-        PolarguideError: it is not.
+        PolarguideError: it is not wanted.
     """
-    if seconds <= LONG_SECONDS:
-        return
-    say(f"Rendering may take {rough_time(seconds)}; a stopped rendering goes on with the same command.")
-    if yes or not (sys.stdin.isatty() and console.is_terminal):
+    if seconds <= LONG_SECONDS or yes or not (sys.stdin.isatty() and console.is_terminal):
         return
     try:
         answer = console.input("Start it? (y/N) ", markup=False)

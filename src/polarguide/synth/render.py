@@ -32,7 +32,7 @@ from polarguide.synth.settings import SynthSettings
 from polarguide.synth.sheet import write_sheet
 from polarguide.synth.sparse import sample_sparse_points, write_model
 from polarguide.synth.transport import PathLimits
-from polarguide.synth.variant import choose_variant, rough_time
+from polarguide.synth.variant import LONG_SECONDS, choose_variant, rough_time
 
 TEST_SAMPLES = 4
 METER_VIEWS, METER_SAMPLES, METER_WIDTH = 4, 16, 64
@@ -111,7 +111,7 @@ def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0
 
     Args:
         plans: the scenes.
-        reporter: warned where only Mitsuba's slow variant can be used, and of the time that it takes.
+        reporter: warned where only Mitsuba's slow variant can be used; told the time then, or if it is long.
         threads: threads to use; 0 takes all cores.
 
     Raises:
@@ -128,7 +128,11 @@ def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0
     variant = choose_variant(left[0].settings.color, threads=threads)
     seconds = sum(plan.paths_left() for plan in left) / variant.paths_per_second
     if variant.note:
-        reporter.warn(f"{variant.note} It will take {rough_time(seconds)}.")
+        reporter.warn(variant.note)
+    if variant.note or seconds > LONG_SECONDS:
+        reporter.say(
+            f"Rendering will take {rough_time(seconds)}; a stopped rendering goes on with the same command."
+        )
     return seconds
 
 

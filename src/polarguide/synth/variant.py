@@ -16,6 +16,8 @@ OLDEST_LLVM = 16
 """Older ones crash on processors that are newer than they are."""
 SLOW_PATHS_PER_SECOND, FAST_PATHS_PER_SECOND = 800.0, 200_000.0
 """Of the scalar variant, which has no threads, and of each thread of a compiled one: rough figures, of the presets."""
+LONG_SECONDS = 3600.0
+"""Longer than anybody who typed a command waits beside it: then it should be meant."""
 
 
 @dataclass(frozen=True)
