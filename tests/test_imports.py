@@ -13,6 +13,7 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / PACKAGE
 
 # From the top down. A room may import from itself and from every room before it.
 ROOMS = (
+    "installation",
     "errors",
     "numerals",
     "printable",

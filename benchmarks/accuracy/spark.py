@@ -1,7 +1,7 @@
 """How an exported file looks in today's viewers: Spark (three.js) in a headless Chromium, against our final picture.
 
     npm install three @sparkjsdev/spark          # anywhere; say where with --node-modules
-    pip install 'polarguide[browser,export]'
+    pip install '.[browser]'                     # in polarguide's source folder
     python benchmarks/accuracy/spark.py RUN --node-modules DIR --format ply
 
 For each test view it prints PSNR against the final layer: of the file in Spark, and of the diffuse layer alone, which

@@ -7,7 +7,7 @@ import importlib.util
 import os
 from typing import Any
 
-EXPORT_EXTRA = "'polarguide[export]'"
+from polarguide.installation import install_extra, install_package
 
 
 class PolarguideError(Exception):
@@ -36,7 +36,7 @@ class PolarguideWarning(UserWarning):
     """Something that the user should know before relying on a result."""
 
 
-def require_package(module: str, what: str, *, install: str = EXPORT_EXTRA) -> None:
+def require_package(module: str, what: str) -> None:
     """Check that a package is there, without loading it: before work begins, not after.
 
     Raises:
@@ -47,14 +47,15 @@ def require_package(module: str, what: str, *, install: str = EXPORT_EXTRA) -> N
     except (ImportError, ValueError):  # a package that says itself that it is none
         there = False
     if not there:
-        raise _missing(module, what, install)
+        raise _missing(module, what)
 
 
-def optional_import(module: str, what: str, *, install: str = EXPORT_EXTRA) -> Any:
-    """Import a library that most verbs do without.
+def optional_import(module: str, what: str, *, extra: str = "") -> Any:
+    """Import a library that most verbs do without: then it costs them no time, and may be missing.
 
     Args:
-        module: its name. what: what it is needed for, as the message says. install: what to give to pip.
+        module: its name. what: what it is needed for, as the message says. extra: the extra of polarguide that
+            brings it; empty: it comes with polarguide.
 
     Raises:
         PolarguideError: it is not installed.
@@ -62,13 +63,14 @@ def optional_import(module: str, what: str, *, install: str = EXPORT_EXTRA) -> A
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise _missing(module, what, install) from None
+        raise _missing(module, what, extra) from None
 
 
-def _missing(module: str, what: str, install: str) -> PolarguideError:
+def _missing(module: str, what: str, extra: str = "") -> PolarguideError:
+    command = install_extra(extra) if extra else install_package(module)
     return PolarguideError(
         what,
         expected=f"the Python package {module.partition('.')[0]}",
         found="that it is not installed",
-        remedy=f"Install it: pip install {install} (or 'polarguide[all]').",
+        remedy=f"Install it with {command} and repeat the command.",
     )

@@ -26,7 +26,7 @@ EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "mesh": ("skimage", "trimesh"),
     "environment": ("OpenEXR",),
 }
-"""Optional packages that formats need."""
+"""The packages that formats need: looked for before a run is loaded."""
 PathLike = str | os.PathLike[str]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.cli.app import run
+from polarguide.installation import install_extra
 
 
 @pytest.mark.parametrize(
@@ -35,5 +36,5 @@ def test_without_mitsuba_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     assert run(["bench", "--render-only", "--out", str(tmp_path / "x")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "polarguide[synth]" in line
+    assert f"Install it with {install_extra('synth')} and" in line
     assert not (tmp_path / "x").exists()

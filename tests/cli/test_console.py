@@ -55,10 +55,10 @@ def test_what_has_no_value_is_named_once() -> None:
 
 def test_a_reason_keeps_its_brackets() -> None:
     record = {metric.key: 1.0 for metric in METRICS} | {"mesh_fscore_1": None}
-    record["mesh_fscore_1_reason"] = "pip install 'polarguide[export]'"
+    record["mesh_fscore_1_reason"] = "pip install 'a[b]'"
     shown = Console(file=io.StringIO(), width=400)
     shown.print(_table(record, "scores"))
-    assert "n/a (pip install 'polarguide[export]')" in shown.file.getvalue()  # type: ignore[attr-defined]
+    assert "n/a (pip install 'a[b]')" in shown.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_lines_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:

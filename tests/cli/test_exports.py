@@ -21,6 +21,7 @@ from polarguide import errors
 from polarguide.cli.app import run
 from polarguide.export import points
 from polarguide.gaussians.ply import read_ply
+from polarguide.installation import install_package
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 from polarguide.trajectory import camera_record
 
@@ -176,7 +177,7 @@ def test_a_missing_library_is_named(
     monkeypatch.setattr(errors, "importlib", SimpleNamespace(import_module=missing, util=importlib.util))
     line = refused("export", trained, "--format", kind, "--out", tmp_path)
     assert module.partition(".")[0] in line
-    assert "pip install 'polarguide[export]'" in line
+    assert f"Install it with {install_package(module)} and" in line
 
 
 def edit(run_folder: Path, **changes: object) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.cli.app import run
+from polarguide.installation import install_package
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 
 
@@ -218,4 +219,4 @@ def test_missing_packages_are_named_before_anything_is_read(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else there(name))
     line = refused(*(str(tmp_path / "run") if word == "RUN" else word for word in arguments))
     assert f"expected the Python package {package}" in line
-    assert "polarguide[all]" in line
+    assert f"Install it with {install_package(package)} and" in line

@@ -14,6 +14,7 @@ from random_runs import ring
 from polarguide.camera import Camera
 from polarguide.capture import GroundTruth, View
 from polarguide.evaluation import mesh as measured
+from polarguide.installation import install_package
 from polarguide.rendering.fusion import Surface
 from polarguide.rendering.mesh import fused_surface
 from polarguide.shading.result import RenderResult
@@ -201,7 +202,7 @@ def test_a_package_that_is_missing_is_the_reason(monkeypatch: pytest.MonkeyPatch
     got = measured.mesh_scores(fused(sphere_result), views())
     assert set(got) == {"mesh_fscore_1_reason"}
     assert "skimage is not installed" in str(got["mesh_fscore_1_reason"])
-    assert "pip install 'polarguide[export]'" in str(got["mesh_fscore_1_reason"])
+    assert install_package("skimage") in str(got["mesh_fscore_1_reason"])
     unknown = [dataclasses.replace(view, ground_truth=None) for view in views()]
     assert measured.mesh_scores(fused(sphere_result), unknown) == {}
 

@@ -34,7 +34,7 @@ from polarguide.synth.schema import SceneSpec, parse_scene
 from polarguide.synth.sensor import Sensor
 from polarguide.synth.settings import Overrides, SynthSettings
 from polarguide.synth.sweep import Sweep, sweep_scenes
-from polarguide.synth.variant import OLDEST_LLVM, Variant, choose_variant, slow_estimate
+from polarguide.synth.variant import OLDEST_LLVM, Variant, choose_variant, rough_time
 
 TINY = {
     "name": "tiny",
@@ -327,8 +327,27 @@ def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch:
     finally:
         monkeypatch.undo()
         choose_variant("rgb", threads=1)
-    assert slow_estimate(1e8).endswith("hours")
-    assert slow_estimate(1e5).endswith("minutes")
+    assert rough_time(9 * 3600) == "about 9 hours"
+    assert rough_time(600) == "about 10 minutes"
+
+
+def test_the_time_expected_is_of_what_is_left(
+    scene: Path, spec: SceneSpec, variant: Variant, tmp_path: Path
+) -> None:
+    """Four views, of which the held-out one takes four times as many paths; a finished scene takes none."""
+    new = runner.Plan(spec, SETTINGS, tmp_path / "new")
+    paths = 16 * 16 * SETTINGS.samples * (4 + 3)
+    assert runner.expected_time([new, new], Reporter()) == pytest.approx(
+        2 * paths / choose_variant("rgb").paths_per_second
+    )
+    choose_variant("rgb", threads=1)
+    assert not new.out.exists()
+    assert runner.expected_time([runner.Plan(spec, SETTINGS, scene)], Reporter()) == 0
+    begun = tmp_path / "begun"
+    shutil.copytree(scene, begun)
+    (begun / "scene.json").unlink()
+    (begun / "polar" / "v001_045.png").unlink()
+    assert runner.Plan(spec, SETTINGS, begun).paths_left() == 16 * 16 * SETTINGS.samples
 
 
 def test_the_photograph_of_a_gray_scene_has_three_channels(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def bench(
     """Run the bench of generality: render its scenes where they are missing, and compare all methods on them.
 
     Scenes go to scenes/ of the folder given by --out, tables and report to development/ or held-back/. What is finished
-    is checked and not repeated; after Ctrl-C the same command goes on. Rendering needs the extra polarguide[synth].
+    is checked and not repeated; after Ctrl-C the same command goes on. Rendering needs Mitsuba, as ``synth`` does.
 
     Args:
         out: Folder to write.

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import say, use_threads
+from polarguide.cli.console import console, say, use_threads
 from polarguide.cli.progress import ConsoleReporter
+from polarguide.errors import PolarguideError
 from polarguide.options import ThreadOptions
 from polarguide.synth.settings import Overrides, SynthSettings, find_scene
+from polarguide.synth.variant import LONG_SECONDS, rough_time
 
 
 def synth(
@@ -20,32 +23,39 @@ def synth(
     *,
     out: Path,
     sweep: str | None = None,
+    yes: bool = False,
     settings: Annotated[SynthSettings, tyro.conf.arg(name="")],
     overrides: Annotated[Overrides, tyro.conf.arg(name="")],
     compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
 ) -> None:
     """Render a polarized scene with ground truth: a preset (figure, kit, car, cup, water, proof, ...) or a scene file.
 
-    Needs the extra polarguide[synth]. A rendering that was stopped goes on with the same command.
-    docs/reference/scene-files.md describes scene files and what is written.
+    Needs Mitsuba (pip install '.[synth]' in polarguide's source folder). A rendering that was stopped goes on with the
+    same command. docs/reference/scene-files.md describes scene files and what is written.
 
     Args:
         scene: Name of a preset (docs/how-to/synthesize.md lists them), or path of a scene file in JSON.
         out: Scene folder to write.
         sweep: A family of scenes, such as views=9,18,36,63 or noise=0,1,2,4; also roughness, index and spacing.
+        yes: Do not ask before a rendering that takes more than an hour. Nothing is asked where there is no terminal.
     """
     use_threads(compute.threads)
     spec, reporter = find_scene(scene), ConsoleReporter()
+    render = importlib.import_module("polarguide.synth.render")
     if sweep is not None:
         sweeps = importlib.import_module("polarguide.synth.sweep")
+        family = sweeps.parse_sweep(sweep)
+        plans = sweeps.sweep_plans(spec, out, settings, overrides, family)
+        _confirm(render.expected_time(plans, reporter, threads=compute.threads), yes)
         folders = sweeps.sweep_scenes(
-            spec, out, settings, overrides, sweeps.parse_sweep(sweep), reporter, threads=compute.threads
+            spec, out, settings, overrides, family, reporter, threads=compute.threads
         )
         say(f"scenes: {' '.join(str(folder) for folder in folders)}")
         return
-    render = importlib.import_module("polarguide.synth.render")
+    plan = render.Plan(overrides.apply(spec), settings, out)
+    _confirm(render.expected_time([plan], reporter, threads=compute.threads), yes)
     manifest = importlib.import_module("polarguide.synth.manifest")
-    done = render.synthesize(overrides.apply(spec), out, settings, reporter, threads=compute.threads)
+    done = render.synthesize(plan.spec, out, settings, reporter, threads=compute.threads)
     say(
         f"scene: {done}   SHA-256 of its {manifest.MANIFEST}: {manifest.scene_digest(done)}",
     )
@@ -57,4 +67,25 @@ def synth(
         say(
             f"next: polarguide prepare {done / 'raw'} --out {done}-prepared --sensor {settings.sensor.upper()} "
             f"--bits 12 --black-level 64 --calibration {done / 'calibration.json'} --poses {done}",
+        )
+
+
+def _confirm(seconds: float, yes: bool) -> None:
+    """Ask before a rendering that takes long, if somebody sits at a terminal.
+
+    Raises:
+        PolarguideError: it is not wanted.
+    """
+    if seconds <= LONG_SECONDS or yes or not (sys.stdin.isatty() and console.is_terminal):
+        return
+    try:
+        answer = console.input("Start it? (y/N) ", markup=False)
+    except EOFError:
+        answer = ""
+    if answer.strip().lower() not in ("y", "yes"):
+        raise PolarguideError(
+            "the rendering",
+            expected=f"yes to {rough_time(seconds)}",
+            found="no",
+            remedy="Nothing was written. Fewer --views or --samples or a smaller --size take less.",
         )

@@ -31,6 +31,6 @@ def view(
             remedy=f"polarguide view {run.parent} if it lies in one. Files of Gaussians alone, without the light that "
             "they reflect, are for other viewers (SuperSplat).",
         )
-    require_package("viser", "the viewer", install="'viser==1.1.*'")
+    require_package("viser", "the viewer")
     trained, reporter = opened(run, compute)
     trained.view(host=host, port=port, visitors=visitors, reporter=reporter)

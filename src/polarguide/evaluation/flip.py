@@ -58,6 +58,6 @@ def flip(
 def load_package() -> tuple[Any, str | None]:
     """The package ``flip_evaluator``, loaded once per process: (package, None), or (None, reason)."""
     try:
-        return optional_import("flip_evaluator", "FLIP", install=PACKAGE), None
+        return optional_import("flip_evaluator", "FLIP"), None
     except PolarguideError:
         return None, f"the package {PACKAGE} is not installed"

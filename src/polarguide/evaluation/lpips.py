@@ -1,7 +1,7 @@
 """LPIPS (Zhang et al. 2018) with the VGG-16 network, where its weights are at hand.
 
-The network needs the torchvision package and its ImageNet weights (528 MB). Nothing is ever downloaded here:
-without them the metric is None, with a reason that says how to get them.
+The network needs the extra ``lpips`` (torchmetrics, torchvision) and ImageNet weights (528 MB). Nothing is ever
+downloaded here: without them the metric is None, with a reason that says how to get them.
 """
 
 from __future__ import annotations
@@ -58,8 +58,9 @@ def lpips(
 @lru_cache(maxsize=1)
 def load_metric() -> tuple[Any, str | None]:
     """The LPIPS metric of torchmetrics, loaded once per process: (metric, None), or (None, reason)."""
-    if find_spec("torchvision") is None:
-        return None, "torchvision is not installed"
+    for package in ("torchvision", "torchmetrics"):
+        if find_spec(package) is None:
+            return None, f"{package} is not installed (the extra lpips has it)"
     try:
         from torchvision.models import VGG16_Weights
     except Exception as error:  # a torchvision built for another torch fails on import in many ways

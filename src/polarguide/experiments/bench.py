@@ -19,10 +19,9 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.synth.folder import State, folder_state, scene_request
 from polarguide.synth.manifest import scene_digest, verify_scene
-from polarguide.synth.render import synthesize
+from polarguide.synth.render import Plan, expected_time, synthesize
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, find_scene
-from polarguide.synth.variant import choose_variant
 
 SCENES = "scenes"
 
@@ -65,8 +64,8 @@ def run_bench(
     places = {name: Path(out) / SCENES / spec.name for name, spec in specs.items()}
     states = {name: _state(places[name], spec, bench) for name, spec in specs.items()}
     threads = options.jobs * options.threads
-    if set(states.values()) != {"finished"}:
-        choose_variant(bench.synth.color, threads=threads)  # an error now where there is no Mitsuba
+    plans = [Plan(spec, bench.synth, places[name]) for name, spec in specs.items()]
+    expected_time(plans, reporter, threads=threads)  # an error now where there is no Mitsuba
     make_folder(Path(out) / SCENES)
     with locked(Path(out) / SCENES):
         for name, spec in specs.items():

@@ -71,7 +71,7 @@ def export(
         The files and folders written.
 
     Raises:
-        PolarguideError: an optional package is missing, or the recipe has nothing of this kind.
+        PolarguideError: a package is missing, or the recipe has nothing of this kind.
     """
     folder = run.folder / "export" if out is None else Path(out)
     if out is None:

@@ -27,6 +27,7 @@ from torch.autograd.function import once_differentiable
 
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
+from polarguide.installation import install_extra
 from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterized, ScreenStatistic, Splats, check_shapes
 
 TILE = 16
@@ -88,7 +89,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
             "--device cuda",
             expected="the package gsplat",
             found="that it is not installed",
-            remedy="pip install 'polarguide[cuda]', or use --device cpu.",
+            remedy=f"Install it with {install_extra('cuda')} and repeat the command, or use --device cpu.",
         )
     notice = "compiling gsplat's CUDA kernels; this takes minutes, once for each machine and PyTorch ..."
     timer = threading.Timer(NOTICE_SECONDS, say, (notice,))

@@ -87,7 +87,7 @@ def write_shots(
             remedy="Correct the name.",
         )
     if "exr" in formats:
-        optional_import("OpenEXR", "EXR files", install="'polarguide[exr]'")
+        optional_import("OpenEXR", "EXR files")
     found = [s for s in paths if isinstance(s, ExposureSet)]
     if len(found) < len(paths) or not paths:
         found += find_shots([p for p in paths if not isinstance(p, ExposureSet)], options)
@@ -184,7 +184,7 @@ def _write_exr(path: Path, values: NDArray[Any], unit: str, note: str) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    exr = optional_import("OpenEXR", "EXR files", install="'polarguide[exr]'")
+    exr = optional_import("OpenEXR", "EXR files")
     numbers = np.ascontiguousarray(
         values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values, np.float32
     )

@@ -1,4 +1,4 @@
-"""Polarized scenes with ground truth, rendered by physical light transport: the optional extra ``polarguide[synth]``.
+"""Polarized scenes with ground truth, rendered by physical light transport: the extra ``synth``.
 
 A scene file (``schema``) becomes meshes (``shapes``), textures (``textures``) and Mitsuba scenes (``build``).
 ``transport`` traces polarized paths, ``film`` renders the pixels of a camera, ``geometry`` computes ground truth,

@@ -33,19 +33,6 @@ def scene_request(spec: SceneSpec, settings: SynthSettings) -> dict[str, Any]:
     return {"scene": spec.data(), "settings": settings.data()}
 
 
-def open_folder(out: Path, request: dict[str, Any]) -> bool:
-    """Create the folder, or resume the same request in it; returns whether the scene is finished.
-
-    Raises:
-        PolarguideError: as ``folder_state``.
-    """
-    state = folder_state(out, request)
-    if state == "new":
-        out.mkdir(parents=True, exist_ok=True)
-        write_file(out / REQUEST, json.dumps(request, indent=1).encode())
-    return state == "finished"
-
-
 def folder_state(out: Path, request: dict[str, Any]) -> State:
     """How far the rendering of a request in a folder is. Nothing is written.
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ from polarguide.synth.settings import SynthSettings
 from polarguide.synth.sheet import write_sheet
 from polarguide.synth.sparse import sample_sparse_points, write_model
 from polarguide.synth.transport import PathLimits
-from polarguide.synth.variant import choose_variant, slow_estimate
+from polarguide.synth.variant import LONG_SECONDS, choose_variant, rough_time
 
 TEST_SAMPLES = 4
 METER_VIEWS, METER_SAMPLES, METER_WIDTH = 4, 16, 64
@@ -38,17 +40,38 @@ BRIGHT = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
-    """All that the rendering of a view needs."""
+class Plan:
+    """What is to be rendered: known before anything is loaded or written."""
 
-    built: BuiltScene
+    spec: SceneSpec
     settings: SynthSettings
     out: Path
-    names: list[str]
-    tests: list[str]
-    cameras: list[Camera]
-    exposure: float
-    sensor: Sensor
+
+    @property
+    def request(self) -> dict[str, Any]:
+        """The content of the folder's ``request.json``."""
+        return folder.scene_request(self.spec, self.settings)
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Of all views."""
+        return view_names(self.spec.camera.views)
+
+    @cached_property
+    def tests(self) -> list[str]:
+        """The names of the views that are held out."""
+        return held_out_names(self.names, self.settings.test_every)
+
+    def left(self) -> list[int]:
+        """The numbers of the views that are not finished."""
+        views = enumerate(self.names)
+        return [number for number, name in views if not all(file.exists() for file in self.files(name))]
+
+    def paths_left(self) -> int:
+        """How many paths it takes to finish."""
+        settings = self.settings
+        views = sum(TEST_SAMPLES if self.names[number] in self.tests else 1 for number in self.left())
+        return settings.width * settings.height * settings.samples * views
 
     @property
     def mosaics(self) -> bool:
@@ -73,6 +96,46 @@ class Job:
         return files if photograph is None else [*files, photograph[1]]
 
 
+@dataclass(frozen=True, eq=False)
+class Job(Plan):
+    """All that the rendering of a view needs."""
+
+    built: BuiltScene
+    cameras: list[Camera]
+    exposure: float
+    sensor: Sensor
+
+
+def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0) -> float:
+    """The seconds that rendering what is left of some scenes may take; nothing is written yet.
+
+    Args:
+        plans: the scenes.
+        reporter: warned where only Mitsuba's slow variant can be used; told the time then, or if it is long.
+        threads: threads to use; 0 takes all cores.
+
+    Raises:
+        PolarguideError: as ``synthesize``.
+    """
+    left = []
+    for plan in plans:
+        plan.settings.check()
+        require_unicode(plan.out)
+        if folder.folder_state(plan.out, plan.request) != "finished":
+            left.append(plan)
+    if not left:
+        return 0.0
+    variant = choose_variant(left[0].settings.color, threads=threads)
+    seconds = sum(plan.paths_left() for plan in left) / variant.paths_per_second
+    if variant.note:
+        reporter.warn(variant.note)
+    if variant.note or seconds > LONG_SECONDS:
+        reporter.say(
+            f"Rendering will take {rough_time(seconds)}; a stopped rendering goes on with the same command."
+        )
+    return seconds
+
+
 def synthesize(
     spec: SceneSpec, out: Path, settings: SynthSettings, reporter: Reporter, *, threads: int = 0
 ) -> Path:
@@ -90,21 +153,20 @@ def synthesize(
     """
     settings.check()
     require_unicode(out)
-    if folder.open_folder(out, folder.scene_request(spec, settings)):
+    plan = Plan(spec, settings, out)
+    state = folder.folder_state(out, plan.request)
+    if state == "finished":
         verify_scene(out)
         reporter.say(f"{out} is finished already; all its files have their checksums.")
         return out
     variant = choose_variant(settings.color, threads=threads)
-    names = view_names(spec.camera.views)
-    tests = held_out_names(names, settings.test_every)
-    if variant.note:
-        views = len(names) + (TEST_SAMPLES - 1) * len(tests)
-        paths = settings.width * settings.height * settings.samples * views
-        reporter.warn(f"{variant.note} It will take {slow_estimate(paths)} on this scene.")
+    if state == "new":
+        folder.write_file(out / folder.REQUEST, json.dumps(plan.request, indent=1).encode())
+    names, tests = plan.names, plan.tests
     built = build_scene(spec, out, variant)
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     exposure = spec.exposure or _metered_exposure(built, cameras, settings.seed)
-    job = Job(built, settings, out, names, tests, cameras, exposure, Sensor())
+    job = Job(spec, settings, out, built, cameras, exposure, Sensor())
     _render_all(job, reporter)
     write_sparse(built, cameras, names, tests, out, settings)
     clipped = folder.clipped_share(out, names)
@@ -125,7 +187,7 @@ def synthesize(
 
 def _render_all(job: Job, reporter: Reporter) -> None:
     """Render the views that are not finished."""
-    left = [number for number, name in enumerate(job.names) if not all(f.exists() for f in job.files(name))]
+    left = job.left()
     if len(left) < len(job.names):
         reporter.say(f"Going on: {len(job.names) - len(left)} of {len(job.names)} views are finished.")
     with reporter.track(f"rendering {job.built.spec.name}", len(job.names)) as progress:

@@ -17,7 +17,7 @@ from polarguide.synth import folder
 from polarguide.synth.build import build_scene
 from polarguide.synth.cameras import held_out_names, place_cameras, view_names
 from polarguide.synth.manifest import verify_scene, write_manifest
-from polarguide.synth.render import synthesize, write_sparse
+from polarguide.synth.render import Plan, synthesize, write_sparse
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, SynthSettings
 from polarguide.synth.variant import choose_variant
@@ -66,9 +66,23 @@ def sweep_scenes(
     A sweep over ``views`` (their number in training) renders the scene once, as it is, and makes the smaller scenes by
     leaving out training views evenly, so that all share their test views and even their pictures.
     """
+    plans = sweep_plans(spec, out, settings, overrides, sweep)
     if sweep.parameter == "views":
-        return _fewer_views(overrides.apply(spec), out, settings, sweep, reporter, threads)
+        return _fewer_views(plans[0], out, sweep, reporter, threads)
     done = []
+    for value, plan in zip(sweep.values, plans, strict=True):
+        done.append(synthesize(plan.spec, plan.out, plan.settings, reporter, threads=threads))
+        _note(done[-1], sweep.parameter, value)
+    return done
+
+
+def sweep_plans(
+    spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep
+) -> list[Plan]:
+    """The scenes that a sweep renders, in the order of its values; of a sweep over ``views`` the one with all views."""
+    if sweep.parameter == "views":
+        return [Plan(overrides.apply(spec), settings, out / "all")]
+    plans = []
     for value in sweep.values:
         one, how = overrides, settings
         if sweep.parameter == "noise":
@@ -76,9 +90,8 @@ def sweep_scenes(
         else:
             change: dict[str, Any] = {sweep.parameter: value}
             one = replace(overrides, **change)
-        done.append(synthesize(one.apply(spec), _member(out, sweep, value), how, reporter, threads=threads))
-        _note(done[-1], sweep.parameter, value)
-    return done
+        plans.append(Plan(one.apply(spec), how, _member(out, sweep, value)))
+    return plans
 
 
 def _member(out: Path, sweep: Sweep, value: float) -> Path:
@@ -95,10 +108,9 @@ def _note(scene: Path, parameter: str, value: float) -> None:
     folder.write_file(scene / "scene.json", json.dumps(record, indent=1).encode())
 
 
-def _fewer_views(
-    spec: SceneSpec, out: Path, settings: SynthSettings, sweep: Sweep, reporter: Reporter, threads: int
-) -> list[Path]:
-    """All members of a sweep over the number of training views."""
+def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, threads: int) -> list[Path]:
+    """All members of a sweep over the number of training views, from the scene with all of them."""
+    spec, settings = plan.spec, plan.settings
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     by_name = dict(zip(view_names(len(cameras)), cameras, strict=True))
     tests = held_out_names(list(by_name), settings.test_every)
@@ -110,7 +122,7 @@ def _fewer_views(
             found=f"{sweep.values[-1]:g}",
             remedy=f"The scene has {len(cameras)} views; give --views to render more.",
         )
-    whole = synthesize(spec, out / "all", settings, reporter, threads=threads)
+    whole = synthesize(spec, plan.out, settings, reporter, threads=threads)
     record = json.loads((whole / "scene.json").read_text(encoding="utf-8"))
     done = []
     for value in sweep.values:

@@ -14,8 +14,10 @@ from polarguide.errors import optional_import
 Color = Literal["rgb", "spectral"]
 OLDEST_LLVM = 16
 """Older ones crash on processors that are newer than they are."""
-SLOW_PATHS_PER_SECOND = 800.0
-"""Of the scalar variant, a rough figure for one core."""
+SLOW_PATHS_PER_SECOND, FAST_PATHS_PER_SECOND = 800.0, 200_000.0
+"""Of the scalar variant, which has no threads, and of each thread of a compiled one: rough figures, of the presets."""
+LONG_SECONDS = 3600.0
+"""Longer than anybody who typed a command waits beside it: then it should be meant."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,14 @@ class Variant:
         color: "rgb" renders three channels one after the other, each with exact values; "spectral" follows four
             wavelengths a path and converts.
         fast: whether paths are vectorized (LLVM) instead of scalar.
+        paths_per_second: a rough figure for this machine.
         note: the reason for a slow variant; else empty.
     """
 
     name: str
     color: Color
     fast: bool
+    paths_per_second: float
     note: str = ""
 
     @property
@@ -52,7 +56,7 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
         PolarguideError: Mitsuba is not installed.
     """
     with _silent_stderr():
-        mi = optional_import("mitsuba", "synth", install="'polarguide[synth]'")
+        mi = optional_import("mitsuba", "synth", extra="synth")
         missing = _missing_llvm()
     if not missing:
         mi.set_variant("llvm_ad_mono_polarized" if color == "rgb" else "llvm_ad_spectral_polarized")
@@ -60,14 +64,15 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
             import drjit as dr
 
             dr.set_thread_count(threads)
-        return Variant(mi.variant(), color, True)
+        speed = FAST_PATHS_PER_SECOND * (threads or os.cpu_count() or 1)
+        return Variant(mi.variant(), color, True, speed)
     with _silent_stderr():
         mi.set_variant("scalar_spectral_polarized")
     note = (
         f"Mitsuba's fast variants need LLVM {OLDEST_LLVM} or newer as a shared library ({missing}); on Debian "
         "'apt-get install libllvm19', elsewhere set DRJIT_LIBLLVM_PATH. The slow scalar variant is used."
     )
-    return Variant(mi.variant(), "spectral", False, note)
+    return Variant(mi.variant(), "spectral", False, SLOW_PATHS_PER_SECOND, note)
 
 
 @contextlib.contextmanager
@@ -103,7 +108,7 @@ def _missing_llvm() -> str:
     return f"found {'.'.join(str(part) for part in version)}"
 
 
-def slow_estimate(paths: float) -> str:
-    """The estimated time for that many paths with the scalar variant, in words."""
-    hours = paths / SLOW_PATHS_PER_SECOND / 3600
+def rough_time(seconds: float) -> str:
+    """An estimated time in words."""
+    hours = seconds / 3600
     return f"about {hours:.0f} hours" if hours >= 2 else f"about {max(2.0, hours * 60):.0f} minutes"

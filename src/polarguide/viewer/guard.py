@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from polarguide.errors import PolarguideError, optional_import
+from polarguide.installation import install_package
 from polarguide.viewer.gate import Gate
 from polarguide.viewer.messages import LARGEST, Refused
 
@@ -51,7 +52,7 @@ def guarded(gate: Gate, check: Check) -> Iterator[None]:
     Raises:
         PolarguideError: it has not listened with what was wrapped; whoever started it has to end it.
     """
-    sockets = optional_import("websockets.asyncio.server", "the viewer", install="'viser==1.1.*'")
+    sockets = optional_import("websockets.asyncio.server", "the viewer")
     listen, taken = sockets.serve, []
 
     def serve(handler: Any, *arguments: Any, **options: Any) -> Any:
@@ -76,7 +77,7 @@ def guarded(gate: Gate, check: Check) -> Iterator[None]:
             "the viewer",
             expected="a viser whose connections can be checked",
             found="one that listens in another way",
-            remedy="Install the version that was tested: pip install 'viser==1.1.*'.",
+            remedy=f"Install the version that was tested with {install_package('viser')} and repeat the command.",
         )
 
 

@@ -74,7 +74,7 @@ class Viewer:
         title: str = "polarguide",
         warn: Callable[[str], None] = lambda text: None,
     ) -> None:
-        viser = optional_import("viser", "the viewer", install="'viser==1.1.*'")
+        viser = optional_import("viser", "the viewer")
         # viser warns of pictures for a browser that has just disconnected.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self._current, self._photographs = current, photographs

@@ -47,7 +47,7 @@ def read_camera_raw(
     Raises:
         PolarguideError: rawpy is missing, or the file cannot be read or is damaged.
     """
-    opened = opener or optional_import("rawpy", str(path), install="'polarguide[raw]'").imread
+    opened = opener or optional_import("rawpy", str(path)).imread
     data = read_file(path)
     try:
         with opened(io.BytesIO(data)) as raw:

@@ -79,7 +79,7 @@ def _light(seconds: float | None, iso: float | None, f_number: float | None) -> 
 def _by_libraw(path: Path, data: bytes) -> Taken | None:
     """What LibRaw reads of other camera raw files; None where this version of rawpy does not tell."""
     try:
-        with optional_import("rawpy", str(path), install="'polarguide[raw]'").imread(io.BytesIO(data)) as raw:
+        with optional_import("rawpy", str(path)).imread(io.BytesIO(data)) as raw:
             about = getattr(raw, "other", None)
             return (
                 None if about is None else Taken("", _light(about.shutter, about.iso_speed, about.aperture))

@@ -80,7 +80,7 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
 
 def _read_exr(path: Path, wanted: tuple[str, ...] | None = None) -> NDArray[Any]:
     data = read_file(path)
-    openexr = optional_import("OpenEXR", str(path), install="'polarguide[exr]'")
+    openexr = optional_import("OpenEXR", str(path))
     found = "an empty file" if not data else "one that is damaged, cut short or something else"
     pixels = None
     if data.startswith(_EXR_MAGIC):

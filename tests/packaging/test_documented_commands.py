@@ -1,0 +1,287 @@
+"""Every command and every Python block that README and get-started show works after a plain ``pip install .``.
+
+They run as they are written, page by page, on small inputs, with options behind them that make them short. A command
+that this file does not know how to shorten, or an input that it cannot make, is a failure.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from camera_files import write_mosaic, write_mosaics
+from made_sensor import made_sensor, write_polarizer_shots
+from plain_environment import declared, make_plain_environment
+from relief import write_relief
+
+import polarguide
+from polarguide.capture.sensor.pattern import sensor_pattern, tiled
+from polarguide.polarizer import ANGLES
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs" / "get-started").glob("*.md")))
+# A fenced block, or a command or an expression of the API within a sentence.
+SHOWN = re.compile(r"^```(\w*)\n(.*?)^```|`((?:polarguide [a-z]+ |pg\.)[^`\n]+)`", re.MULTILINE | re.DOTALL)
+CHOICES = re.compile(r"# (\w+(?: \| \w+)+)")
+
+EXCLUDED = {
+    "make demo": "makes .venv, and runs polarguide demo there",
+    "make test": "runs this test",
+    "make docs": "CI runs it",
+    "pip install .": "leaves the environment in which all others run here",
+}
+STEPS = 12
+SHORT = {
+    "demo": ["--steps", str(STEPS)],
+    "calibrate": [],
+    "prepare": [],
+    "inspect": [],
+    "train": ["--steps", str(STEPS), "--downscale", "2"],
+    "eval": [],
+    "view": [],
+    "render": [],
+    "present": [],
+    "share": [],
+    "export": ["--resolution", "32"],
+    "synth": [],
+    "priors": [],
+    "measure": [],
+}
+"""What is added to each verb: it may do less, and has to do it in the same way."""
+WITHOUT_EXTRA = ("synth",)
+"""Verbs that may say in one line what they lack."""
+PATIENCE = 900.0
+"""Seconds for one command: a busy machine is slow."""
+
+
+def raw_mosaics(folder: Path) -> None:
+    """The relief as a color polarization camera of twice the size records it."""
+    shots = folder.with_name("shots-of-raw")
+    names = write_relief(shots)
+    pattern = sensor_pattern("IMX250MYR")
+    assert pattern.colors is not None
+    for name in names:
+        four = [cv2.imread(str(shots / str(angle) / f"{name}.png"), cv2.IMREAD_UNCHANGED) for angle in ANGLES]
+        seen = np.stack([picture[..., ::-1].repeat(2, 0).repeat(2, 1) for picture in four]) / 65535
+        size = seen.shape[1:3]
+        angles = tiled(np.vectorize(ANGLES.index)(pattern.angles), size)
+        row, column = np.indices(size)
+        write_mosaic(folder / f"{name}.png", seen[angles, row, column, tiled(pattern.colors, size)])
+
+
+def single_shots(folder: Path) -> None:
+    """One picture of each view of the relief, at an angle that its name does not tell."""
+    shots = folder.with_name("shots-of-singles")
+    folder.mkdir()
+    for number, name in enumerate(write_relief(shots)):
+        shutil.copy(shots / str(ANGLES[number % 4]) / f"{name}.png", folder / f"{name}.png")
+
+
+def polarizer_shots(folder: Path) -> None:
+    """A polarizer before the sensor, every 15 degrees."""
+    write_polarizer_shots(folder.parent, made_sensor("IMX250MYR"), [15.0 * k for k in range(12)])
+    (folder.parent / "shots").rename(folder)
+
+
+def one_part(path: Path) -> None:
+    """One mosaic of a monochrome sensor."""
+    write_mosaics(path.with_name("parts-of-one"), 1, color=False)
+    shutil.copy(path.with_name("parts-of-one") / "v000.png", path)
+
+
+def misnamed(folder: Path) -> None:
+    """The demo's scene, whose files have the angles 45 and 135 exchanged in their names."""
+    shutil.copytree(Path(polarguide.__file__).parent / "data" / "demo", folder)
+    for path in (folder / "polar").glob("*_045.png"):
+        other = path.with_name(path.name.replace("_045", "_135"))
+        right = path.read_bytes()
+        path.write_bytes(other.read_bytes())
+        other.write_bytes(right)
+
+
+INPUTS: dict[str, dict[str, Callable[[Path], object]]] = {
+    "calibrate": {"SHOTS": polarizer_shots},
+    "prepare": {"RAW": raw_mosaics, "SHOTS": write_relief},
+    "prepare --angles": {"SHOTS": single_shots},
+    "inspect --fix": {"SCENE": misnamed},
+    "priors": {"part.png": one_part},
+    "measure": {"PARTS": lambda folder: write_mosaics(folder, 2, color=False)},
+}
+"""What is made for a verb before it is called; everything else comes from the commands above it."""
+
+
+def shown(page: Path) -> Iterator[tuple[str, str]]:
+    """What a page shows, from the top down: ("sh", a command line) or ("python", code)."""
+    for language, block, span in SHOWN.findall(page.read_text(encoding="utf-8")):
+        if language == "python" or span.startswith("pg."):
+            yield "python", block or f"import polarguide as pg\n{span}\n"
+        elif language == "sh" or span:
+            for line in (block or span).replace("\\\n", " ").splitlines():
+                yield from (("sh", command) for command in commands(line))
+
+
+def commands(line: str) -> list[str]:
+    """The command of a line; one for each choice where its comment lists what may stand in place of a word."""
+    command = shlex.join(shlex.split(line, comments=True))
+    choices = CHOICES.search(line)
+    listed = choices[1].split(" | ") if choices else []
+    words = shlex.split(command)
+    place = next((words.index(word) for word in listed if word in words), None)
+    if place is None:
+        return [command] if command else []
+    return [shlex.join([*words[:place], choice, *words[place + 1 :]]) for choice in listed]
+
+
+class Reader:
+    """Somebody who types what the pages show, each command once, in a folder of their own."""
+
+    def __init__(self, programs: Path, folder: Path) -> None:
+        self.programs, self.folder = programs, folder
+        self.typed = set(EXCLUDED)
+        self.environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+        self.environment["PATH"] = f"{programs}{os.pathsep}{self.environment['PATH']}"
+
+    def command(self, text: str) -> None:
+        """Run a command line of the shell. What it needs is made; what was there before under such names comes back."""
+        program, verb, *words = shlex.split(text)
+        assert program == "polarguide", f"how to run {text}? Add it to EXCLUDED, with the reason"
+        assert verb in SHORT, f"how to shorten {text}? Add {verb} to SHORT"
+        kinds = [f"{verb} {word}" for word in words if f"{verb} {word}" in INPUTS]
+        made = {name: make for name, make in INPUTS.get((kinds or [verb])[0], {}).items() if name in words}
+        outputs = [words[k + 1] for k, word in enumerate(words) if word in ("--out", "--video", "--fix")]
+        before = self.set_aside([*made, *outputs])
+        for name, make in made.items():
+            make(self.folder / name)
+        whole = [program, verb, *words, *SHORT[verb]]
+        if verb == "view":
+            self.visit(whole)
+        elif verb in WITHOUT_EXTRA:
+            self.turned_away(whole, outputs)
+        else:
+            self.run(whole)
+            for name in outputs:
+                assert (self.folder / name).exists(), f"{text} has not written {name}"
+        self.restore(before)
+
+    def python(self, code: str) -> None:
+        """Run a block of code, with few steps."""
+        before = self.set_aside(["runs/mine"] if "pg.train(" in code else [])
+        self.run(["python", "-W", "error", "-c", re.sub(r"steps=\d+", f"steps={STEPS}", code)])
+        self.restore(before)
+
+    def run(self, words: list[str], status: int = 0) -> subprocess.CompletedProcess[str]:
+        done = subprocess.run(
+            [self.programs / words[0], *words[1:]],
+            cwd=self.folder,
+            env=self.environment,
+            text=True,
+            capture_output=True,
+            stdin=subprocess.DEVNULL,
+            timeout=PATIENCE,
+        )
+        assert done.returncode == status, f"{shlex.join(words)}\n{done.stdout}{done.stderr}"
+        return done
+
+    def turned_away(self, words: list[str], outputs: list[str]) -> None:
+        """Run a command whose extra is not installed: one line says how to add it, and nothing is written."""
+        (line,) = self.run(words, status=2).stderr.splitlines()
+        assert re.search(r"pip install \S*\[" + words[1] + r"\]", line), line
+        assert not any((self.folder / name).exists() for name in outputs)
+
+    def visit(self, words: list[str]) -> None:
+        """Start what serves a page, fetch the page, and stop it as Ctrl-C does."""
+        with socket.socket() as listener:
+            listener.bind(("127.0.0.1", 0))
+            port = listener.getsockname()[1]
+        process = subprocess.Popen(
+            [self.programs / words[0], *words[1:], "--port", str(port)],
+            cwd=self.folder,
+            env=self.environment | {"PYTHONUNBUFFERED": "1"},
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        assert process.stdout is not None
+        said = ""
+        for line in process.stdout:
+            said += line
+            if line.startswith("viewer: "):
+                with urllib.request.urlopen(line.split()[1], timeout=PATIENCE) as answer:
+                    assert b"<html" in answer.read().lower()
+                process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130, said
+
+    def set_aside(self, names: list[str]) -> list[str]:
+        """Make room for outputs: those that are there already move away; returns their names."""
+        there = [name for name in names if (self.folder / name).exists()]
+        for name in there:
+            (self.folder / name).rename(self.folder / f"{name}.before")
+        return there
+
+    def restore(self, names: list[str]) -> None:
+        """Put back what was set aside, in place of what was written meanwhile."""
+        for name in names:
+            self.remove(name)
+            (self.folder / f"{name}.before").rename(self.folder / name)
+
+    def remove(self, name: str) -> None:
+        path = self.folder / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_plain_environment(tmp_path_factory.mktemp("plain") / "venv")
+
+
+@pytest.fixture(scope="module")
+def reader(programs: Path, tmp_path_factory: pytest.TempPathFactory) -> Reader:
+    return Reader(programs, tmp_path_factory.mktemp("reader"))
+
+
+def test_the_environment_has_what_is_declared_and_no_more(programs: Path) -> None:
+    listing = "import importlib.metadata as m; print(*(d.metadata['Name'] for d in m.distributions()))"
+    names = subprocess.run([programs / "python", "-c", listing], text=True, capture_output=True, check=True)
+    assert {re.sub(r"[-_.]+", "-", name).lower() for name in names.stdout.split()} == set(declared())
+    for module in ("pytest", "mitsuba", "torchmetrics"):
+        tried = subprocess.run([programs / "python", "-c", f"import {module}"], capture_output=True)
+        assert b"ModuleNotFoundError" in tried.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [pytest.param(page, id=page.stem) for page in PAGES if any(shown(page))])
+def test_what_a_page_shows_works(page: Path, reader: Reader, trained: Path) -> None:
+    steps = list(shown(page))
+    first = next((text for _, text in steps if "runs/mine" in text), "")
+    if first and " train " not in first and not (reader.folder / "runs" / "mine").exists():
+        shutil.copytree(trained, reader.folder / "runs" / "mine")  # of an earlier page, which was not run
+    for kind, text in steps:
+        if text not in reader.typed:
+            print(text)
+            reader.command(text) if kind == "sh" else reader.python(text)
+            reader.typed.add(text)
+
+
+def test_all_pages_are_read() -> None:
+    """What is excluded is still shown somewhere, and so are commands and code."""
+    found = [step for page in PAGES for step in shown(page)]
+    assert set(EXCLUDED) <= {text for _, text in found}
+    assert {text.split()[1] for kind, text in found if kind == "sh" and text not in EXCLUDED} == set(SHORT)
+    assert sum(kind == "python" for kind, _ in found) >= 4
+    assert {f"polarguide export runs/mine --format {name}" for name in ("ply", "spz", "cameras")} <= {
+        text for _, text in found
+    }
