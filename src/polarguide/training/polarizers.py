@@ -126,6 +126,11 @@ class Judgment:
         return self.tells and self.unexplained > POOR
 
     @property
+    def doubtful(self) -> bool:
+        """Whether an angle that was found may be wrong, or is no better than a guess."""
+        return not self.tells or self.unsettled or self.poorly_explained
+
+    @property
     def off(self) -> float:
         """Degrees from what is said to what was fitted, in [-90, 90); 0 where nothing is said."""
         return 0.0 if self.said.angle is None else (self.angle - self.said.angle + 90.0) % 180.0 - 90.0
