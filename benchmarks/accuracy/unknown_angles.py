@@ -120,7 +120,9 @@ def main() -> None:
         record["capture"] = options.capture.name
         done = {(each["first"], each["folds"], each["fold"]) for each in record["searches"]}
         plan = [(first, 1, 0) for first in range(options.choices)]
-        plan += [(first, options.folds, fold) for first in range(options.choices) for fold in range(options.folds)]
+        plan += [
+            (first, options.folds, fold) for first in range(options.choices) for fold in range(options.folds)
+        ]
         for key in [key for key in plan if key not in done][: options.most]:
             record["searches"].append(search(scene, options.steps, *key))
             options.record.write_text(json.dumps(record, separators=(",", ":")) + "\n", encoding="utf-8")

@@ -356,6 +356,7 @@ def refused(root: Path, settings: PrepareSettings, message: str) -> None:
         (("a_a30.jpg", "IMG_0012.jpg"), {}, r"1 of 2 without one \(IMG_0012.jpg\)"),
         (("img_001.jpg", "img_002.jpg"), {"format": "singles"}, "2 of 2 without one"),
         (("img_001.jpg", "img_002.jpg"), {}, "--angles unknown, or angles.csv"),
+        (("img_001.jpg", "img_002.jpg"), {}, "prepare .*in --out in-scene --angles none"),
         (("a_a30.jpg", "a-30.png"), {}, "one photograph of a at 30 degrees"),
         (("a_a30.jpg", "b_a30.png"), {}, "one kind of file.*JPEG and PNG or TIFF"),
         (("IMG_1.jpg", "IMG_1.png"), {"angles": "unknown"}, "one file called IMG_1"),

@@ -285,7 +285,10 @@ def _turns(folder: SceneFolder) -> str:
         return ""
     turned = listed([f"{counts[code]} {TURNS[code]}" for code in sorted(counts)])
     noted = [
-        shot["angle"] for record in records for shot in record.get("exposures", ()) if record["orientation"] > 1
+        shot["angle"]
+        for record in records
+        for shot in record.get("exposures", ())
+        if record["orientation"] > 1
     ]
     # Shots of a view at the usual four angles have no list of exposures.
     angles = not noted or any(not isinstance(angle, str) for angle in noted)
