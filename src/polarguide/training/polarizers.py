@@ -270,16 +270,10 @@ class Polarizers:
         if self.table is None:
             return []
         common = self._common_gain()
-        usual = self._usual()
+        fits = [self._judged(fit) for fit in self._latest()]
         found = []
-        for (view, k), fits, poor in zip(
-            self._places, self._latest().unbind(1), self._unexplained(), strict=True
-        ):
-            said = view.exposures[k]
-            rows = [
-                Judgment(view.name, k, said, said, *row[: COLUMNS - 1], usual=each)
-                for row, each in zip(fits.tolist(), usual, strict=True)
-            ]
+        for rows, poor in zip(zip(*fits, strict=True), self._unexplained(), strict=True):
+            said = rows[0].said
             telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
             judgment = replace((telling or rows)[-1], unexplained=poor)
             if telling:
@@ -292,17 +286,15 @@ class Polarizers:
             found.append(judgment if said.known else replace(judgment, believed=_belief(judgment, common)))
         return found
 
-    def _usual(self) -> list[float]:
-        """Of each of the latest fits what ``Judgment.usual`` says; 0 where nothing is specified."""
-        found = []
-        for fit in self._latest().tolist():
-            rows = (
-                Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: COLUMNS - 1])
-                for (view, k), row in zip(self._places, fit, strict=True)
-            )
-            offs = [abs(row.off) for row in rows if row.tells and row.said.angle is not None]
-            found.append(median(offs) if offs else 0.0)
-        return found
+    def _judged(self, fit: Tensor) -> list[Judgment]:
+        """What one fit [P, 8] says of each picture."""
+        rows = [
+            Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: COLUMNS - 1])
+            for (view, k), row in zip(self._places, fit.tolist(), strict=True)
+        ]
+        offs = [abs(row.off) for row in rows if row.tells and row.said.angle is not None]
+        usual = median(offs) if offs else 0.0
+        return [replace(row, usual=usual) for row in rows]
 
     def _latest(self) -> Tensor:
         """The fits of the latest search that has any; those of earlier ones are worse."""
