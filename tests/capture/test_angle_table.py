@@ -169,5 +169,5 @@ def test_inspection_knows_what_the_pictures_are(tiny: TinyCapture) -> None:
 def test_a_table_that_is_written_can_be_read(tmp_path: Path) -> None:
     exposures = [*FOUR, Exposure(12.34, gain=1.25), Exposure(), Exposure(filtered=False)]
     path = tmp_path / "angles.csv"
-    path.write_text(table_text((f"{k}.png", "a", e, 0.5 if k else None) for k, e in enumerate(exposures)))
+    path.write_text(table_text((f"{k}.png", "a", e, 0.5 if k else None, "") for k, e in enumerate(exposures)))
     assert [item.exposure for item in read_table(path)] == exposures

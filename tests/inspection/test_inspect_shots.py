@@ -20,13 +20,13 @@ from polarguide.training.polarizers import Judgment
 TURNS = (0.0, 45.0, 90.0, 135.0)
 
 
-def judgment(view: int, angle: float, certainty: float = 0.9, spread: float = 3.0) -> Judgment:
+def judgment(view: int, angle: float, modulation: float = 0.9, spread: float = 3.0) -> Judgment:
     unknown = Exposure()
-    return Judgment(f"v{view}", 0, unknown, unknown, angle % 180.0, 1.0, certainty, spread, 0.02)
+    return Judgment(f"v{view}", 0, unknown, unknown, angle % 180.0, 1.0, modulation, spread, 0.02)
 
 
-def findings(found: list[float], said: list[float | None], certainty: float = 0.9) -> ShotFindings:
-    judgments = tuple(judgment(k, angle, certainty) for k, angle in enumerate(found))
+def findings(found: list[float], said: list[float | None], modulation: float = 0.9) -> ShotFindings:
+    judgments = tuple(judgment(k, angle, modulation) for k, angle in enumerate(found))
     return ShotFindings(judgments, tuple(Exposure(angle) for angle in said))
 
 
@@ -95,11 +95,16 @@ def test_angles_that_have_nothing_to_do_with_the_pictures() -> None:
 
 
 def test_no_filter_and_unknown_angles() -> None:
-    told = checks(findings(scattered(), list(SAID), certainty=0.01))
+    told = checks(findings(scattered(), list(SAID), modulation=0.01))
     assert told["modulation"].verdict == "wrong"
     assert "reversed, or missing" in told["modulation"].finding
     told = checks(findings(scattered(), [None] * 24))
     assert [told[key].verdict for key in ("modulation", "handedness", "angles")] == ["ok", "n/a", "ok"]
+    found = findings(scattered(), [None] * 24)
+    vague = [dataclasses.replace(judgment, spread=30.0) for judgment in found.judgments[:13]]
+    told = checks(dataclasses.replace(found, judgments=(*vague, *found.judgments[13:])))
+    assert (told["angles"].verdict, "13 of the 24" in told["angles"].finding) == ("warning", True)
+    assert "--angles none" in told["angles"].remedy
 
 
 @pytest.mark.slow
@@ -121,3 +126,17 @@ def test_a_calibration_needs_four_pictures(demo_scene: Path, tmp_path: Path) -> 
     settings = InspectSettings(calibration=tmp_path / "none.json")
     with pytest.raises(PolarguideError, match="--calibration"):
         polarguide.inspect(scene, tmp_path / "out", settings=settings)
+
+
+def test_ordinary_photographs_are_not_wrong(demo_scene: Path, tmp_path: Path) -> None:
+    scene = single_shots(demo_scene, tmp_path / "shots")
+    table = scene / "angles.csv"
+    lines = [line.split(",") for line in table.read_text().splitlines()]
+    place = lines[0].index("angle")
+    table.write_text("\n".join(",".join([*row[:place], "none", *row[place + 1 :]]) for row in lines[1:]).join(
+        (",".join(lines[0]) + "\n", "\n")))  # fmt: skip
+    polarguide.inspect(scene, tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "inspection.json").read_text())
+    verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
+    assert verdicts["pictures"] == "warning"
+    assert {verdicts[key] for key in ("modulation", "handedness", "zero_offset", "angles")} == {"n/a"}

@@ -23,7 +23,7 @@ from tiny_capture import encode_srgb, write_picture
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.filter.exif import apply_orientation
+from polarguide.capture.filter.exif import TURNS, apply_orientation
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import malus
 from polarguide.preparation import prepare as prepare_module
@@ -99,7 +99,11 @@ def test_exif_turns_pixels_and_the_angle(tmp_path: Path, code: int) -> None:
     write_picture(path, behind(stored, [30])[0], bits=8)
     data, block = path.read_bytes(), b"Exif\0\0" + exif_tags(code, None)
     path.write_bytes(data[:2] + b"\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block + data[2:])
-    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
+    heard = Heard()
+    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN, heard)
+    said = [text for text in heard.said if "EXIF orientation" in text]
+    also = "1 of 1 views were turned for display, and the polarizer angles with them"
+    assert [(also in text, TURNS[code] in text) for text in said] == [(True, True)] * (code > 1)
     (row,) = table(tmp_path / "out")
     # Worked out by hand: a quarter adds 90, a mirror changes the sign.
     assert float(row["angle"]) == {1: 30, 2: 150, 3: 30, 4: 150, 5: 60, 6: 120, 7: 60, 8: 120}[code]
@@ -352,6 +356,7 @@ def refused(root: Path, settings: PrepareSettings, message: str) -> None:
         (("a_a30.jpg", "IMG_0012.jpg"), {}, r"1 of 2 without one \(IMG_0012.jpg\)"),
         (("img_001.jpg", "img_002.jpg"), {"format": "singles"}, "2 of 2 without one"),
         (("img_001.jpg", "img_002.jpg"), {}, "--angles unknown, or angles.csv"),
+        (("img_001.jpg", "img_002.jpg"), {}, "prepare .*in --out in-scene --angles none"),
         (("a_a30.jpg", "a-30.png"), {}, "one photograph of a at 30 degrees"),
         (("a_a30.jpg", "b_a30.png"), {}, "one kind of file.*JPEG and PNG or TIFF"),
         (("IMG_1.jpg", "IMG_1.png"), {"angles": "unknown"}, "one file called IMG_1"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -46,6 +47,13 @@ def test_views_that_do_not_register(tmp_path: Path, there: bool) -> None:
     with pytest.raises(PolarguideError, match="0 of 3 views registered") as caught:
         prepare_scene(source, out, SETTINGS)
     assert f"polarguide priors {source}" in str(caught.value)
+    # What is recommended changes something: all pairs are compared by default.
+    assert "--matching exhaustive" not in str(caught.value)
+    assert "--sfm-pictures minimum" in str(caught.value)
+    tried = replace(SETTINGS, matching="sequential", sfm_pictures="minimum")
+    with pytest.raises(PolarguideError, match="--matching exhaustive") as caught:
+        prepare_scene(source, out, tried)
+    assert "--sfm-pictures" not in str(caught.value)
     assert out.exists() == there
     assert not there or not list(out.iterdir())
 

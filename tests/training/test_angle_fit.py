@@ -1,4 +1,4 @@
-"""Angle, gain and certainty of a picture behind a polarizer, from what was predicted of it."""
+"""Angle, gain and modulation of a picture behind a polarizer, from what was predicted of it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_angle_and_gain_are_found(degrees: float, mount: Mount) -> None:
     assert found is not None
     assert (found.angle - degrees + 90) % 180 - 90 == pytest.approx(0, abs=1e-2)
     assert found.gain == pytest.approx(1.3, rel=1e-4)
-    assert found.certainty == pytest.approx(1, abs=1e-3)
+    assert found.modulation == pytest.approx(1, abs=1e-3)
     assert found.spread < 0.1
 
 
@@ -56,7 +56,7 @@ def test_misfits_are_those_of_the_angle_and_of_a_quarter_turn(mount: Mount) -> N
 
     def misfit(angle: float) -> float:
         cosine, sine = optics.analyzer(math.radians(angle), RAYS, mount)[..., None].unbind(0)
-        shown = stokes[0] + found.certainty * (stokes[1] * cosine + stokes[2] * sine)
+        shown = stokes[0] + found.modulation * (stokes[1] * cosine + stokes[2] * sine)
         fair = (1 / (stokes[0].mean(dim=-1) + FLOOR))[..., None]
         return float((fair * (picture - found.gain * shown / 2).abs()).sum() / (fair * picture).sum())
 
@@ -86,7 +86,7 @@ def test_masked_pixels_do_not_count() -> None:
 def test_without_a_filter_the_certainty_is_zero() -> None:
     found = fit_angle(0.8 * light()[0] / 2, light(), ALL, RAYS, "sensor")
     assert found is not None
-    assert found.certainty < 1e-3
+    assert found.modulation < 1e-3
     assert found.gain == pytest.approx(0.8, rel=1e-4)
 
 

@@ -191,9 +191,50 @@ def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
     report_polarizers(tmp_path, ones, polarizers, heard)
     warned = "\n".join(heard.said)
     assert "1 of 5 pictures (v3#0) look as if taken without a filter" in warned
-    assert "1 of 5 pictures (v1#0) contradict their angles: v1#0 is said to be at 90 degrees" in warned
+    assert "1 of 5 pictures (v1#0) contradict their angles: v1#0 is specified at 90 degrees" in warned
     lines = {item.view: item.exposure for item in read_table(tmp_path / "angles.csv")}
     assert lines["v4"].angle == 135
+
+
+def test_only_what_is_an_exception_contradicts(tmp_path: Path) -> None:
+    """A fit is evidence as far as those of the other pictures agree with their angles."""
+    scene = captured_as(WHOLE, "one")
+    polarizers = Polarizers(scene, STOKES, STEPS)
+    right = polarizers.fit(predicted)[None]
+    right[..., 3] = 2.0
+
+    def told(*off: float) -> tuple[list[int], str]:
+        fits = right.clone()
+        fits[0, :, 0] = (fits[0, :, 0] + torch.tensor(off, dtype=fits.dtype)) % 180.0
+        polarizers.take(fits)
+        heard = Heard()
+        report_polarizers(tmp_path, scene, polarizers, heard)
+        return [k for k, j in enumerate(polarizers.judgments()) if j.contradicts], "\n".join(heard.said)
+
+    assert told(2, -3, 80, 4, -2)[0] == [2]
+    assert told(2, -3, 45, 4, -2)[0] == [2]
+    assert told(2, -3, 15, 4, -2)[0] == []
+    found, said = told(12, -14, 45, 10, -11)  # the model is 12 degrees off as a rule
+    assert (found, "were not checked" in said) == ([], False)
+    found, said = told(-70, 40, 85, -35, 60)  # it knows nothing yet
+    assert (found, "contradict" in said, "known angles were not checked" in said) == ([], False, True)
+
+
+def test_where_most_angles_are_doubtful_it_says_what_to_do(tmp_path: Path) -> None:
+    scene = captured_as(WHOLE, "unknown")
+    polarizers = Polarizers(scene, STOKES, STEPS)
+    fits = polarizers.fit(predicted)[None]
+    fits[..., 3] = 2.0
+    for doubtful in (2, 3):
+        fits[:, :doubtful, 3] = 30.0
+        polarizers.take(fits)
+        heard = Heard()
+        report_polarizers(tmp_path, scene, polarizers, heard)
+        said = "\n".join(heard.said)
+        assert f"angles found for 5 of 5 pictures; {doubtful} of 5 are doubtful" in said
+        assert ("--angles none" in said) == (2 * doubtful > 5)
+        assert (tmp_path / "angles.csv").read_text().count("doubtful") == doubtful
+    assert read_table(tmp_path / "angles.csv")
 
 
 def test_exposure_times_are_found() -> None:
@@ -271,9 +312,9 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
     # What was found holds for the pictures in full size.
     view = trainer.scene.train_views[0]
     assert trainer.polarizers.believed(view).codes is view.codes
-    # On a schedule that tells nothing of a search, known angles are looked at after half of all steps.
+    # On a schedule that tells nothing of a search, known angles are looked at twice.
     known = Trainer(captured_as(WHOLE, "one"), STOKES, TrainSettings(steps=STEPS, background="scene"), CPU)
-    assert [step for step in range(STEPS) if known.polarizers.due(step)] == [STEPS // 2]
+    assert [step for step in range(STEPS) if known.polarizers.due(step)] == [8, 12]
 
 
 @pytest.mark.parametrize("exposures", ["one", "four", "none"])

@@ -17,7 +17,7 @@ from polarguide.spreadsheet import csv_lines
 TABLE = "angles.csv"
 UNKNOWN, NONE = "unknown", "none"
 _COLUMNS = ("file", "view", "angle")
-_MORE = ("gain", "certainty", "note")
+_MORE = ("gain", "modulation", "note")
 """Further columns; the last two are what a training says of its pictures, and are passed over."""
 _LARGEST = 1 << 26
 _LEAST_GAIN = 1e-6
@@ -132,13 +132,13 @@ def _number(where: str, name: str, text: str, least: float = -math.inf) -> float
     return value
 
 
-def table_text(lines: Iterable[tuple[str, str, Exposure, float | None]]) -> str:
-    """A table as CSV text: file, view, exposure, and how certain it is (None: not judged)."""
-    rows: list[list[object]] = [[*_COLUMNS, "gain", "certainty"]]
-    for file, view, exposure, certainty in lines:
+def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) -> str:
+    """A table as CSV text: file, view, exposure, modulation as of ``FittedAngle`` (None: not fitted), and a note."""
+    rows: list[list[object]] = [[*_COLUMNS, *_MORE]]
+    for file, view, exposure, modulation, note in lines:
         angle = (
             NONE if not exposure.filtered else UNKNOWN if exposure.angle is None else f"{exposure.angle:.2f}"
         )
-        sure = None if certainty is None else f"{certainty:.2f}"
-        rows.append([file, view, angle, f"{exposure.gain:.4f}", sure])
+        shown = None if modulation is None else f"{modulation:.2f}"
+        rows.append([file, view, angle, f"{exposure.gain:.4f}", shown, note])
     return csv_lines(rows)

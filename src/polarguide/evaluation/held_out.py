@@ -48,5 +48,5 @@ def _behind(measured: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, moun
         gain = (counted * measured).sum() / (counted * stokes[0] / 2).sum().clamp(min=1e-12)
         return gain * stokes[0] / 2
     cosine, sine = optics.analyzer(math.radians(found.angle), rays, mount)[..., None].to(stokes)
-    polarized = found.certainty * (stokes[1] * cosine + stokes[2] * sine)
+    polarized = found.modulation * (stokes[1] * cosine + stokes[2] * sine)
     return found.gain * (stokes[0] + polarized) / 2

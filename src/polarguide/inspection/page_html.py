@@ -128,12 +128,12 @@ def _shots(found: ShotFindings) -> str:
         tells = "too little polarization to tell" if judgment.vague else tells
         rows.append(
             f"<tr><th>{html.escape(judgment.view)}</th><td>{html.escape(said.words)}</td><td>{tells}</td>"
-            f"<td>{judgment.spread:.1f}°</td><td>{judgment.certainty:.2f}</td><td>{judgment.gain:.2f}</td></tr>"
+            f"<td>{judgment.spread:.1f}°</td><td>{judgment.modulation:.2f}</td><td>{judgment.gain:.2f}</td></tr>"
         )
     return (
         "<p>A short training that was told no angle found these. It is good to a few degrees; training itself finds "
         'unknown angles more exactly.</p><details><summary>All pictures</summary><table class="odds"><thead><tr>'
-        "<th>view</th><th>said</th><th>found</th><th>spread</th><th>certainty</th><th>gain</th></tr></thead><tbody>"
+        "<th>view</th><th>said</th><th>found</th><th>spread</th><th>modulation</th><th>gain</th></tr></thead><tbody>"
         + "".join(rows)
         + "</tbody></table></details>"
     )

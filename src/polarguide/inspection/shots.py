@@ -22,13 +22,13 @@ from polarguide.inspection.short_run import short_run
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
-from polarguide.training.polarizers import LAST, Judgment, Polarizers
+from polarguide.training.polarizers import LAST, REMEDY, Judgment, Polarizers
 from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import StepReport
 
 RECIPE = "polarguide-stokes"
 CERTAIN = 0.6
-"""Certainty (``FittedAngle``), over the median of all pictures, from which one may be said to contradict its angle. At
+"""Modulation (``FittedAngle``), over the median of all pictures, from which one may be said to contradict its angle. At
 0.7 a wrong line of the demo (0.67) went unnamed. Nor may one that the scene explains poorly: on four test scenes with
 right angles (two seeds each, 504 pictures) nine would be said to be wrong, five of them are certain enough, and none of
 these is explained as well as the others.
@@ -56,11 +56,13 @@ class ShotFindings:
         judgments: of each picture through a filter, as if nothing were known of it; empty without a training.
         said: what the capture says of each of them.
         why: why there was no training.
+        unfiltered: whether that is because no picture was taken through a filter.
     """
 
     judgments: tuple[Judgment, ...] = ()
     said: tuple[Exposure, ...] = ()
     why: str = ""
+    unfiltered: bool = False
 
     @property
     def telling(self) -> list[tuple[Judgment, float]]:
@@ -78,7 +80,7 @@ class ShotFindings:
                 "found_degrees": judgment.angle,
                 "spread_degrees": judgment.spread,
                 "gain": judgment.gain,
-                "certainty": judgment.certainty,
+                "modulation": judgment.modulation,
                 "filtered": not judgment.unfiltered,
                 "tells": not (judgment.vague or judgment.unfiltered),
             }
@@ -111,7 +113,7 @@ def find_shots(
         steps: about how many to take. backend: device and rasterizer. on_step: called after every step.
     """
     if not any(exposure.filtered for view in scene.train_views for exposure in view.exposures):
-        return ShotFindings(why="No picture was taken through a filter.")
+        return ShotFindings(why="No picture was taken through a filter.", unfiltered=True)
     recipe = recipe_named(RECIPE)
     assert isinstance(recipe, Recipe)
     blind, total = untold(scene), math.ceil(steps / LAST)
@@ -146,8 +148,9 @@ def pictures_check(capture: Capture) -> Check:
     said += f"{min(gains):.2f} to {max(gains):.2f}."
     if plain == len(exposures):
         return Check(
-            key, title, "wrong", said, "Polarization takes pictures through a filter: photograph some views so.",
-            figures=figures,
+            key, title, "warning", f"{said} Ordinary photographs train, without measured polarization.",
+            "If a filter was used, note its angles (or --angles unknown) and repeat prepare. If not, nothing is wrong; "
+            "some views through a filter would improve layers and normals.", figures=figures,
         )  # fmt: skip
     if not unknown and len(angles) < FEW_ANGLES:
         return Check(
@@ -163,7 +166,8 @@ def shot_checks(found: ShotFindings) -> list[Check]:
     if found.why:
         said = [("modulation", "Filter"), ("handedness", "Sense of the angles"),
                 ("zero_offset", "Zero of the angles"), ("angles", "Angles of the pictures")]  # fmt: skip
-        return [Check(key, title, "not verified", found.why) for key, title in said]
+        verdict: Verdict = "n/a" if found.unfiltered else "not verified"
+        return [Check(key, title, verdict, found.why) for key, title in said]
     sense, offset, error = _common(found.telling)
     return [
         _modulation(found),
@@ -197,8 +201,8 @@ def _modulation(found: ShotFindings) -> Check:
     count = len(found.judgments)
     plain = tuple(dict.fromkeys(j.view for j in found.judgments if j.unfiltered))
     vague = sum(j.vague for j in found.judgments)
-    certainty = float(np.median([j.certainty for j in found.judgments]))
-    figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "certainty": certainty}
+    modulation = float(np.median([j.modulation for j in found.judgments]))
+    figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "modulation": modulation}
     said = f"{count - len(plain) - vague} of {count} pictures tell the angle of their filter."
     if 2 * len(plain) > count:
         return Check(
@@ -267,17 +271,22 @@ def _each(found: ShotFindings, sense: int | None, offset: float) -> Check:
     unknown = sum(not said.known for said in found.said)
     if sense is None:
         chaos = len(found.telling) >= FEWEST
+        if _all_unknown(found) and (doubtful := sum(j.doubtful for j in found.judgments)) * 2 > unknown:
+            said = f"No angle is specified, and {doubtful} of the {unknown} that were found are doubtful."
+            return Check(
+                key, title, "warning", said, REMEDY, figures={"doubtful": doubtful, "unknown": unknown}
+            )
         verdict: Verdict = "wrong" if chaos else "ok" if _all_unknown(found) else "not verified"
         said = "The pictures contradict the angles that are said." if chaos else _too_few(found)
         return Check(key, title, verdict, said, _remedy_of_chaos() if chaos else "")
     rows = [(j, _apart(j.angle, sense * said + offset), said) for j, said in found.telling]
     typical = float(np.median([abs(apart) for _, apart, _ in rows]))
-    certain = CERTAIN * float(np.median([j.certainty for j in found.judgments]))
+    certain = CERTAIN * float(np.median([j.modulation for j in found.judgments]))
     off = [
         (j, said)
         for j, apart, said in rows
         if abs(apart) > max(CONTRADICTS, 4 * j.spread, 4 * 1.4826 * typical)
-        and j.certainty > certain
+        and j.modulation > certain
         and not j.poorly_explained
     ]
     figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}

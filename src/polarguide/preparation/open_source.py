@@ -107,7 +107,8 @@ def _unknown_layout(root: Path) -> PolarguideError:
     if photographs and not mosaics:
         remedy += (
             " Photographs through a filter that was turned between them: --angles unknown, or angles.csv with the "
-            "columns file,angle. Ordinary photographs carry no polarization."
+            f"columns file,angle. Ordinary photographs, without a filter: polarguide prepare {source} {out} --angles "
+            "none (pictures, poses and normals without measured polarization)."
         )
         if len(photographs) % len(ANGLES) == 0:
             remedy += " docs/how-to/prepare.md sorts shots that are numbered in the order they were taken."

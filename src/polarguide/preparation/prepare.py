@@ -6,6 +6,7 @@ import itertools
 import os
 import shlex
 import shutil
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError
 from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.filter.exif import TURNS
 from polarguide.capture.view import ANGLES, listed
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
@@ -151,6 +153,8 @@ def _write_scene(
             f"({listed(poses.missing)})."
         )
     _write_views(folder, pictures, poses, reporter)
+    if note := _turns(folder):
+        reporter.say(note)
     if poses is not None:
         _write_model(folder, poses)
     if pictures.kind == "singles":
@@ -270,6 +274,26 @@ def _write_view(
             if np.array_equal(intensities[a], intensities[b])
         ]
     return faults, done.notes
+
+
+def _turns(folder: SceneFolder) -> str:
+    """Which views were turned for display, and their polarizer angles with them; empty where none was."""
+    records = folder.views.values()
+    counts = Counter(record.get("orientation", 1) for record in records)
+    del counts[1]
+    if not counts:
+        return ""
+    turned = listed([f"{counts[code]} {TURNS[code]}" for code in sorted(counts)])
+    noted = [
+        shot["angle"]
+        for record in records
+        for shot in record.get("exposures", ())
+        if record["orientation"] > 1
+    ]
+    # Shots of a view at the usual four angles have no list of exposures.
+    angles = not noted or any(not isinstance(angle, str) for angle in noted)
+    also = ", and the polarizer angles with them" if angles else ""
+    return f"EXIF orientation: {counts.total()} of {len(records)} views were turned for display{also} ({turned})."
 
 
 def _write_model(folder: SceneFolder, poses: Poses) -> None:

@@ -50,6 +50,7 @@ class Workshop:
             matching=asked.matching,
             seed=asked.seed,
             reporter=self._reporter,
+            untried=_untried(asked, self._pictures.kind),
             intrinsics=None if asked.intrinsics is None else known_intrinsics(asked.intrinsics),
             refine=asked.refine_intrinsics,
         )
@@ -95,3 +96,14 @@ class Workshop:
                     self._folder.save()
                 advance(count)
         return {view: msgspec.convert(known[view], Geometry) for view in views}
+
+
+def _untried(asked: PrepareSettings, kind: str) -> str:
+    """The options that change something about structure from motion, for a message."""
+    ways = ["--matching exhaustive (compares all pairs)"] if asked.matching != "exhaustive" else []
+    if asked.sfm_pictures != "minimum" and kind != "singles":  # of one picture, the minimum is the picture
+        ways.append("--sfm-pictures minimum (less glare)")
+    if asked.intrinsics is None:
+        ways.append("--intrinsics fx,fy,cx,cy (in pixels of the developed pictures)")
+    ways.append("--poses PATH (a COLMAP model, or cameras of another program)")
+    return f"Options that may help: {', '.join(ways)}."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
 
 from polarguide.capture import Scene
 from polarguide.capture.angle_table import TABLE, table_text
@@ -14,7 +13,10 @@ from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.files import write_text
 from polarguide.progress import Reporter
-from polarguide.training.polarizers import Judgment, Polarizers
+from polarguide.training.polarizers import REMEDY, Judgment, Polarizers
+
+ANY = 90.0
+"""Degrees: as far as two angles can be apart."""
 
 
 def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter: Reporter) -> None:
@@ -29,13 +31,15 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         return
     names = picture_names(scene)
     of = {(judgment.view, judgment.number): judgment for judgment in judgments}
-    lines: list[tuple[str, str, Exposure, float | None]] = []
+    lines: list[tuple[str, str, Exposure, float | None, str]] = []
     for view in scene.views:
         for number, exposure in enumerate(view.exposures):
-            found = of.get((view.name, number))
-            file = names[view.name][number]
-            certainty = None if found is None else found.certainty
-            lines.append((file, view.name, exposure if found is None else found.believed, certainty))
+            file, found = names[view.name][number], of.get((view.name, number))
+            if found is None:
+                lines.append((file, view.name, exposure, None, ""))
+                continue
+            note = "doubtful" if found.doubtful and not found.said.known else ""
+            lines.append((file, view.name, found.believed, found.modulation, note))
     write_text(out / TABLE, table_text(lines))
 
     def named(chosen: Sequence[Judgment]) -> str:
@@ -43,12 +47,14 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
 
     sought = [judgment for judgment in judgments if not judgment.said.known]
     if sought:
-        fitted = [judgment for judgment in sought if judgment.believed.angle is not None]
-        middle = median(judgment.certainty for judgment in fitted) if fitted else 0.0
+        fitted = sum(judgment.believed.angle is not None for judgment in sought)
+        doubtful = sum(judgment.doubtful for judgment in sought)
         reporter.say(
-            f"angles found for {len(fitted)} of {len(sought)} pictures (median certainty {middle:.2f}, 1 is a filter, "
-            f"0 none): {out / TABLE}"
+            f"angles found for {fitted} of {len(sought)} pictures; {doubtful} of {len(sought)} are doubtful: "
+            f"{out / TABLE}"
         )
+        if 2 * doubtful > len(sought):
+            reporter.warn(f"Most angles are doubtful, and so are the layers and normals. {REMEDY}")
     vague = [judgment for judgment in sought if judgment.vague]
     if guessed := [judgment for judgment in vague if judgment.guesses]:
         reporter.warn(f"{named(guessed)} hardly tell their angle: the likeliest one is taken.")
@@ -67,10 +73,16 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         reporter.warn(
             f"{named(plain)} look as if taken without a filter, or through a circular one mounted the wrong way round."
         )
+    known = [judgment for judgment in judgments if judgment.said.angle is not None]
+    if known and all(judgment.limit >= ANY for judgment in known):
+        reporter.say(
+            f"known angles were not checked: the model predicts polarization too poorly (pictures look "
+            f"{known[0].usual:.0f} degrees off in the median). polarguide inspect {scene.root} checks them by itself."
+        )
     if wrong := [judgment for judgment in judgments if judgment.contradicts]:
         first = wrong[0]
         reporter.warn(
-            f"{named(wrong)} contradict their angles: {_name(names, first)} is said to be at "
+            f"{named(wrong)} contradict their angles: {_name(names, first)} is specified at "
             f"{first.said.words} degrees and looks as if at {first.angle:.0f}. Correct angles.csv."
         )
 

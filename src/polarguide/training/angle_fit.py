@@ -28,16 +28,17 @@ class FittedAngle:
     Attributes:
         angle: degrees in [0, 180), as ``Exposure.angle``.
         gain: brightness over the predicted one.
-        certainty: how much of the predicted polarization shows in the picture: 1 behind a polarizer, 0 without one.
+        modulation: the polarization that shows in the picture over the predicted one: 1 behind a polarizer, 0 without
+            one, above 1 where too little was predicted.
         spread: standard deviation of the angle, degrees; at most 90.
-        doubt: standard deviation of the certainty, at most 1.
+        doubt: standard deviation of the modulation, at most 1.
         misfit: what remains of the picture's light, relative to it: the mean of the differences over the picture's.
         misfit_across: the same with the polarizer turned by 90 degrees.
     """
 
     angle: float
     gain: float
-    certainty: float
+    modulation: float
     spread: float
     doubt: float
     misfit: float
@@ -93,13 +94,13 @@ def fit_angle(
     across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
     spread = math.degrees(math.sqrt(max(0.0, float(across @ covariance @ across))) / length / 2)
     doubt = math.sqrt(max(0.0, float(torch.linalg.eigvalsh(covariance[1:, 1:])[-1]))) / gain
-    certainty = length / gain
+    modulation = length / gain
     fair = plain.sqrt()
     light = float((fair * y).sum())
     turned = solution * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     misfit, crossed = (float((fair * (y - of @ columns).abs()).sum()) / light for of in (solution, turned))
     return FittedAngle(
-        math.degrees(angle) % 180.0, gain, certainty, min(spread, 90.0), min(doubt, 1.0), misfit, crossed
+        math.degrees(angle) % 180.0, gain, modulation, min(spread, 90.0), min(doubt, 1.0), misfit, crossed
     )
 
 

@@ -24,8 +24,8 @@ _ENOUGH_SHARE = 0.9
 _WEAK_PAIR, _WEAK_START, _WEAK_POSE = 10, 50, 15
 LEAST_VIEWS = 3
 ADVICE = (
-    "More views with more overlap (15 degrees or less between neighbors), a textured ground under the object and "
-    "sharp pictures help; --matching exhaustive finds more pairs than sequential."
+    "Take more pictures between those that are left out and their neighbors (15 degrees or less apart), put a textured "
+    "ground under the object, and remove blurred pictures."
 )
 
 
@@ -53,6 +53,7 @@ def reconstruct(
     matching: str,
     seed: int,
     reporter: Reporter,
+    untried: str,
     intrinsics: tuple[str, tuple[float, ...]] | None = None,
     refine: bool = True,
 ) -> Path:
@@ -68,6 +69,7 @@ def reconstruct(
         matching: "exhaustive", or "sequential" for views taken in the order of their names.
         seed: of the random numbers.
         reporter: for progress and messages.
+        untried: the options that may connect more views, for messages.
         intrinsics: model and parameters of all pictures, where they are known.
         refine: whether to refine known intrinsics.
 
@@ -105,7 +107,7 @@ def reconstruct(
             images,
             expected="pictures that structure from motion can connect",
             found=f"{registered} of {len(sizes)} views registered",
-            remedy=ADVICE + " Or bring a COLMAP model with --poses PATH.",
+            remedy=f"{ADVICE} {untried}",
         )
     chosen = folder / "chosen"
     shutil.rmtree(chosen, ignore_errors=True)
@@ -118,7 +120,7 @@ def reconstruct(
         f"{best.compute_mean_reprojection_error():.2f} pixels; {len(models)} model(s) found."
     )
     if registered < _FEW_SHARE * len(sizes):
-        reporter.warn(f"Only {said}. {ADVICE}")
+        reporter.warn(f"Only {said}. {ADVICE} {untried}")
     return model
 
 

@@ -14,6 +14,16 @@ from polarguide.capture.formats.integrity import jpeg_segments, png_chunks, tiff
 _ORIENTATION = 274
 _MIRRORED = (2, 4, 5, 7)
 _QUARTER = (5, 6, 7, 8)
+TURNS = {
+    2: "mirrored left to right",
+    3: "turned by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "mirrored along the falling diagonal",
+    6: "turned by 90 degrees clockwise",
+    7: "mirrored along the rising diagonal",
+    8: "turned by 90 degrees counter-clockwise",
+}
+"""What each orientation but 1 does to the stored picture for display."""
 
 
 def orientation(data: bytes) -> int:
