@@ -125,6 +125,7 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
     views = run.scene.test_views + run.scene.train_views
     scored = (run.folder / METRICS_FILE).exists()
     scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
+    health = run.health
     page = share_page(
         shown.gaussians,
         model.light,
@@ -136,7 +137,9 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         metrics=[
             *((f"{label}, test views", text) for label, text in scores),
             ("Gaussians", f"{len(shown.gaussians['means']):,}"),
+            ("polarization", run.polarization),
         ],
+        notes=[f"Warning: {warning}" for warning in health.warnings] if health is not None else [],
         presentation=shown.presentation,
     )
     make_folder(path.parent)
@@ -170,7 +173,10 @@ class _Shown:
         around = run.frame if self.presentation.up_axis is not None else None
         self.placement = Placement.of(self.presentation, around)
         scene = run.configuration.scene_digest[:12]
-        self.origin = Origin(self.presentation, f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}")
+        made_of = (
+            f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}, polarization {run.polarization}"
+        )
+        self.origin = Origin(self.presentation, made_of)
 
     @property
     def comments(self) -> list[str]:
