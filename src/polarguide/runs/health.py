@@ -49,18 +49,19 @@ class Limits:
     """From where on a fact is worth a warning.
 
     Attributes:
-        far: dB under the median of the views nearest to it: 6 are twice their error. Views of other sides of a scene
-            differ by as much by nature.
-        scattered: the same in robust standard deviations of such differences.
+        far: dB under the median of the views nearest to it: 10 are ten times their squared error. Views of sound
+            scenes differ from those beside them by up to 6.
+        scattered: the same in robust standard deviations of such differences, for scenes where they differ by more.
         brighter: times the brightest intensity that was measured anywhere. A filter hides more than half of the light
             only where more than half of it is polarized, and then in every view.
         burned: share of the pixels of a view that are brighter than that: a spot of 9 x 9 pixels of 320 x 240.
         fog: mean share of the light of a view that comes from where no surface can be: what one sees in dark places.
-        bare: share of the pixels of a view through which one sees nothing where the photograph shows something.
+        bare: share of the pixels of a view that are holes: there is mostly nothing, and less than half of the light
+            that was measured, which no filter explains.
         unseen: share of the Gaussians that no view sees: of the size of a file, and what one sees from elsewhere.
     """
 
-    far: float = 6.0
+    far: float = 10.0
     scattered: float = 3.0
     brighter: float = 2.0
     burned: float = 0.001
@@ -81,7 +82,7 @@ class ViewHealth:
         beside: median of those of the views nearest to it; None where there are not enough.
         burned: share of the pixels that are brighter than ``Limits.brighter`` times what was measured anywhere.
         fog: mean share of the light that comes from where no surface can be; None where no points tell that.
-        bare: share of the pixels where the photograph shows something and the model, mostly, nothing.
+        bare: share of the pixels that are holes, see ``Limits.bare``.
     """
 
     psnr: float | None
@@ -218,8 +219,8 @@ def _look(
     error = errors[:, counted].square().mean().double()
     psnr = None if bool(error.isnan()) else min(float(-10 * torch.log10(error)), HIGHEST_PSNR)
     burned = ~(result.final <= limit).all(dim=-1) & counted
-    shows = _inner((local.photograph().mean(dim=-1) > DARK) & counted)
-    bare = shows & (result.alpha < 0.5)
+    shown, light = local.photograph().mean(dim=-1), result.final.mean(dim=-1)
+    bare = _inner((shown > DARK) & counted) & (result.alpha < 0.5) & (light < shown / 2)
     fog = None
     if near > 0:
         depth = torch.full_like(result.alpha, near)
@@ -273,6 +274,7 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
         views: those that were looked at. unseen: as of ``Health``. limits: from where on.
     """
     found = []
+    bare = {name: view.bare for name, view in views.items() if view.bare > limits.bare}
     burned = {name: view.burned for name, view in views.items() if view.burned > limits.burned}
     if burned:
         found.append(
@@ -280,7 +282,8 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             "was measured. Their pictures do not determine the light there: do not use this run; add pictures of "
             "these views at other angles, or without a filter, and train again."
         )
-    if far := [name for name in _far_under(views, limits) if name not in burned]:
+    explained = burned.keys() | bare.keys()
+    if far := [name for name in _far_under(views, limits) if name not in explained]:
         worst = ", ".join(
             f"{name} ({views[name].psnr:.1f} dB, beside {views[name].beside:.1f})" for name in far[:4]
         )
@@ -297,7 +300,6 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             "views near them show it: add views from there, or, if the subject stands alone, train with --background "
             "black or masked."
         )
-    bare = {name: view.bare for name, view in views.items() if view.bare > limits.bare}
     if bare:
         found.append(
             f"the result has holes where the photographs show something: {_worst(bare)}. Add views or points there; "
