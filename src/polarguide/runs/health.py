@@ -278,7 +278,7 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
     burned = {name: view.burned for name, view in views.items() if view.burned > limits.burned}
     if burned:
         found.append(
-            f"the result has burned: {_worst(burned)} shine {limits.brighter:g} times brighter than anything that "
+            f"the result has burned: {_worst(burned)} are over {limits.brighter:g} times as bright as anything that "
             "was measured. Their pictures do not determine the light there: do not use this run; add pictures of "
             "these views at other angles, or without a filter, and train again."
         )
