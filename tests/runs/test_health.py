@@ -249,7 +249,7 @@ def test_a_training_writes_its_health_and_the_page_shows_it(demo_scene: Path, tm
     assert run.polarization == "measured"
     dataclasses.replace(found, warnings=("it has <burned>",)).save(run.folder)
     page = run.share().read_text(encoding="utf-8")
-    assert "<tr><th>polarization</th><td>measured</td></tr>" in page
+    assert "polarguide-stokes, 100 steps · polarization: measured</p>" in page
     assert "Warning: it has &lt;burned&gt;" in page
     sheet = run.write_pictures(views="v000", layers=["final"])
     assert b"tEXtPolarization\0measured" in sheet.read_bytes()

@@ -106,7 +106,7 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         run: the run; its scene is read.
         path: file to write, ending in .html; ``share.html`` in the run's folder by default.
         title: heading of the page; that of the presentation, or the scene's name, by default.
-        caption: text below it; the recipe and its steps by default.
+        caption: text below it; the recipe and its steps by default. The word about polarization follows.
 
     Returns:
         The file's path.
@@ -133,11 +133,10 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         {view.name: view.camera for view in views},
         first=views[0].name,
         title=title or shown.presentation.title or run.scene.name,
-        caption=caption or f"{run.recipe.name}, {run.steps:,} steps",
+        caption=f"{caption or f'{run.recipe.name}, {run.steps:,} steps'} · polarization: {run.polarization}",
         metrics=[
             *((f"{label}, test views", text) for label, text in scores),
             ("Gaussians", f"{len(shown.gaussians['means']):,}"),
-            ("polarization", run.polarization),
         ],
         notes=[f"Warning: {warning}" for warning in health.warnings] if health is not None else [],
         presentation=shown.presentation,
