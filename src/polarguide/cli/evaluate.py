@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from polarguide.cli.console import console, say
+from polarguide.cli.console import console, say, warn
 from polarguide.cli.runs import RunFolder, opened
 from polarguide.options import ComputeOptions
 from polarguide.printable import printable
@@ -44,6 +44,11 @@ def evaluate(
             say(
                 f"the {_MOST_OBJECTS} largest of {len(record['objects']):,} objects; metrics.json has all of them"
             )
+    found = trained.health
+    for warning in () if found is None else found.warnings:
+        warn(warning)
+    say(f"polarization: {trained.polarization}")
+    say("health: not recorded, the training was not checked" if found is None else found.summary)
     sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE
     say(f"metrics: {run / 'metrics.json'}")
     say(f"where the errors are: {run / sheet}")
@@ -89,5 +94,5 @@ def _table(record: dict[str, Any], title: str) -> Table:
     table.add_column("metric")
     table.add_column("value", justify="right")
     for label, text in importlib.import_module("polarguide.evaluation.table").shown_metrics(record):
-        table.add_row(label, Text(text))
+        table.add_row(label, Text(printable(text)))
     return table

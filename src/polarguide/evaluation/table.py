@@ -272,6 +272,7 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
     Returns:
         Labels and values with their units, in the order of the table; "n/a" and why for a metric without a value. One
         that has no reason recorded, for want of ground truth or of a layer, is left out: see ``absent_metrics``.
+        Below the PSNR stands that of the worst view, which a mean hides.
     """
     lines = []
     for metric in METRICS:
@@ -281,7 +282,18 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
         reason = record.get(f"{metric.key}_reason")
         if value is not None or reason:
             lines.append((metric.label, f"n/a ({reason})" if value is None else metric.text(value)))
+        if metric.key == "psnr":
+            lines += _worst_view(record, metric)
     return lines
+
+
+def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, str]]:
+    """The lowest value of a metric among the views, with its name; nothing for a single view."""
+    known = {name: s[metric.key] for name, s in record.get("views", {}).items() if s[metric.key] is not None}
+    if len(known) < 2:
+        return []
+    name = min(known, key=lambda view: known[view])
+    return [(f"{metric.label}, worst view", f"{metric.text(known[name])} ({name})")]
 
 
 def absent_metrics(record: Mapping[str, Any]) -> list[str]:

@@ -25,6 +25,7 @@ from polarguide.experiments.shown import formatted
 from polarguide.experiments.tables import seed_counts
 from polarguide.files import write_text
 from polarguide.progress import Reporter
+from polarguide.runs.health import Health
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import (
@@ -79,6 +80,7 @@ def write_report(
     remarks: list[str] = []
     curves: dict[str, list[Curve]] = {}
     sheets: dict[str, list[tuple[str, str]]] = {}
+    health = _health([run for run in plan if run.state() == "done"])
     for scene in scenes:
         shown = _first_finished(comparison, plan, scene)
         drawn_errors = [(run.row.name, run.folder / ERROR_SHEET) for run in shown]
@@ -101,7 +103,23 @@ def write_report(
                     views += [embedded] if embedded is not None else []
                     remarks += [remark] if remark is not None else []
                     advance(done + 1)
-    write_text(comparison.out / REPORT, report_html(results, views, curves, remarks, sheets))
+    write_text(comparison.out / REPORT, report_html(results, views, curves, remarks, sheets, health))
+
+
+def _health(runs: Sequence[PlannedRun]) -> list[str]:
+    """What trainings say of themselves: what layers rest on, runs alike in a line, and a line for each warning."""
+    alike: dict[str, list[str]] = {}
+    warnings = []
+    for run in runs:
+        found = Health.load(run.folder)
+        text = (
+            "polarization not recorded, not checked"
+            if found is None
+            else f"polarization {found.polarization.text}"
+        )
+        alike.setdefault(text, []).append(run.label)
+        warnings += [f"{run.label}: {warning}" for warning in (() if found is None else found.warnings)]
+    return [f"{text}: {'; '.join(labels)}" for text, labels in alike.items()] + warnings
 
 
 def _first_finished(
@@ -177,6 +195,7 @@ def report_html(
     curves: Mapping[str, Sequence[Curve]],
     remarks: Sequence[str] = (),
     sheets: Mapping[str, Sequence[tuple[str, str]]] = MappingProxyType({}),
+    health: Sequence[str] = (),
 ) -> str:
     """The page.
 
@@ -186,6 +205,7 @@ def report_html(
         curves: by scene, those of its recipes.
         remarks: what was left out of the pictures or reduced, a sentence each.
         sheets: by scene, recipes and their pictures of errors, as paths from the page.
+        health: what trainings say of themselves, a sentence each.
 
     Returns:
         HTML; all names and texts in it are escaped, and it asks for nothing from outside. It links to ``sheets``.
@@ -202,6 +222,8 @@ def report_html(
         pictures_hidden="" if views else "hidden",
         remarks=list_html(remarks),
         sheets=_sheets(sheets),
+        health=list_html(health),
+        health_hidden="" if health else "hidden",
         gradient=figures.color_gradient("inferno"),
         legend=script_json(LEGEND),
         data=script_json([vars(view) for view in views]),

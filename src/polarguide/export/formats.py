@@ -106,7 +106,7 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         run: the run; its scene is read.
         path: file to write, ending in .html; ``share.html`` in the run's folder by default.
         title: heading of the page; that of the presentation, or the scene's name, by default.
-        caption: text below it; the recipe and its steps by default.
+        caption: text below it; the recipe and its steps by default. The word about polarization follows.
 
     Returns:
         The file's path.
@@ -125,6 +125,7 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
     views = run.scene.test_views + run.scene.train_views
     scored = (run.folder / METRICS_FILE).exists()
     scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
+    health = run.health
     page = share_page(
         shown.gaussians,
         model.light,
@@ -132,11 +133,12 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         {view.name: view.camera for view in views},
         first=views[0].name,
         title=title or shown.presentation.title or run.scene.name,
-        caption=caption or f"{run.recipe.name}, {run.steps:,} steps",
+        caption=f"{caption or f'{run.recipe.name}, {run.steps:,} steps'} · polarization: {run.polarization}",
         metrics=[
             *((f"{label}, test views", text) for label, text in scores),
             ("Gaussians", f"{len(shown.gaussians['means']):,}"),
         ],
+        notes=[f"Warning: {warning}" for warning in health.warnings] if health is not None else [],
         presentation=shown.presentation,
     )
     make_folder(path.parent)
@@ -170,7 +172,10 @@ class _Shown:
         around = run.frame if self.presentation.up_axis is not None else None
         self.placement = Placement.of(self.presentation, around)
         scene = run.configuration.scene_digest[:12]
-        self.origin = Origin(self.presentation, f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}")
+        made_of = (
+            f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}, polarization {run.polarization}"
+        )
+        self.origin = Origin(self.presentation, made_of)
 
     @property
     def comments(self) -> list[str]:

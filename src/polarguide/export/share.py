@@ -65,6 +65,7 @@ def share_page(
     title: str,
     caption: str = "",
     metrics: Sequence[tuple[str, str]] = (),
+    notes: Sequence[str] = (),
     presentation: Presentation = NOTHING,
 ) -> str:
     """The page.
@@ -74,7 +75,7 @@ def share_page(
         light: parameters of the learned light by name. shading: of the recipe, for the run's refractive index.
         cameras: poses to choose from by name, at least one. first: name of the one to begin with.
         title, caption: any text; it is escaped.
-        metrics: labels and values, any text.
+        metrics: labels and values, any text. notes: paragraphs before them, any text.
         presentation: white balance, up axis, scale and credit.
 
     Returns:
@@ -109,7 +110,7 @@ def share_page(
         version=html.escape(__version__),
         title=html.escape(title),
         caption=html.escape(caption),
-        notes="".join(f'<p class="note">{html.escape(note)}</p>' for note in page.notes),
+        notes="".join(f'<p class="note">{html.escape(note)}</p>' for note in (*notes, *page.notes)),
         metrics="".join(
             f"<tr><th>{html.escape(label)}</th><td>{html.escape(value)}</td></tr>" for label, value in metrics
         ),

@@ -20,8 +20,9 @@ def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Ras
     The depth at which this share reaches one half is the pixel's median depth. The rasterizer blends channels and
     not conditions, so the Gaussians are sorted into slabs of depth, one channel each: the share is then known at the
     slabs' ends. Each pass puts these where pixels' own depths lie among those that are still undecided, that is whose
-    slab's two ends lie on different sides of one half. What is undecided after the last pass is read off the straight
-    line between the ends; its slab then is at most a few thousandths of its depth wide.
+    slab's two ends lie on different sides of one half, and that do not lie at an end themselves. What is undecided
+    after the last pass is read off the straight line between the ends; its slab then is at most a few thousandths of
+    its depth wide.
 
     Args:
         splats: the Gaussians; features are not read. camera: the view.
@@ -54,7 +55,8 @@ def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Ras
         start[now], end[now] = bounds[at[..., 0]][now], bounds[at[..., 0] + 1][now]
         total[now] = upto[..., -1][now]
         half = total / 2
-        open_pixels = asked & ((low < half) & (high >= half)).cpu() & (end > start * (1 + 1e-3)).cpu()
+        undecided = (low < half) & (high >= half) & (wanted > start) & (end > start * (1 + 1e-3))
+        open_pixels = asked & undecided.cpu()
     along = torch.where(end.isfinite(), (wanted - start) / (end - start).clamp(min=1e-12), 0.0)
     share = (low + along * (high - low)) / total.clamp(min=1e-12)
     return torch.where(asked.to(total.device) & (total > 0), share.clamp(0, 1), 0.0)

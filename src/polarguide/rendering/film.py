@@ -90,8 +90,9 @@ def write_film(
         reporter.say(f"video: {out} ({count} pictures, {count / speed:.1f} s)")
         return
     make_folder(out)
+    about = {"Polarization": run.polarization}
     for number, picture in enumerate(pictures):
-        figures.write_png(out / f"path_{number:05d}.png", picture)
+        figures.write_png(out / f"path_{number:05d}.png", picture, about=about)
     reporter.say(f"pictures: {out}/path_*.png")
 
 

@@ -100,6 +100,8 @@ def write_pictures(
     shown: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
     gains = run.presentation.gains
+    polarization = run.polarization
+    about = {"Polarization": polarization}
     with reporter.track("rendering", len(chosen)) as advance:
         for number, view in enumerate(chosen):
             result = run.result(view.camera).to("cpu")
@@ -118,9 +120,9 @@ def write_pictures(
                     exposed = name == "reflection"
                     whole = layer_picture(rendered, name, view.camera, depths, exposed=exposed, gains=gains)
                     assert whole is not None
-                    figures.write_png(folder / f"{view.name}_{name}.png", whole, _opacity(result))
+                    figures.write_png(folder / f"{view.name}_{name}.png", whole, _opacity(result), about)
                 elif format == "png":
-                    figures.write_png(folder / f"{view.name}_{name}.png", picture)
+                    figures.write_png(folder / f"{view.name}_{name}.png", picture, about=about)
                 else:
                     _write_numbers(folder / f"{view.name}_{name}.{format}", getattr(result, name))
             if len(shown) < SHEET_VIEWS:
@@ -135,18 +137,18 @@ def write_pictures(
             folder / UNITS_FILE, to_json({name: UNITS[name] for name in names if name not in missing})
         )
     sheet = folder / CONTACT_SHEET
-    figures.write_png(sheet, _sheet(shown, names))
+    figures.write_png(sheet, _sheet(shown, names, f"polarization: {polarization}"), about=about)
     if missing:
         reporter.say(f"this recipe has no layer {', '.join(sorted(missing))}")
     return sheet
 
 
-def _sheet(shown: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str]) -> Picture:
+def _sheet(shown: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str], caption: str) -> Picture:
     """A row a view, and beside each layer what is true of it. A column that some view has not is left out."""
     wanted = [column for name in names for column in (name, f"{name}, true")]
     columns = [column for column in wanted if all(column in cells for _, cells in shown)]
     rows = [[cells[column] for column in columns] for _, cells in shown]
-    return contact_sheet(rows, [name for name, _ in shown], columns)
+    return contact_sheet(rows, [name for name, _ in shown], columns, caption=caption)
 
 
 def _unblended(result: RenderResult) -> RenderResult:

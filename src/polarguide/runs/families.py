@@ -21,12 +21,15 @@ from polarguide.runs.angles import report_polarizers
 from polarguide.runs.defaults import most_gaussians, with_defaults
 from polarguide.runs.folder import CHECKPOINT, PLY, AnyState
 from polarguide.runs.forecast import Forecast, forecast
+from polarguide.runs.health import Evidence
 from polarguide.runs.memory import MemoryPlan, plan_field_memory, plan_memory
 from polarguide.runs.model import GaussianModel, Model
 from polarguide.runs.point_cloud import write_run_ply
+from polarguide.runs.polarization import Polarization
 from polarguide.shading.model import ShadingModel
 from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
+from polarguide.training.polarizers import predicts_filters
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.trainer import Trainer
@@ -129,6 +132,10 @@ class Family(ABC):
     def finish(self, out: Path, trainer: Any, model: Any, reporter: Reporter) -> None:
         """Write what a finished training leaves beside its checkpoint."""
 
+    @abstractmethod
+    def evidence(self, trainer: Any, method: Any) -> Evidence:
+        """What a finished training is examined by."""
+
 
 class GaussianFamily(Family):
     """Recipes of Gaussians."""
@@ -197,6 +204,14 @@ class GaussianFamily(Family):
         centers = torch.stack([view.camera.center for view in trainer.scene.views])
         write_run_ply(out / PLY, model.state, model.shading, centers)
 
+    def evidence(self, trainer: Trainer, method: Recipe) -> Evidence:
+        """See ``Family``. A look at a view takes two renderings without gradients, a third of a step each."""
+        views = [trainer.polarizers.believed(view) for view in trainer.scene.train_views]
+        filters, priors = predicts_filters(method), any(stage.weights.priors for stage in method.stages)
+        judgments = trainer.polarizers.judgments()
+        polarization = Polarization.of(views, judgments, measured=priors, fitted=filters)
+        return Evidence(views, polarization, filters=filters, steps_a_view=1.0)
+
 
 class FieldFamily(Family):
     """Recipes of neural fields."""
@@ -252,6 +267,13 @@ class FieldFamily(Family):
 
     def finish(self, out: Path, trainer: Any, model: Any, reporter: Reporter) -> None:
         """See ``Family``: nothing."""
+
+    def evidence(self, trainer: FieldTrainer, method: NeuralRecipe) -> Evidence:
+        """See ``Family``. A step takes some rays of a view."""
+        views = trainer.scene.train_views
+        polarization = Polarization.of(views, (), measured=method.weights.aolp > 0, fitted=False)
+        pixels = max(view.camera.width * view.camera.height for view in views)
+        return Evidence(views, polarization, filters=False, steps_a_view=pixels / method.sampling.rays)
 
 
 def family_of(method: Method) -> Family:

@@ -24,6 +24,7 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
+from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Model
 from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.result import LAYERS, RenderResult
@@ -134,6 +135,23 @@ class OpenedRun:
             found=f"one of {self.recipe.name}, a signed-distance field",
             remedy="polarguide export --format mesh writes its surface.",
         )
+
+    @property
+    def health(self) -> Health | None:
+        """What its training says of itself; None where that has not ended, or was one of an earlier version.
+
+        Raises:
+            PolarguideError: ``health.json`` is not such a record.
+        """
+        return Health.load(self.folder)
+
+    @property
+    def polarization(self) -> str:
+        """What layers and normals rest on, for people: ``measured``, ``fitted`` or ``none``, with what it does not hold
+        for. ``not recorded`` where there is no ``health``.
+        """
+        found = self.health
+        return "not recorded" if found is None else found.polarization.text
 
     @property
     def light(self) -> dict[str, Tensor]:

@@ -34,6 +34,7 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
+from polarguide.runs.health import examine
 from polarguide.runs.memory import MemoryPlan, pixels_of
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.system import MemoryBound, return_freed_memory
@@ -152,8 +153,29 @@ def train(
         if expected is not None:
             reporter.say(expected.truth(seconds))
         if leads:
-            family.finish(out, trainer, model, reporter)
+            finished = _Warned(reporter)
+            family.finish(out, trainer, model, finished)
+            evidence = family.evidence(trainer, chosen)
+            health = examine(model, evidence, loaded.points, settings.steps, reporter)
+            for warning in health.warnings:
+                reporter.warn(warning)
+            health = replace(health, warnings=(*health.warnings, *finished.warnings))
+            health.save(out)
+            reporter.say(f"{health.summary}; polarization: {health.polarization.text}")
     return OpenedRun(out, configuration, chosen, model, scene=whole, reporter=reporter)
+
+
+class _Warned(Reporter):
+    """Hands messages on to another reporter, and keeps the warnings."""
+
+    def __init__(self, to: Reporter) -> None:
+        self.say, self.track = to.say, to.track  # type: ignore[method-assign]
+        self._to, self.warnings = to, list[str]()
+
+    def warn(self, text: str) -> None:
+        """See ``Reporter``."""
+        self.warnings.append(text)
+        self._to.warn(text)
 
 
 class _Loop:

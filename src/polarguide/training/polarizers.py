@@ -163,6 +163,12 @@ class Judgment:
         """Whether the picture contradicts what is said."""
         return self.tells and abs(self.off) > self.limit
 
+    @property
+    def doubtful(self) -> bool:
+        """Whether the angle that the training goes by may well be wrong."""
+        sought = not self.said.known and (self.vague or self.unsettled or self.poorly_explained)
+        return sought or self.unfiltered or self.contradicts
+
 
 class Polarizers:
     """The pictures behind polarizers that are to be fitted, and what has been found.
@@ -183,7 +189,7 @@ class Polarizers:
     def __init__(
         self, scene: Scene, recipe: Recipe, steps: int, table: Tensor | None = None, search: int = 0
     ) -> None:
-        uses = recipe.shading.reflects and any(stage.weights.stokes for stage in recipe.stages)
+        uses = predicts_filters(recipe)
         self._views = [view for view in scene.train_views if uses and not view.is_four]
         self._places = [
             (view, k)
@@ -331,6 +337,11 @@ class Polarizers:
             exposures = believed.setdefault(judgment.view, list(views[judgment.view].exposures))
             exposures[judgment.number] = judgment.believed
         return {name: tuple(exposures) for name, exposures in believed.items()}
+
+
+def predicts_filters(recipe: Recipe) -> bool:
+    """Whether a recipe learns from what is behind a filter: it renders S0, S1 and S2."""
+    return recipe.shading.reflects and any(stage.weights.stokes > 0 for stage in recipe.stages)
 
 
 def search_steps(settings: TrainSettings) -> int:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import struct
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -23,6 +27,9 @@ COLOR_MAPS = {
     "inferno": cv2.COLORMAP_INFERNO,
 }
 """Names that ``scalar_to_rgb`` knows."""
+PNG_HEADER = 33
+"""Bytes of a PNG file's signature and first chunk."""
+NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 def radiance_to_rgb(linear: Tensor) -> Picture:
@@ -151,11 +158,14 @@ def _bar(colors: Picture, left: str, right: str) -> Picture:
     return drawn
 
 
-def write_png(path: str | Path, rgb8: Picture, alpha8: Picture | None = None) -> None:
+def write_png(
+    path: str | Path, rgb8: Picture, alpha8: Picture | None = None, about: Mapping[str, str] = NOTHING
+) -> None:
     """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
 
     Args:
         path: of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
+        about: texts in ASCII by keyword, which go into the file, see ``with_texts``.
 
     Raises:
         ValueError: not such a picture.
@@ -167,7 +177,7 @@ def write_png(path: str | Path, rgb8: Picture, alpha8: Picture | None = None) ->
         raise PolarguideError(
             path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
         )
-    write_whole(path, png_bytes(rgb8, alpha8))
+    write_whole(path, with_texts(png_bytes(rgb8, alpha8), about))
 
 
 def png_bytes(rgb8: Picture, alpha8: Picture | None = None) -> bytes:
@@ -181,6 +191,15 @@ def png_bytes(rgb8: Picture, alpha8: Picture | None = None) -> bytes:
     if not encoded:
         raise ValueError("picture: it could not be encoded as PNG")
     return data.tobytes()
+
+
+def with_texts(png: bytes, about: Mapping[str, str]) -> bytes:
+    """A PNG file with texts in ASCII by keyword, as chunks tEXt after its header (PNG specification, 11.3.3.2)."""
+    chunks = b""
+    for keyword, text in about.items():
+        data = b"tEXt" + keyword.encode("ascii") + b"\0" + text.encode("ascii")
+        chunks += struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
+    return png[:PNG_HEADER] + chunks + png[PNG_HEADER:]
 
 
 def _to_uint8(values: Tensor) -> Picture:

@@ -29,6 +29,7 @@ def contact_sheet(
     minimum_width: int = 256,
     maximum_width: int = 640,
     gutter: int = 8,
+    caption: str = "",
 ) -> Picture:
     """Lay pictures out in rows and columns, with labels on top and to the left, on white.
 
@@ -43,6 +44,7 @@ def contact_sheet(
         footer: pictures below the columns, such as scales, as wide as a tile and as high as they then are.
         minimum_width, maximum_width: bounds of a tile's width in pixels.
         gutter: pixels between tiles and around the sheet.
+        caption: a line of text below everything.
 
     Returns:
         uint8 RGB picture.
@@ -76,9 +78,13 @@ def contact_sheet(
         for j, cell in enumerate(row):
             if cell is not None:
                 _place(sheet[y : y + height, left + j * (width + gutter) :][:, :width], cell)
-    if not any(cell is not None for cell in footer):
+    if any(cell is not None for cell in footer):
+        sheet = np.concatenate((sheet, _strip(footer, sheet.shape[1], width, left, gutter)))
+    if not caption:
         return sheet
-    return np.concatenate((sheet, _strip(footer, sheet.shape[1], width, left, gutter)))
+    line: Picture = np.full((LINE_HEIGHT, sheet.shape[1], 3), BACKGROUND, np.uint8)
+    _write(line, caption, gutter, LINE_HEIGHT // 2, sheet.shape[1] - 2 * gutter)
+    return np.concatenate((sheet, line))
 
 
 def _strip(cells: Sequence[Picture | None], across: int, width: int, left: int, gutter: int) -> Picture:

@@ -1,0 +1,260 @@
+"""What a finished training says of itself: it names what has burned, and is silent about what is right."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+import polarguide
+from polarguide.camera import Camera
+from polarguide.capture import Scene, View, load_scene
+from polarguide.capture.exposures import FOUR, PLAIN, Exposure
+from polarguide.capture.variants import captured_as
+from polarguide.errors import PolarguideError
+from polarguide.options import SceneOptions, SessionOptions
+from polarguide.progress import SILENT
+from polarguide.raster import choose_backend
+from polarguide.recipes import RECIPES
+from polarguide.runs.health import HEALTH, Evidence, Health, Limits, examine, warnings_of
+from polarguide.runs.model import GaussianModel
+from polarguide.runs.polarization import Polarization
+from polarguide.shading.result import RenderResult
+from polarguide.training.polarizers import Polarizers
+from polarguide.training.settings import TrainSettings
+from polarguide.training.state import TrainingState
+from tests.helpers.heard import Heard
+from tests.helpers.tiny import circling, make_scene
+
+STOKES = RECIPES["polarguide-stokes"]
+BURNED = Path(__file__).parent / "burned"
+LONG = 100_000
+WHOLE = make_scene()
+
+
+def around(scene: Scene, count: int = 12) -> Scene:
+    """The scene with its pictures taken from more places: what a stand-in shows needs not be of one thing."""
+    views = [
+        dataclasses.replace(
+            scene.views[k % len(scene.views)], name=f"v{k:02}", camera=circling(2 * math.pi * k / count)
+        )
+        for k in range(count)
+    ]
+    return dataclasses.replace(scene, views=tuple(views), test_names=())
+
+
+class StandIn:
+    """Renders what was measured in each view, but for its faults: a change of the result, by the view's name."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, scene: Scene, **faults: Callable[[RenderResult], RenderResult]) -> None:
+        self._views, self._faults = {id(view.camera): view for view in scene.views}, faults
+        self.fog: dict[str, float] = {}
+
+    def render(self, camera: Camera, **_: bool) -> RenderResult:
+        view = self._views[id(camera)]
+        final = view.photograph()
+        alpha, radii = torch.ones(final.shape[:2]), torch.ones(10, dtype=torch.int32)
+        nothing: Any = dict.fromkeys(("specular", "diffuse", "reflection", "strength", "normal", "depth"))
+        result = RenderResult(final=final, base=final, alpha=alpha, radii=radii, **nothing)
+        return self._faults.get(view.name, lambda same: same)(result)
+
+    def stokes(self, result: RenderResult, camera: Camera) -> Tensor:
+        return self._views[id(camera)].stokes()
+
+    def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
+        return torch.full_like(depth, self.fog.get(self._views[id(camera)].name, 0.0))
+
+
+def evidence(scene: Scene, views: tuple[View, ...] | None = None) -> Evidence:
+    return Evidence(
+        views or scene.train_views, Polarization(len(scene.views), 0, 0), filters=True, steps_a_view=1.0
+    )
+
+
+def examined(model: Any, scene: Scene, views: tuple[View, ...] | None = None) -> Health:
+    return examine(model, evidence(scene, views), scene.points, LONG, SILENT)
+
+
+def test_a_training_that_has_burned_is_named() -> None:
+    """A real one: single shots of a cup on a table, 2,500 steps, by a version without a bound on the light."""
+    scene = load_scene(BURNED)
+    stored = load_file(BURNED / "burned.safetensors")  # in half precision, to be small
+    tensors = {
+        name: values.float() if values.is_floating_point() else values for name, values in stored.items()
+    }
+    state = TrainingState.from_tensors(tensors, STOKES)
+    model = GaussianModel(state, STOKES.shading.bind(1.5), choose_backend("cpu"))
+    found = examined(model, scene)
+    burned = {name for name, view in found.views.items() if view.burned > Limits().burned}
+    assert {"v030", "v006", "v012"} <= burned < set(found.views)
+    (said,) = [warning for warning in found.warnings if "burned" in warning]
+    assert "v030 (" in said
+    assert "add pictures" in said
+
+
+def test_nothing_is_said_of_a_model_that_renders_what_was_measured() -> None:
+    scene = around(WHOLE)
+    found = examined(StandIn(scene), scene)
+    assert found.warnings == ()
+    assert len(found.views) == 12
+    assert found.summary.startswith("health: 12 training views")
+
+
+def bright(result: RenderResult) -> RenderResult:
+    final = result.final.clone()
+    final[3:5, 3:5] = 30.0
+    return dataclasses.replace(result, final=final)
+
+
+def dim(result: RenderResult) -> RenderResult:
+    """As of an exposure that is wrong by two stops."""
+    return dataclasses.replace(result, final=0.25 * result.final)
+
+
+def noisy(result: RenderResult) -> RenderResult:
+    """What every training leaves, so that a view without a fault is not perfect."""
+    wave = 0.02 * torch.sin(torch.arange(result.final.shape[1], dtype=torch.float32))[None, :, None]
+    return dataclasses.replace(result, final=result.final + wave)
+
+
+def hollow(result: RenderResult) -> RenderResult:
+    alpha = result.alpha.clone()
+    alpha[5:12, 5:12] = 0.1
+    return dataclasses.replace(result, alpha=alpha, final=result.final * alpha[..., None])
+
+
+def broken(result: RenderResult) -> RenderResult:
+    return dataclasses.replace(result, final=torch.full_like(result.final, torch.nan))
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [(bright, "burned"), (broken, "burned"), (dim, "far under"), (hollow, "holes")],
+    ids=["bright", "not-finite", "dim", "hollow"],
+)
+def test_a_fault_of_one_view_is_one_warning_that_names_it(
+    fault: Callable[[RenderResult], RenderResult], words: str
+) -> None:
+    scene = around(WHOLE)
+    faults = {view.name: noisy for view in scene.views} | {"v04": lambda result: fault(noisy(result))}
+    (said,) = examined(StandIn(scene, **faults), scene).warnings
+    assert words in said
+    assert "v04" in said
+    assert not any(view.name in said for view in scene.views if view.name != "v04")
+
+
+def test_fog_before_a_camera_is_named() -> None:
+    scene = around(WHOLE)
+    model = StandIn(scene)
+    model.fog = {"v07": 0.05}
+    (said,) = examined(model, scene).warnings
+    assert "v07 (5.0 % of the light)" in said
+
+
+def test_gaussians_that_no_view_sees_are_counted_once_all_views_were_looked_at() -> None:
+    scene = around(WHOLE)
+
+    def seen(result: RenderResult) -> RenderResult:
+        assert result.radii is not None
+        return dataclasses.replace(result, radii=result.radii * (torch.arange(10) < 7))
+
+    model = StandIn(scene, **{view.name: seen for view in scene.views})
+    found = examined(model, scene)
+    assert found.unseen == pytest.approx(0.3)
+    assert "30 % of the Gaussians" in found.warnings[0]
+    few = examine(model, evidence(scene), scene.points, 300, SILENT)
+    assert len(few.views) == 6
+    assert few.unseen is None
+
+
+@pytest.mark.parametrize("kind", ["four", "one"])
+def test_a_wrong_angle_shows_behind_the_filter(kind: str) -> None:
+    """The picture itself may be right: what is behind the filter is compared, of four pictures and of one."""
+    scene = around(WHOLE)
+    model = StandIn(scene, **{view.name: noisy for view in scene.views})
+    views = scene.views if kind == "four" else captured_as(scene, "one").views
+    exposures = tuple(dataclasses.replace(e, angle=(e.angle + 90) % 180) for e in views[4].exposures)
+    right = examined(model, scene, views)
+    wrong = examined(model, scene, (*views[:4], views[4].with_exposures(exposures), *views[5:]))
+    assert right.warnings == ()
+    before, after = right.views["v04"].psnr, wrong.views["v04"].psnr
+    assert before is not None
+    assert after is not None
+    assert after < before - 6
+
+
+def test_views_are_spread_over_all_and_take_a_fiftieth_of_the_steps() -> None:
+    scene = around(WHOLE, 100)
+    counts = {steps: len(evidence(scene).chosen(steps)) for steps in (40, 500, 2_000, LONG)}
+    assert counts == {40: 0, 500: 10, 2_000: 40, LONG: 64}
+    names = [view.name for view in evidence(scene).chosen(500)]
+    assert (names[0], names[-1]) == ("v00", "v99")
+
+
+def test_half_and_double_the_limits_tell_the_same_of_a_burned_view() -> None:
+    scene = around(WHOLE)
+    found = examined(StandIn(scene, v04=bright), scene)
+    for factor in (0.5, 2.0):
+        limits = Limits(burned=factor * Limits().burned, far=factor * Limits().far)
+        assert len(warnings_of(found.views, found.unseen, limits)) == 1
+
+
+def test_the_word_says_what_most_views_tell_and_what_is_in_doubt() -> None:
+    one, plain = captured_as(WHOLE, "one"), captured_as(WHOLE, "none")
+    truth = {view.name: view.stokes() for view in WHOLE.views}
+    polarizers = Polarizers(one, STOKES, 40)
+    polarizers.take(polarizers.fit(lambda view: truth[view.name])[None])
+
+    def told(views: tuple[View, ...], **reads: bool) -> str:
+        return Polarization.of(
+            views, polarizers.judgments(), **({"measured": True, "fitted": True} | reads)
+        ).text
+
+    assert told(WHOLE.train_views) == "measured"
+    assert told(one.train_views) == "fitted (0 of 5 pictures doubtful)"
+    assert told(plain.train_views) == "none (layers and normals are a guess of the model)"
+    assert told(one.train_views, fitted=False) == told(plain.train_views)
+    assert told(WHOLE.train_views, measured=False) == told(plain.train_views)
+    mixed = (*WHOLE.train_views[:1], *one.train_views[1:])
+    assert told(mixed) == "fitted in 4 of 5 views (0 of 4 pictures doubtful), measured in 1"
+    assert {view.exposures for view in WHOLE.train_views} == {FOUR}
+    assert {view.exposures for view in plain.train_views} == {PLAIN}
+    lost = tuple(view.with_exposures((Exposure(),)) for view in one.train_views)
+    assert Polarization.of(lost, (), measured=True, fitted=True).word == "none"
+
+
+def test_a_training_writes_its_health_and_the_page_shows_it(demo_scene: Path, tmp_path: Path) -> None:
+    heard = Heard()
+    run = polarguide.train(
+        demo_scene,
+        tmp_path / "run",
+        settings=TrainSettings(100),
+        reading=SceneOptions(downscale=4),
+        session=SessionOptions(threads=1),
+        reporter=heard,
+    )
+    found = run.health
+    assert found is not None
+    assert len(found.views) == 2
+    assert any(said.startswith("health: 2 training views") for said in heard.said)
+    assert run.polarization == "measured"
+    dataclasses.replace(found, warnings=("it has <burned>",)).save(run.folder)
+    page = run.share().read_text(encoding="utf-8")
+    assert "polarguide-stokes, 100 steps · polarization: measured</p>" in page
+    assert "Warning: it has &lt;burned&gt;" in page
+    sheet = run.write_pictures(views="v000", layers=["final"])
+    assert b"tEXtPolarization\0measured" in sheet.read_bytes()
+    (run.folder / HEALTH).write_text('{"polarization": {"measured": -1, "fitted": 0, "none": 0}}')
+    with pytest.raises(PolarguideError, match=r"health\.json"):
+        _ = run.health
+    (run.folder / HEALTH).unlink()
+    assert run.polarization == "not recorded"
