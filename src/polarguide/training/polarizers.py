@@ -17,7 +17,7 @@ from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
 from polarguide.training.angle_fit import fit_angle
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import ResolvedSettings
 
 FIRST, EVERY, LAST = 0.5, 0.05, 0.65
 """Shares of all steps at which angles are fitted: earlier, what is believed of them would confirm itself, and later,
@@ -296,7 +296,7 @@ class Polarizers:
         return {name: tuple(exposures) for name, exposures in believed.items()}
 
 
-def search_steps(settings: TrainSettings) -> int:
+def search_steps(settings: ResolvedSettings) -> int:
     """Steps of the schedule by which unknown angles are sought before a training begins; 0: it does not begin again."""
     return min(SEARCH_STEPS, settings.steps) if settings.begin_again else 0
 
