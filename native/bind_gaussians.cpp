@@ -179,9 +179,10 @@ class Splatting {
         return found;
     }
     template <class Work> void in_chunks(Work work) {
-        const std::unique_ptr<float[]> memory(new float[size_t(thread_count()) * most_values * splat_chunk]);
+        const Workers workers;
+        const std::unique_ptr<float[]> memory(new float[size_t(workers.count()) * most_values * splat_chunk]);
         auto body = [&](int64_t b, int64_t e, int worker) { work(b, e - b, memory.get() + worker * most_values * splat_chunk); };
-        parallel_chunks(count_, splat_chunk, body);
+        workers.chunks(count_, splat_chunk, body);
     }
     template <class T> static void skip(T **values, int64_t count) {
         if (*values) *values += count;

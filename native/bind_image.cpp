@@ -58,10 +58,11 @@ std::tuple<double, double, double> photometric(const Array &prediction, const Ar
     a.gradient = gradient ? gradient->data() : nullptr;
     a.ssim_weight = ssim_weight, a.inverse_count = float(1.0 / (3.0 * weight_sum));
     nb::gil_scoped_release release;
-    PhotometricMemory memory(a, thread_count());
+    const Workers workers;
+    PhotometricMemory memory(a, workers.count());
     auto run = [&](void (*kernel)(const PhotometricArgs &, int64_t, int64_t, float *)) {
         auto body = [&](int64_t b, int64_t e, int worker) { kernel(a, b, e, memory.scratch(worker)); };
-        parallel_chunks(height, row_chunk, body);
+        workers.chunks(height, row_chunk, body);
     };
     run(POLARGUIDE_DISPATCH(photometric_show));
     run(POLARGUIDE_DISPATCH(photometric_statistics));

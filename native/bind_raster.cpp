@@ -175,7 +175,8 @@ void bind_raster(nb::module_ &module) {
         "fma_peak",
         [](double seconds) {
             nb::gil_scoped_release release;
-            const int threads = thread_count();
+            const Workers workers;
+            const int threads = workers.count();
             std::vector<float> sink(size_t(threads), 0.0f);
             double best = 0.0, spent = 0.0;
             while (spent < seconds) {
@@ -184,7 +185,7 @@ void bind_raster(nb::module_ &module) {
                     for (int64_t i = b; i < e; ++i) sink[size_t(w)] += POLARGUIDE_DISPATCH(fma_burst)(rounds);
                 };
                 auto start = std::chrono::steady_clock::now();
-                parallel_chunks(threads, 1, burst);
+                workers.chunks(threads, 1, burst);
                 double t = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
                 best = std::max(best, double(rounds) * double(fma_burst_flops) * threads / t);
                 spent += t;

@@ -158,7 +158,8 @@ void bind_reflect(nb::module_ &module) {
             look.resolution = int(side), look.channels = 3, look.texture = texture.data();
             nb::gil_scoped_release release;
             // A piece at a time goes through all three, so that what one leaves the next finds near.
-            std::vector<float> own(size_t(thread_count()) * 7 * item_chunk);
+            const Workers workers;
+            std::vector<float> own(size_t(workers.count()) * 7 * item_chunk);
             auto body = [&](int64_t b, int64_t e, int worker) {
                 float *spare = own.data() + int64_t(worker) * 7 * item_chunk;
                 ReflectArgs part = a;
@@ -175,7 +176,7 @@ void bind_reflect(nb::module_ &module) {
                 part.diffuse = diffuse.data() + 3 * b, part.reflection = reflection.data() + 3 * b;
                 POLARGUIDE_DISPATCH(reflect_layers)(part, 0, e - b);
             };
-            parallel_chunks(n, item_chunk, body);
+            workers.chunks(n, item_chunk, body);
         },
         nb::arg("features"), nb::arg("rays"), nb::arg("texture"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
         nb::arg("index"), nb::arg("directions").none(), nb::arg("seen").none(), nb::arg("final"), nb::arg("specular"),

@@ -89,16 +89,17 @@ double consistency(const Array &normal, const Array &rays, const Array &rotation
     a.height = int(height), a.width = int(width), a.rays = rays.data(), a.rotation = rotation.data();
     a.depth = depth.data(), a.alpha = alpha.data(), a.grad_depth = grad_depth.data();
     nb::gil_scoped_release release;
+    const Workers workers;
     const int64_t each = consistency_scratch(width);
-    const std::unique_ptr<float[]> beside(new float[size_t(2 * n)]), scratch(new float[size_t(each) * size_t(thread_count())]);
+    const std::unique_ptr<float[]> beside(new float[size_t(2 * n)]), scratch(new float[size_t(each) * size_t(workers.count())]);
     std::vector<double> parts(size_t(height), 0.0);
     a.upward = beside.get(), a.downward = a.upward + n, a.term.parts = parts.data();
     auto body = [&](int64_t b, int64_t e, int worker) {
         POLARGUIDE_DISPATCH(consistency_term)(a, b + 1, e + 1, scratch.get() + worker * each);
     };
-    parallel_chunks(height - 2, row_chunk, body);
+    workers.chunks(height - 2, row_chunk, body);
     auto gather = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(consistency_gather)(a, b, e); };
-    parallel_chunks(height, row_chunk, gather);
+    workers.chunks(height, row_chunk, gather);
     return total(parts) * double(factor);
 }
 

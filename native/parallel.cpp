@@ -3,8 +3,10 @@
 #include <atomic>
 #include <condition_variable>
 #include <cstdlib>
-#include <memory>
+#include <exception>
 #include <mutex>
+#include <stdexcept>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -30,20 +32,25 @@ int default_threads() {
     return n ? int(n) : 1;
 }
 
+} // namespace
+
 class Pool {
   public:
+    using Body = void (*)(void *context, int64_t begin, int64_t end, int worker);
+
     explicit Pool(int threads) : threads_(threads), owner_(getpid()) {
-        for (int worker = 1; worker < threads; ++worker)
-            workers_.emplace_back([this, worker] { serve(worker); });
-    }
-    ~Pool() {
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            stopping_ = true;
+        try {
+            for (int worker = 1; worker < threads; ++worker)
+                workers_.emplace_back([this, worker] { serve(worker); });
+        } catch (const std::system_error &) { // those that have begun must be joined, or the process ends
+            stop();
+            throw std::runtime_error("can't start new thread"); // as Python says it
+        } catch (...) {
+            stop();
+            throw;
         }
-        start_.notify_all();
-        for (auto &t : workers_) t.join();
     }
+    ~Pool() { stop(); }
     int threads() const { return threads_; }
     bool forked() const { return owner_ != getpid(); }
 
@@ -58,18 +65,37 @@ class Pool {
         }
         start_.notify_all();
         work(0);
-        std::unique_lock<std::mutex> lock(mutex_);
-        done_.wait(lock, [this] { return pending_ == 0; });
+        std::exception_ptr error;
+        { // Whatever was thrown: `context` must outlive all workers.
+            std::unique_lock<std::mutex> lock(mutex_);
+            done_.wait(lock, [this] { return pending_ == 0; });
+            error.swap(error_);
+        }
+        if (error) std::rethrow_exception(error);
     }
 
   private:
     void work(int worker) {
-        for (;;) {
-            int64_t begin = next_.fetch_add(chunk_, std::memory_order_relaxed);
-            if (begin >= count_) return;
-            int64_t end = begin + chunk_ < count_ ? begin + chunk_ : count_;
-            body_(context_, begin, end, worker);
+        try {
+            for (;;) {
+                int64_t begin = next_.fetch_add(chunk_, std::memory_order_relaxed);
+                if (begin >= count_) return;
+                int64_t end = begin + chunk_ < count_ ? begin + chunk_ : count_;
+                body_(context_, begin, end, worker);
+            }
+        } catch (...) {
+            std::lock_guard<std::mutex> lock(mutex_);
+            if (!error_) error_ = std::current_exception();
+            next_.store(count_, std::memory_order_relaxed); // the others need not begin what nobody will read
         }
+    }
+    void stop() {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            stopping_ = true;
+        }
+        start_.notify_all();
+        for (auto &t : workers_) t.join();
     }
     void serve(int worker) {
         uint64_t seen = 0;
@@ -95,10 +121,13 @@ class Pool {
     int64_t count_ = 0, chunk_ = 1;
     Body body_ = nullptr;
     void *context_ = nullptr;
+    std::exception_ptr error_; // the first of a job
     int pending_ = 0;
     uint64_t generation_ = 0;
     bool stopping_ = false;
 };
+
+namespace {
 
 std::mutex pool_mutex;
 std::shared_ptr<Pool> pool;
@@ -113,24 +142,27 @@ std::shared_ptr<Pool> current_pool() {
 
 } // namespace
 
-int thread_count() { return current_pool()->threads(); }
+Workers::Workers() : pool_(current_pool()) {}
+
+int Workers::count() const { return pool_->threads(); }
+
+void Workers::run(int64_t count, int64_t chunk, Body body, void *context) const {
+    if (count <= 0) return;
+    if (pool_->threads() == 1 || count <= chunk) {
+        for (int64_t begin = 0; begin < count; begin += chunk)
+            body(context, begin, begin + chunk < count ? begin + chunk : count, 0);
+        return;
+    }
+    pool_->run(count, chunk, body, context);
+}
+
+int thread_count() { return Workers().count(); }
 
 void set_thread_count(int threads) {
     std::lock_guard<std::mutex> lock(pool_mutex);
     requested = threads > 0 ? threads : 0;
     if (pool && pool->forked()) new std::shared_ptr<Pool>(std::move(pool));
     pool.reset();
-}
-
-void parallel_for(int64_t count, int64_t chunk, Body body, void *context) {
-    if (count <= 0) return;
-    auto p = current_pool();
-    if (p->threads() == 1 || count <= chunk) {
-        for (int64_t begin = 0; begin < count; begin += chunk)
-            body(context, begin, begin + chunk < count ? begin + chunk : count, 0);
-        return;
-    }
-    p->run(count, chunk, body, context);
 }
 
 } // namespace polarguide

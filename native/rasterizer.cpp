@@ -57,24 +57,24 @@ RasterArgs Rasterizer::raster_args(const GaussianInputs &in) const {
 }
 
 template <class F> void Rasterizer::for_tiles(F &&body) {
-    // Each worker gets its own scratch, allocated when it sees its first tile.
-    struct Worker {
+    struct Memory {
         Buffer<float> rows, moments;
         Buffer<uint16_t> blocks;
         Buffer<int32_t> list;
-        RasterScratch scratch{};
     };
-    std::vector<Worker> workers(static_cast<size_t>(thread_count()));
+    const Workers workers;
+    std::vector<Memory> memory(static_cast<size_t>(workers.count()));
+    const int64_t longest = lists_.longest();
+    for (Memory &m : memory) {
+        m.rows.resize(longest * (channels_ + 6) + 16), m.blocks.resize(longest + 16), m.list.resize(longest + 16);
+        m.moments.resize(longest * std::max(channels_ + 9, 16) + 32);
+    }
     auto run = [&](int64_t begin, int64_t end, int worker) {
-        Worker &w = workers[size_t(worker)];
-        if (!w.scratch.rows) {
-            w.rows.resize(lists_.longest() * (channels_ + 6) + 16), w.blocks.resize(lists_.longest() + 16), w.list.resize(lists_.longest() + 16);
-            w.moments.resize(lists_.longest() * std::max(channels_ + 9, 16) + 32);
-            w.scratch = {w.rows.get(), w.blocks.get(), w.list.get(), w.moments.get()};
-        }
-        for (int64_t tile = begin; tile < end; ++tile) body(tile, w.scratch);
+        const Memory &m = memory[size_t(worker)];
+        const RasterScratch scratch{m.rows.get(), m.blocks.get(), m.list.get(), m.moments.get()};
+        for (int64_t tile = begin; tile < end; ++tile) body(tile, scratch);
     };
-    parallel_chunks(int64_t(tiles_x_) * tiles_y_, 2, run);
+    workers.chunks(int64_t(tiles_x_) * tiles_y_, 2, run);
 }
 
 void Rasterizer::project(const GaussianInputs &in, float *radius, bool for_backward) {

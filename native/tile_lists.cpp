@@ -57,11 +57,11 @@ struct Rows {
     std::vector<int64_t> begin, instances_begin; // [rows + 1] where a row's runs begin, and what is listed for its tiles
 };
 
-Rows sort_into_rows(const TileEmitArgs &emitted, const std::vector<int32_t> &order, const int64_t *first, int64_t rows,
-                    bool for_backward) {
+Rows sort_into_rows(const Workers &workers, const TileEmitArgs &emitted, const std::vector<int32_t> &order,
+                    const int64_t *first, int64_t rows, bool for_backward) {
     Rows out;
     // The order is cut into parts, one a thread. What a part has in a row comes behind what the parts before it have there.
-    const int64_t parts = thread_count(), length = (int64_t(order.size()) + parts - 1) / parts;
+    const int64_t parts = workers.count(), length = (int64_t(order.size()) + parts - 1) / parts;
     const int64_t *offset = emitted.offset;
     auto each = [&](int64_t part, auto &&body) { // body(Gaussian, its runs, how many)
         constexpr int64_t ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
@@ -83,7 +83,7 @@ Rows sort_into_rows(const TileEmitArgs &emitted, const std::vector<int32_t> &ord
             for (int32_t i = 0; i < n; ++i) ++runs_here[runs[i].row], tiles_here[runs[i].row] += runs[i].end - runs[i].begin;
         });
     };
-    parallel_chunks(parts, 1, count);
+    workers.chunks(parts, 1, count);
     int64_t runs = 0, tiles = 0;
     out.begin.assign(1, 0), out.instances_begin.assign(1, 0);
     for (int64_t row = 0; row < rows; ++row) {
@@ -107,7 +107,7 @@ Rows sort_into_rows(const TileEmitArgs &emitted, const std::vector<int32_t> &ord
             }
         });
     };
-    parallel_chunks(parts, 1, place);
+    workers.chunks(parts, 1, place);
     return out;
 }
 
@@ -116,32 +116,35 @@ Rows sort_into_rows(const TileEmitArgs &emitted, const std::vector<int32_t> &ord
 // What a row's lists are written to stays in a cache, which the lists of a whole picture do not.
 void TileLists::sort(const TileEmitArgs &emitted, const float *depth, const int64_t *first, int64_t count, int tiles_x,
                      int tiles_y, bool for_backward) {
-    const Rows rows = sort_into_rows(emitted, depth_order(depth, emitted.touched, count), first, tiles_y, for_backward);
+    const Workers workers;
+    const Rows rows = sort_into_rows(workers, emitted, depth_order(depth, emitted.touched, count), first, tiles_y, for_backward);
     const int64_t listed = rows.instances_begin.back();
     gaussians_.resize(listed), begin_.resize(int64_t(tiles_x) * tiles_y + 1);
     if (for_backward) instances_.resize(listed);
     begin_.get()[int64_t(tiles_x) * tiles_y] = listed;
-    std::vector<int64_t> longest(size_t(tiles_y), 0);
-    auto sort_row = [&](int64_t row, int64_t, int) {
+    const int64_t slots = tiles_x + 1 + 8; // eight more, so that two workers never write to one line of a cache
+    std::vector<int64_t> longest(size_t(tiles_y), 0), memory(size_t(workers.count() * slots));
+    auto sort_row = [&](int64_t row, int64_t, int worker) {
         const Rows::Run *runs = rows.runs.get();
         const int64_t begin = rows.begin[size_t(row)], end = rows.begin[size_t(row) + 1];
-        std::vector<int64_t> next(size_t(tiles_x) + 1, 0); // how many more than in the tile before, then where the next goes
+        int64_t *next = memory.data() + worker * slots; // how many more than in the tile before, then where the next goes
+        std::fill_n(next, tiles_x + 1, 0);
         for (int64_t k = begin; k < end; ++k) ++next[runs[k].begin], --next[runs[k].end];
         int64_t here = 0, to = rows.instances_begin[size_t(row)];
         for (int column = 0; column < tiles_x; ++column) {
-            here += next[size_t(column)], longest[size_t(row)] = std::max(longest[size_t(row)], here);
-            next[size_t(column)] = begin_.get()[row * tiles_x + column] = to, to += here;
+            here += next[column], longest[size_t(row)] = std::max(longest[size_t(row)], here);
+            next[column] = begin_.get()[row * tiles_x + column] = to, to += here;
         }
         int32_t *gaussians = gaussians_.get();
-        int64_t *instances = instances_.get(), *slots = next.data();
+        int64_t *instances = instances_.get();
         for (int64_t k = begin; k < end; ++k) {
             const Rows::Run run = runs[k];
             if (for_backward)
-                for (int64_t column = run.begin, n = rows.numbers.get()[k]; column < run.end; ++column, ++n) instances[slots[column]] = n;
-            for (int64_t column = run.begin; column < run.end; ++column) gaussians[slots[column]++] = run.gaussian;
+                for (int64_t column = run.begin, n = rows.numbers.get()[k]; column < run.end; ++column, ++n) instances[next[column]] = n;
+            for (int64_t column = run.begin; column < run.end; ++column) gaussians[next[column]++] = run.gaussian;
         }
     };
-    parallel_chunks(tiles_y, 1, sort_row);
+    workers.chunks(tiles_y, 1, sort_row);
     longest_ = *std::max_element(longest.begin(), longest.end());
 }
 

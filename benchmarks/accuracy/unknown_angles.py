@@ -30,7 +30,7 @@ from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.view import View
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import with_defaults
+from polarguide.runs.defaults import resolve
 from polarguide.training.polarizers import Judgment
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
@@ -55,7 +55,7 @@ def searched(scene: Scene, steps: int) -> list[Judgment]:
     """What a training of so many steps finds of the angles."""
     recipe = recipe_named("polarguide-stokes")
     assert isinstance(recipe, Recipe)
-    settings = with_defaults(TrainSettings(steps=steps), scene, recipe, None)
+    settings = resolve(TrainSettings(steps=steps), scene, recipe)
     trainer = Trainer(scene, recipe, settings, choose_backend("cpu"))
     while not trainer.polarizers.settled:
         trainer.step()

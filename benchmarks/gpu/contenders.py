@@ -14,11 +14,13 @@ from polarguide.color import srgb_encode
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.shading.gbuffer import render
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.trainer import Trainer
 
 STEPS, BEGIN = 1_000_000, 300_000  # in stage 2 of polarguide, with all harmonics
 
@@ -50,7 +52,7 @@ class Ours:
     def __init__(self, scene: Scene, state: TrainingState, backend: Backend) -> None:
         recipe = steady("polarguide")
         state.step = BEGIN
-        self.trainer = Trainer(scene, recipe, TrainSettings(STEPS, 0), backend, state)
+        self.trainer = Trainer(scene, recipe, resolve(TrainSettings(STEPS, 0), scene, recipe), backend, state)
         self.stage = self.trainer.schedule.at(BEGIN).stage
         assert self.stage.reflection
         assert self.stage.densify

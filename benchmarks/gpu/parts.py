@@ -27,10 +27,12 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.shading.gbuffer import render
+from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.trainer import Trainer
 
 RECIPE = RECIPES["polarguide"]
 
@@ -66,7 +68,7 @@ def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
     there = (folder / CHECKPOINT).exists()
     state = load_checkpoint(folder, RECIPE, job.backend.device) if there else None
     scene = job.scene(name)
-    trainer = Trainer(scene, RECIPE, TrainSettings(steps, 0), job.backend, state)
+    trainer = Trainer(scene, RECIPE, resolve(TrainSettings(steps, 0), scene, RECIPE), job.backend, state)
 
     def busy() -> bool:
         return trainer.state.step < steps and time.perf_counter() - begin < job.seconds

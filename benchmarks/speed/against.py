@@ -36,13 +36,18 @@ try:
 except ImportError:
     use_threads = torch.set_num_threads
 from polarguide.recipes import RECIPES
+try:
+    from polarguide.runs.defaults import resolve
+except ImportError:
+    resolve = lambda settings, *of: settings
 from polarguide.training.trainer import Trainer, TrainSettings
 
 scene, downscale, recipe, gaussians, threads = sys.argv[1:]
 keep_freed_memory()
 use_threads(int(threads))
 scene = load_scene(scene, downscale=int(downscale))
-trainer = Trainer(scene, RECIPES[recipe], TrainSettings(5000, 0), choose_backend("cpu"))
+settings = resolve(TrainSettings(5000, 0), scene, RECIPES[recipe])
+trainer = Trainer(scene, RECIPES[recipe], settings, choose_backend("cpu"))
 kept, trained = np.load(gaussians), getattr(trainer.state, "gaussians", None) or trainer.state.rows
 count = len(kept["means"])
 trained.keep(torch.arange(count) % len(trained))

@@ -25,10 +25,12 @@ from polarguide.capture import load_scene
 from polarguide.gaussians.gaussians import Trained
 from polarguide.raster import choose_backend, use_threads
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CONFIGURATION, load_checkpoint
 from polarguide.system import keep_freed_memory
 from polarguide.training.feed import Feed
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 
 DEMO = Path(__file__).resolve().parents[2] / "src/polarguide/data/demo"
 PARTS = {
@@ -143,7 +145,8 @@ def main() -> None:
             state = load_checkpoint(options.source, recipe) if run is not None else None
             if state is not None:
                 state.frozen = None
-            trainer = Trainer(scene, recipe, TrainSettings(5000, 0), choose_backend("cpu"), state)
+            settings = resolve(TrainSettings(5000, 0), scene, recipe)
+            trainer = Trainer(scene, recipe, settings, choose_backend("cpu"), state)
             columns.append(measured(trainer, clock, options.steps))
             gaussians = len(trainer.state.gaussians)
         kind = "trained" if run is not None else "first"

@@ -24,8 +24,10 @@ from polarguide import _native
 from polarguide.capture import Scene, load_scene
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.training.recipe import Recipe, Stage
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 
 SKIPPED, LAST = 100, 400
 PLAIN = RECIPES["3dgs"]
@@ -94,7 +96,9 @@ def main() -> None:
     rasterizer = Stopwatch()
     native = _native.Rasterizer
     native.forward, native.backward = rasterizer.timed(native.forward), rasterizer.timed(native.backward)
-    trainer = Trainer(scene, recipe, TrainSettings(arguments.steps, 0), choose_backend("cpu"))
+    trainer = Trainer(
+        scene, recipe, resolve(TrainSettings(arguments.steps, 0), scene, recipe), choose_backend("cpu")
+    )
     times = []
     for _ in range(arguments.steps):
         begin = time.perf_counter()

@@ -42,7 +42,7 @@ from polarguide.shots.exposures import find_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.write import FORMATS, WrittenShots, write_shots
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import TrainSettings, index_of
 from polarguide.viewer import watch
 
 _OF_MAPS = ("full_well", "read_noise", "snr")
@@ -90,7 +90,7 @@ def train(
     out: PathLike,
     *,
     recipe: Recipe | str = "polarguide-stokes",
-    settings: TrainSettings = TrainSettings(refractive_index=0.0),
+    settings: TrainSettings = TrainSettings(),
     session: SessionOptions = SessionOptions(),
     reading: SceneOptions = SceneOptions(),
     resume: bool = False,
@@ -176,13 +176,13 @@ def priors(
             shots,
             formats=FORMATS if formats is None else formats,
             intrinsics=intrinsics,
-            refractive_index=_said_index(many) if refractive_index is None else refractive_index,
+            refractive_index=index_of(refractive_index, _said_index(many)),
             reporter=reporter,
         )
     _refuse_with_poses(intrinsics, shots, reading, bool(formats))
     refuse_scene(Path(out))
     scene = paths if isinstance(paths, Scene) else read_scene(many[0], reading, reporter)
-    index = (scene.refractive_index or 1.5) if refractive_index is None else refractive_index
+    index = index_of(refractive_index, scene.refractive_index)
     sheet = write_priors(
         scene,
         out,
@@ -204,11 +204,10 @@ def priors(
     return sheet
 
 
-def _said_index(paths: Sequence[PathLike]) -> float:
-    """The refractive index of shots: what the ``scene.json`` of the one folder says, else 1.5."""
+def _said_index(paths: Sequence[PathLike]) -> float | None:
+    """The refractive index in the ``scene.json`` of shots from one folder; None where it has none."""
     file = Path(paths[0]) / "scene.json" if len(paths) == 1 else None
-    found = refractive_index_of(file, read_file(file)) if file is not None and file.is_file() else None
-    return found or 1.5
+    return refractive_index_of(file, read_file(file)) if file is not None and file.is_file() else None
 
 
 def _refuse_for_shots(

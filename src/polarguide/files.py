@@ -210,8 +210,15 @@ def check_out(path: Path) -> None:
     """Check that a folder can be written to where there may be none yet.
 
     Raises:
-        PolarguideError: there is a file of this name, or a link to nowhere.
+        PolarguideError: there is a file of this name, or a link to nowhere; or no file can have this name.
     """
+    if "\0" in os.fspath(path):
+        raise PolarguideError(
+            repr(os.fspath(path)),
+            expected="a folder to write",
+            found="a null byte",
+            remedy="Give another --out.",
+        )
     if os.path.lexists(path):
         require_folder(path, expected="a folder to write", remedy="Give another --out.")
 

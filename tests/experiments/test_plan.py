@@ -83,12 +83,12 @@ def test_seeds_count_up_from_that_of_the_settings() -> None:
 def test_each_scene_has_its_refractive_index_where_none_is_asked_for() -> None:
     water = replace(ENTRY, name="water", digest="another", refractive_index=1.33)
 
-    def found(index: float) -> list[float]:
+    def found(index: float | None) -> list[float | None]:
         settings = TrainSettings(40, refractive_index=index)
         return [run.settings.refractive_index for run in plan_runs(asked(settings=settings), [ENTRY, water])]
 
-    assert set(found(0.0)[: len(found(0.0)) // 2]) == {1.5}
-    assert set(found(0.0)[len(found(0.0)) // 2 :]) == {1.33}
+    assert set(found(None)[: len(found(None)) // 2]) == {1.5}
+    assert set(found(None)[len(found(None)) // 2 :]) == {1.33}
     assert set(found(1.6)) == {1.6}
 
 

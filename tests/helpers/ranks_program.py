@@ -13,18 +13,20 @@ import torch.distributed as dist
 from tiny import make_busy_recipe, make_scene
 
 from polarguide.raster import choose_backend
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.training.distributed import SeveralRanks
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 
 torch.set_num_threads(1)
 out, steps, views, until = Path(sys.argv[1]), *(int(number) for number in sys.argv[2:5])
 dist.init_process_group("gloo")
 ranks = SeveralRanks()
-settings = TrainSettings(steps, 3, views_per_step=views)
-recipe, backend = make_busy_recipe(), choose_backend("cpu")
+scene, recipe, backend = make_scene(), make_busy_recipe(), choose_backend("cpu")
+settings = resolve(TrainSettings(steps, 3, views_per_step=views), scene, recipe)
 state = load_checkpoint(Path(sys.argv[5]), recipe) if sys.argv[5] else None
-trainer = Trainer(make_scene(), recipe, settings, backend, state, ranks)
+trainer = Trainer(scene, recipe, settings, backend, state, ranks)
 trainer.run(lambda _: None, until=until)
 trainer.exchange_statistics()
 folder = out / str(ranks.rank)

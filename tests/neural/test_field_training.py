@@ -22,6 +22,7 @@ from polarguide.neural.recipe import FieldShape, NeuralRecipe, Sampling
 from polarguide.neural.state import FieldState
 from polarguide.neural.trainer import FieldTrainer
 from polarguide.recipes.gnerp import ABLATIONS_GNERP, RECIPE_GNERP
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint, trained_steps
 from polarguide.runs.train import train
 from polarguide.training.settings import TrainSettings
@@ -37,7 +38,8 @@ def ball() -> Scene:
 
 
 def trainer(scene: Scene, steps: int, recipe: NeuralRecipe | None = None) -> FieldTrainer:
-    return FieldTrainer(scene, recipe or small(), TrainSettings(steps=steps), CPU)
+    recipe = recipe or small()
+    return FieldTrainer(scene, recipe, resolve(TrainSettings(steps=steps), scene, recipe), CPU)
 
 
 def normal_error(model: FieldModel, scene: Scene) -> float:
@@ -95,7 +97,7 @@ def test_resumed_is_uninterrupted(ball: Scene, tmp_path: Path) -> None:
         save_checkpoint(tmp_path, parts.state)
         state = load_checkpoint(tmp_path, small())
         assert isinstance(state, FieldState)
-        parts = FieldTrainer(ball, small(), TrainSettings(steps=40), CPU, state)
+        parts = FieldTrainer(ball, small(), resolve(TrainSettings(steps=40), ball, small()), CPU, state)
         assert trained_steps(tmp_path) == stop
     assert bits(parts.state) == bits(whole.state)
 
@@ -199,7 +201,7 @@ def test_settings_that_mean_nothing_are_refused(ball: Scene, tmp_path: Path, nam
 
 def test_steps_are_the_recipes_where_nobody_says_how_many(ball: Scene, tmp_path: Path) -> None:
     recipe = replace(small(), steps=3)
-    run = train(ball, tmp_path / "run", recipe=recipe, settings=TrainSettings(steps=0))
+    run = train(ball, tmp_path / "run", recipe=recipe, settings=TrainSettings())
     assert run.steps == 3
     assert trained_steps(tmp_path / "run") == 3
     with safe_open(tmp_path / "run" / CHECKPOINT, framework="pt") as file:

@@ -22,6 +22,7 @@ from polarguide.files import atomic
 from polarguide.neural.recipe import NeuralRecipe
 from polarguide.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import (
     CHECKPOINT,
     CONFIGURATION,
@@ -34,13 +35,14 @@ from polarguide.runs.folder import (
 )
 from polarguide.runs.train import TrainingStopped
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import TrainSettings, first_state
+from polarguide.training.trainer import first_state
 
 
 @pytest.fixture
 def state(tiny_scene: Scene, busy_recipe: Recipe) -> TrainingState:
-    return first_state(tiny_scene, busy_recipe, TrainSettings(10, 0))
+    return first_state(tiny_scene, busy_recipe, resolve(TrainSettings(10, 0), tiny_scene, busy_recipe))
 
 
 def files(folder: Path) -> list[str]:

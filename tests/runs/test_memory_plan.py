@@ -18,10 +18,10 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs import forecast as forecasts
 from polarguide.runs import memory
-from polarguide.runs.defaults import MOST_GAUSSIANS, STEPS, with_defaults, with_index
+from polarguide.runs.defaults import MOST_GAUSSIANS, resolve
 from polarguide.runs.memory import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.flat import Flat
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
 
 STOKES = RECIPES["polarguide-stokes"]
 LARGE = [1224 * 1024] * 60
@@ -85,35 +85,47 @@ def test_sizes(text: str, bytes_: float | None) -> None:
     assert found == (None if bytes_ is None else pytest.approx(bytes_ / 2**30))
 
 
-def test_defaults_follow_from_the_size_and_are_those_of_the_run_that_goes_on(tiny_scene: Scene) -> None:
-    asked = TrainSettings(steps=0)
-    found = with_defaults(asked, tiny_scene, STOKES)
-    pixels = sum(view.camera.width * view.camera.height for view in tiny_scene.train_views)
-    assert (found.steps, found.gaussians) == (STEPS, int(pixels / STOKES.densification.pixels_each))
-    assert with_defaults(TrainSettings(7, gaussians=9), tiny_scene, STOKES) == TrainSettings(7, gaussians=9)
-    older = TrainSettings(steps=700)
-    assert with_defaults(asked, tiny_scene, STOKES, older) == older
-
-
-def test_the_refractive_index_is_the_one_asked_for_or_the_scenes_or_that_of_the_run_that_goes_on(
+def test_what_is_not_specified_follows_from_the_size_or_is_that_of_the_run_to_resume(
     tiny_scene: Scene,
 ) -> None:
-    asked, water = TrainSettings(refractive_index=0.0), replace(tiny_scene, refractive_index=1.33)
-    unsaid = replace(tiny_scene, refractive_index=None)
-    assert with_index(asked, water).refractive_index == 1.33
-    assert with_index(asked, unsaid).refractive_index == 1.5
-    assert with_index(TrainSettings(refractive_index=1.6), water).refractive_index == 1.6
-    assert with_index(asked, water, TrainSettings(refractive_index=1.4)).refractive_index == 1.4
+    asked = TrainSettings()
+    found = resolve(asked, tiny_scene, STOKES, processes=3)
+    pixels = sum(view.camera.width * view.camera.height for view in tiny_scene.train_views)
+    assert (found.steps, found.gaussians) == (STEPS, int(pixels / STOKES.densification.pixels_each))
+    assert found.views_per_step == 3
+    given = TrainSettings(7, 1, 1.7, 2, gaussians=9)
+    assert vars(resolve(given, tiny_scene, STOKES, found)) == vars(given)
+    older = ResolvedSettings(steps=700, refractive_index=1.4, views_per_step=2, gaussians=50)
+    assert resolve(asked, tiny_scene, STOKES, older) == older
+    assert resolve(older, tiny_scene, STOKES) == older
+    assert resolve(asked, tiny_scene, STOKES, replace(older, gaussians=0)).gaussians == found.gaussians
+
+
+def test_the_refractive_index_is_the_one_asked_for_or_the_scenes(tiny_scene: Scene) -> None:
+    water, unknown = (replace(tiny_scene, refractive_index=index) for index in (1.33, None))
+    assert resolve(TrainSettings(), water, STOKES).refractive_index == 1.33
+    assert resolve(TrainSettings(), unknown, STOKES).refractive_index == 1.5
+    assert resolve(TrainSettings(refractive_index=1.6), water, STOKES).refractive_index == 1.6
+
+
+@pytest.mark.parametrize("name", ["steps", "refractive_index", "views_per_step", "gaussians"])
+def test_zero_is_no_setting(name: str) -> None:
+    with pytest.raises(PolarguideError, match=f"{name}: expected .* found 0"):
+        TrainSettings(**{name: 0})
 
 
 def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Scene) -> None:
-    settings, backend = TrainSettings(600), choose_backend("cpu")
+    settings = resolve(TrainSettings(600, gaussians=10**6), tiny_scene, STOKES)
+    backend = choose_backend("cpu")
     found = forecasts.forecast(tiny_scene, STOKES, settings, backend, 10**9)
     assert found is not None
     assert 0 < found.seconds < 600
     assert found.most == 16 * found.gaussians
     assert "1.0 GB" in found.sentence()
-    assert forecasts.forecast(tiny_scene, STOKES, TrainSettings(60), backend, 10**9) is None
+    assert (
+        forecasts.forecast(tiny_scene, STOKES, resolve(TrainSettings(60), tiny_scene, STOKES), backend, 10**9)
+        is None
+    )
     assert [forecasts.in_words(s) for s in (3.4, 300, 5400, 7260)] == [
         "3 s",
         "5 min",
@@ -134,7 +146,9 @@ def test_what_is_found_once_of_all_views_is_not_forecast_for_each(
 
     monkeypatch.setattr("polarguide.training.feed.flat_surfaces", slow)
     monkeypatch.setattr(forecasts, "time", SimpleNamespace(perf_counter=lambda: clock))
-    found = forecasts.forecast(tiny_scene, STOKES, TrainSettings(600), choose_backend("cpu"), 10**9)
+    found = forecasts.forecast(
+        tiny_scene, STOKES, resolve(TrainSettings(600), tiny_scene, STOKES), choose_backend("cpu"), 10**9
+    )
     assert found is not None
     assert clock >= 1000.0
     assert found.seconds == 0.0

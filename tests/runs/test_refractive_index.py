@@ -10,6 +10,8 @@ import pytest
 
 import polarguide
 from polarguide.errors import PolarguideError
+from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.results import read_results
 from polarguide.options import SceneOptions
 from polarguide.progress import Reporter
 from polarguide.recipes import recipe_named
@@ -21,7 +23,7 @@ from polarguide.training.schedule import Schedule
 from polarguide.training.settings import TrainSettings
 
 READING = SceneOptions(downscale=4)
-ASKED = TrainSettings(3, refractive_index=0.0)
+ASKED = TrainSettings(3)
 
 
 @pytest.fixture
@@ -55,7 +57,9 @@ def test_a_training_takes_the_index_of_its_scene_and_goes_on_with_it(water: Path
     assert "refractive index 1.33, as scene.json says" in said.lines
     assert index_of(run) == 1.33
     with pytest.raises(PolarguideError, match=r"\(settings\)"):
-        polarguide.train(water, run, settings=TrainSettings(3), reading=READING, resume=True)
+        polarguide.train(
+            water, run, settings=TrainSettings(3, refractive_index=1.5), reading=READING, resume=True
+        )
     opened = polarguide.train(water, run, settings=ASKED, reading=READING, resume=True)
     assert opened.steps == 3
     assert index_of(run) == 1.33
@@ -65,6 +69,19 @@ def test_without_settings_it_is_that_of_the_scene(water: Path, tmp_path: Path) -
     with pytest.raises(TrainingStopped):
         polarguide.train(water, tmp_path / "run", reading=READING, should_stop=lambda: True)
     assert index_of(tmp_path / "run") == 1.33
+
+
+def test_a_comparison_takes_it_too(water: Path, tmp_path: Path) -> None:
+    options = CompareOptions(downscale=4, device="cpu", report_views=0)
+    results = polarguide.compare([water], ["3dgs"], tmp_path, settings=TrainSettings(2), options=options)
+    (run,) = results["runs"]
+    assert index_of(tmp_path / run["folder"]) == 1.33
+    assert results["settings"]["refractive_index"] is None
+    assert results["scenes"][0]["refractive_index"] == 1.33
+    # Records of earlier versions have 0 in place of null.
+    file = tmp_path / "results.json"
+    file.write_text(json.dumps({**results, "settings": {**results["settings"], "refractive_index": 0.0}}))
+    assert read_results(file) == results
 
 
 def test_one_that_is_asked_for_overrides_the_scene(water: Path, tmp_path: Path) -> None:

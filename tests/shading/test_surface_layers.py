@@ -12,17 +12,20 @@ from polarguide.capture import Scene
 from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
+from polarguide.runs.defaults import resolve
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
 from polarguide.shading.splatting import splatting
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
 def trainer(tiny_scene: Scene) -> Trainer:
+    recipe = recipe_named("polarguide-stokes")
     made = Trainer(
-        tiny_scene, recipe_named("polarguide-stokes"), TrainSettings(steps=60), choose_backend("cpu")
+        tiny_scene, recipe, resolve(TrainSettings(steps=60), tiny_scene, recipe), choose_backend("cpu")
     )
     made.run(lambda _: None, until=30)
     return made

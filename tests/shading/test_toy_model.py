@@ -24,6 +24,7 @@ from polarguide.presentation import Crop
 from polarguide.raster import choose_backend
 from polarguide.recipes import ablations_of, recipe_named
 from polarguide.rendering.relight import needs_radiance
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.point_cloud import write_run_ply
 from polarguide.scene_frame import scene_frame
@@ -31,8 +32,9 @@ from polarguide.shading.gbuffer import render
 from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.training.actions import reset_opacity
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.trainer import Trainer
 from polarguide.viewer import shown_training
 from polarguide.viewer.appearance import Appearance, Painter
 
@@ -54,7 +56,7 @@ def trained(tiny_scene: Scene, toy: Recipe) -> Trainer:
 def train(
     scene: Scene, recipe: Recipe, until: int | None = None, state: TrainingState | None = None
 ) -> Trainer:
-    trainer = Trainer(scene, recipe, SETTINGS, choose_backend("cpu"), state)
+    trainer = Trainer(scene, recipe, resolve(SETTINGS, scene, recipe), choose_backend("cpu"), state)
     trainer.run(lambda _: None, until=until)
     return trainer
 
@@ -73,7 +75,7 @@ def picture(trainer: Trainer, **layers: bool) -> RenderResult:
 
 
 def test_it_trains_and_resumes_to_the_same_bits(trained: Trainer, toy: Recipe, tmp_path: Path) -> None:
-    first = Trainer(trained.scene, toy, SETTINGS, trained.backend).state
+    first = Trainer(trained.scene, toy, resolve(SETTINGS, trained.scene, toy), trained.backend).state
     for name in ("gloss_logits", "tint"):
         assert trained.state.gaussians[name].detach().std() > 0, "not trained"
         assert trained.state.gaussians[name].shape == (len(trained.state.gaussians), *toy.shapes[name])
@@ -98,7 +100,7 @@ def test_it_renders_and_is_evaluated(trained: Trainer) -> None:
     assert {name for name in LAYERS if getattr(result, name) is not None} == set(trained.shading.layers)
     assert trained.shading.refractive_index == SETTINGS.refractive_index
     target = ViewTarget.of(view.photograph(), view.invalid, view.ground_truth, torch.device("cpu"))
-    before = Trainer(trained.scene, trained.recipe, SETTINGS, trained.backend)
+    before = Trainer(trained.scene, trained.recipe, trained.settings, trained.backend)
     first, last = (score_view(target, picture(trainer))["psnr"] for trainer in (before, trained))
     assert last > first + 1  # type: ignore[operator]
 

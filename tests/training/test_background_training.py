@@ -11,6 +11,7 @@ from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, choose_backend, rasterize_reference
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.shading.visibility import LEAST_PIXELS, touched_pixels
 from polarguide.training import losses as losses_of_steps
 from polarguide.training.losses import coverage_loss
@@ -35,7 +36,7 @@ def black_scene(tiny_scene: Scene) -> Scene:
 
 def trainer(scene: Scene, background: str, recipe: str = "3dgs", steps: int = 60) -> Trainer:
     settings = TrainSettings(steps, 3, background=background)  # type: ignore[arg-type]
-    return Trainer(scene, RECIPES[recipe], settings, BACKEND)
+    return Trainer(scene, RECIPES[recipe], resolve(settings, scene, RECIPES[recipe]), BACKEND)
 
 
 def outside(made: Trainer, scene: Scene) -> float:
@@ -59,9 +60,13 @@ def test_the_mode_is_found_from_the_pictures_unless_it_is_given(
 
 @pytest.mark.parametrize("name", ["3dgs", "3dgs-dr", "ref-gs", "polarguide-stokes"])
 def test_every_recipe_begins_without_far_gaussians(black_scene: Scene, name: str) -> None:
-    begun = Trainer(black_scene, RECIPES[name], TrainSettings(60), BACKEND)
+    begun = Trainer(
+        black_scene, RECIPES[name], resolve(TrainSettings(60), black_scene, RECIPES[name]), BACKEND
+    )
     assert len(begun.state.gaussians) == len(black_scene.points)
-    with_shell = first_state(black_scene, RECIPES[name], TrainSettings(60))
+    with_shell = first_state(
+        black_scene, RECIPES[name], resolve(TrainSettings(60), black_scene, RECIPES[name])
+    )
     assert len(with_shell.gaussians) == len(black_scene.points) + RECIPES[name].initialization.shell
 
 
@@ -168,7 +173,10 @@ def test_all_stays_where_no_view_sees_anything(black_scene: Scene) -> None:
         return rasterize_reference(splats._replace(opacities=splats.opacities * 0), camera, **asked)
 
     made = Trainer(
-        black_scene, RECIPES["3dgs"], TrainSettings(40, background="black"), Backend(BACKEND.device, nothing)
+        black_scene,
+        RECIPES["3dgs"],
+        resolve(TrainSettings(40, background="black"), black_scene, RECIPES["3dgs"]),
+        Backend(BACKEND.device, nothing),
     )
     made.run(lambda _: None)
     assert len(made.state.gaussians) == len(black_scene.points)

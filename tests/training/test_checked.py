@@ -18,16 +18,17 @@ from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES, recipe_named
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState, first_state
-from polarguide.training.trainer import TrainSettings
 
 
 def stepped(scene: Scene, recipe: Recipe) -> TrainingState:
     """A state with moments of everything, and the copy from which priors are computed."""
-    state = first_state(scene, recipe, TrainSettings(10, 0))
+    state = first_state(scene, recipe, resolve(TrainSettings(10, 0), scene, recipe))
     for trained in (state.gaussians, state.environment):
         if trained is not None:
             for values in trained.trained():

@@ -18,8 +18,10 @@ from polarguide.camera import Camera
 from polarguide.capture import Scene
 from polarguide.raster import Backend, Rasterized, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.training.recipe import Recipe
-from polarguide.training.trainer import Trainer, TrainSettings, first_state
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer, first_state
 
 OF_GAUSSIANS = [name for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)]
 
@@ -94,7 +96,7 @@ def plain_adam(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def started(scene: Scene, recipe: Recipe, views: int = 1) -> Trainer:
-    settings = TrainSettings(40, 0, views_per_step=views)
+    settings = resolve(TrainSettings(40, 0, views_per_step=views), scene, recipe)
     state = first_state(scene, recipe, settings, META)
     return Trainer(scene, recipe, settings, Backend(META, stand_in), state)
 

@@ -14,10 +14,12 @@ from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.raster import choose_backend
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Recipe
-from polarguide.training.trainer import StepReport, Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import StepReport, Trainer
 
 PROGRAM = Path(__file__).parents[1] / "helpers" / "ranks_program.py"
 PATIENCE = 300.0
@@ -40,7 +42,7 @@ def shared(
 def alone(
     scene: Scene, recipe: Recipe, *, steps: int, views: int, until: int | None = None
 ) -> tuple[Trainer, list[StepReport]]:
-    settings = TrainSettings(steps, 3, views_per_step=views)
+    settings = resolve(TrainSettings(steps, 3, views_per_step=views), scene, recipe)
     trainer, reports = Trainer(scene, recipe, settings, choose_backend("cpu")), list[StepReport]()
     trainer.run(reports.append, until=until)
     return trainer, reports
@@ -86,7 +88,8 @@ def test_several_views_a_step_are_resumed_bit_by_bit(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
     """Also between two rounds of the density control, when the statistics are under way."""
-    settings, backend = TrainSettings(30, 3, views_per_step=3), choose_backend("cpu")
+    backend = choose_backend("cpu")
+    settings = resolve(TrainSettings(30, 3, views_per_step=3), tiny_scene, busy_recipe)
     whole, _ = alone(tiny_scene, busy_recipe, steps=30, views=3)
     begun = Trainer(tiny_scene, busy_recipe, settings, backend)
     begun.run(lambda _: None, until=21)
@@ -108,10 +111,8 @@ def test_another_number_of_ranks_goes_on_bit_by_bit(
     if before > 1:
         first = shared(tmp_path, ranks=before, steps=steps, views=views, until=until)
         assert int(first[0]["scalars"][0]) == until
-        settings, state = (
-            TrainSettings(steps, 3, views_per_step=views),
-            load_checkpoint(tmp_path / "0", busy_recipe),
-        )
+        settings = resolve(TrainSettings(steps, 3, views_per_step=views), tiny_scene, busy_recipe)
+        state = load_checkpoint(tmp_path / "0", busy_recipe)
         resumed = Trainer(tiny_scene, busy_recipe, settings, choose_backend("cpu"), state)
         resumed.run(lambda _: None)
         ends = [resumed.state.tensors()]
@@ -135,7 +136,12 @@ def test_slots_are_shared_out_once_each_and_the_first_rank_has_one(world: int, v
 
 def test_rates_follow_the_square_root_of_the_views(tiny_scene: Scene, busy_recipe: Recipe) -> None:
     one, four = (
-        Trainer(tiny_scene, busy_recipe, TrainSettings(30, 3, views_per_step=views), choose_backend("cpu"))
+        Trainer(
+            tiny_scene,
+            busy_recipe,
+            resolve(TrainSettings(30, 3, views_per_step=views), tiny_scene, busy_recipe),
+            choose_backend("cpu"),
+        )
         for views in (1, 4)
     )
     for trainer in (one, four):

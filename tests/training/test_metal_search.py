@@ -12,12 +12,14 @@ from polarguide.capture import Scene
 from polarguide.raster import choose_backend
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.shading.metal import any_metal
 from polarguide.training.metals.decision import decide
 from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.words import contradicted, said_by
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
 
 RECIPE = RECIPES["polarguide-stokes"]
@@ -38,7 +40,7 @@ def trainer_of(scene: Scene, settings: TrainSettings, warn: list[str]) -> Traine
         for stage in RECIPE.stages
     )
     recipe = dataclasses.replace(RECIPE, stages=repeats)
-    return Trainer(scene, recipe, settings, choose_backend("cpu"), warn=warn.append)
+    return Trainer(scene, recipe, resolve(settings, scene, recipe), choose_backend("cpu"), warn=warn.append)
 
 
 @pytest.mark.parametrize("until", [32, 45])
@@ -76,7 +78,13 @@ def test_too_few_steps_to_heed_materials_are_told_of(tiny_scene: Scene, minimum:
     )
     recipe, scene = dataclasses.replace(RECIPE, stages=stages), with_materials(tiny_scene, 2)
     for given in (scene, tiny_scene):
-        Trainer(given, recipe, TrainSettings(60, 3), choose_backend("cpu"), warn=heard.append)
+        Trainer(
+            given,
+            recipe,
+            resolve(TrainSettings(60, 3), given, recipe),
+            choose_backend("cpu"),
+            warn=heard.append,
+        )
     if minimum == 1:
         assert not heard
     else:

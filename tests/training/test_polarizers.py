@@ -18,6 +18,7 @@ from polarguide.capture.variants import captured_as
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.angles import report_polarizers
+from polarguide.runs.defaults import resolve
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.polarizers import AGAIN, DISAGREE, Polarizers, mean_angle
 from polarguide.training.settings import StepReport, TrainSettings
@@ -252,7 +253,9 @@ def test_exposure_times_are_found() -> None:
 
 
 def trained(scene: Scene, until: int, state: TrainingState | None = None) -> Trainer:
-    trainer = Trainer(scene, STOKES, TrainSettings(steps=STEPS, background="scene"), CPU, state)
+    trainer = Trainer(
+        scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU, state
+    )
     trainer.run(lambda report: None, until=until)
     return trainer
 
@@ -260,7 +263,7 @@ def trained(scene: Scene, until: int, state: TrainingState | None = None) -> Tra
 def test_it_begins_again_with_the_angles_that_it_found() -> None:
     scene = captured_as(WHOLE, "unknown")
     reports: list[StepReport] = []
-    settings = TrainSettings(steps=STEPS, background="scene")
+    settings = resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES)
     trainer = Trainer(scene, STOKES, settings, CPU)
     first, second = round(0.65 * STEPS), round(AGAIN[-1] * STEPS)
     search = first + second
@@ -292,7 +295,9 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
     scene = captured_as(WHOLE, "unknown")
     width = scene.views[0].camera.width
     assert width > 16
-    trainer = Trainer(scene, STOKES, TrainSettings(steps=STEPS, background="scene"), CPU)
+    trainer = Trainer(
+        scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
+    )
     assert trainer.total == STEPS + 13 + 19
     looked_at = set[int]()
     fit = trainer.polarizers.fit
@@ -313,14 +318,19 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
     view = trainer.scene.train_views[0]
     assert trainer.polarizers.believed(view).codes is view.codes
     # On a schedule that tells nothing of a search, known angles are looked at twice.
-    known = Trainer(captured_as(WHOLE, "one"), STOKES, TrainSettings(steps=STEPS, background="scene"), CPU)
+    scene = captured_as(WHOLE, "one")
+    known = Trainer(
+        scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
+    )
     assert [step for step in range(STEPS) if known.polarizers.due(step)] == [8, 12]
 
 
 @pytest.mark.parametrize("exposures", ["one", "four", "none"])
 def test_where_all_angles_are_known_nothing_begins_again(exposures: str) -> None:
     scene = captured_as(WHOLE, exposures)  # type: ignore[arg-type]
-    trainer = Trainer(scene, STOKES, TrainSettings(steps=STEPS, background="scene"), CPU)
+    trainer = Trainer(
+        scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
+    )
     assert (trainer.begins_again, trainer.total) == (False, STEPS)
 
 

@@ -8,6 +8,7 @@ from glossy_table import glossy_table, radiance
 
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.shading.gbuffer import render
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer
@@ -17,7 +18,9 @@ from polarguide.training.trainer import Trainer
 def test_blocked_light_does_not_run_away() -> None:
     """With S0 as rendered in the term of S1 and S2, one view was 75 % off; without, it is 22 %."""
     scene = glossy_table()
-    trainer = Trainer(scene, RECIPES["polarguide-stokes"], TrainSettings(900), choose_backend("cpu"))
+    recipe = RECIPES["polarguide-stokes"]
+    settings = resolve(TrainSettings(900), scene, recipe)
+    trainer = Trainer(scene, recipe, settings, choose_backend("cpu"))
     trainer.run(lambda _: None)
     state, errors = trainer.state, {}
     for view in scene.views:

@@ -11,11 +11,12 @@ import torch
 from polarguide.capture import Scene
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.forecast import _priors_made
 from polarguide.training.feed import Feed
 from polarguide.training.recipe import Coarse
-from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
 from polarguide.training.sizes import coarse_steps
 from polarguide.training.trainer import Trainer
 
@@ -27,7 +28,9 @@ NEVER = dataclasses.replace(STOKES, coarse=Coarse(share=0.0))
 
 def trained(scene: Scene, recipe: object, until: int | None = None, state: object = None) -> Trainer:
     reports: list[StepReport] = []
-    trainer = Trainer(scene, recipe, TrainSettings(STEPS, 3), choose_backend("cpu"), state)  # type: ignore[arg-type]
+    trainer = Trainer(
+        scene, recipe, resolve(TrainSettings(STEPS, 3), scene, recipe), choose_backend("cpu"), state
+    )  # type: ignore[arg-type]
     trainer.run(reports.append, until=until)
     return trainer
 
@@ -79,7 +82,7 @@ def test_small_pictures_are_looked_at_whole(tiny_scene: Scene) -> None:
 
 def test_priors_are_counted_by_size() -> None:
     """Where the size changes they are all made once more."""
-    settings = TrainSettings(1000)
+    settings = ResolvedSettings(steps=1000, refractive_index=1.5)
     assert _priors_made(STOKES, settings, 10, 0)[True] == 0
     whole = _priors_made(STOKES, settings, 10, 0)[False]
     halved = _priors_made(STOKES, settings, 10, 430)

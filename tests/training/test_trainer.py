@@ -14,10 +14,12 @@ from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe
-from polarguide.training.trainer import StepReport, Trainer, TrainSettings, first_state
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import StepReport, Trainer, first_state
 
 OF_GAUSSIANS = [name for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)]
 
@@ -29,7 +31,9 @@ def train(
     scene: Scene, recipe: Recipe, *, until: int | None = None, steps: int = STEPS, seed: int = 3
 ) -> tuple[Trainer, list[StepReport]]:
     reports: list[StepReport] = []
-    trainer = Trainer(scene, recipe, TrainSettings(steps, seed), choose_backend("cpu"))
+    trainer = Trainer(
+        scene, recipe, resolve(TrainSettings(steps, seed), scene, recipe), choose_backend("cpu")
+    )
     trainer.run(reports.append, until=until)
     return trainer, reports
 
@@ -88,7 +92,13 @@ def test_resumed_is_uninterrupted_bit_by_bit(tiny_scene: Scene, busy_recipe: Rec
     state = load_checkpoint(tmp_path, busy_recipe)
     assert different(state.tensors(), begun.state.tensors()) == []
     rest: list[StepReport] = []
-    Trainer(tiny_scene, busy_recipe, TrainSettings(STEPS, 3), choose_backend("cpu"), state).run(rest.append)
+    Trainer(
+        tiny_scene,
+        busy_recipe,
+        resolve(TrainSettings(STEPS, 3), tiny_scene, busy_recipe),
+        choose_backend("cpu"),
+        state,
+    ).run(rest.append)
     assert first + rest == reports
     assert different(state.tensors(), whole.state.tensors()) == []
 
@@ -110,7 +120,9 @@ def test_a_directional_light_is_resumed_bit_by_bit(
     save_checkpoint(tmp_path, begun.state)
     state = load_checkpoint(tmp_path, recipe)
     assert different(state.tensors(), begun.state.tensors()) == []
-    Trainer(tiny_scene, recipe, TrainSettings(STEPS, 3), choose_backend("cpu"), state).run(lambda _: None)
+    Trainer(
+        tiny_scene, recipe, resolve(TrainSettings(STEPS, 3), tiny_scene, recipe), choose_backend("cpu"), state
+    ).run(lambda _: None)
     assert different(state.tensors(), whole.state.tensors()) == []
     tensors = state.tensors()
     moved = [f"adam.{name}.exp_avg" for name in DIRECTIONAL]
@@ -129,7 +141,7 @@ def test_any_step_can_be_resumed_from(
     begun, _ = train(tiny_scene, busy_recipe, until=stop)
     save_checkpoint(tmp_path, begun.state)
     state = load_checkpoint(tmp_path, busy_recipe)
-    settings = TrainSettings(STEPS, 3)
+    settings = resolve(TrainSettings(STEPS, 3), tiny_scene, busy_recipe)
     Trainer(tiny_scene, busy_recipe, settings, choose_backend("cpu"), state).run(lambda _: None, until=ahead)
     assert different(state.tensors(), whole.state.tensors()) == []
 
@@ -165,7 +177,12 @@ def test_global_random_state_neither_matters_nor_changes(tiny_scene: Scene, busy
 
 
 def test_every_epoch_visits_every_training_view_once(tiny_scene: Scene) -> None:
-    trainer = Trainer(tiny_scene, RECIPES["3dgs"], TrainSettings(100, 0), choose_backend("cpu"))
+    trainer = Trainer(
+        tiny_scene,
+        RECIPES["3dgs"],
+        resolve(TrainSettings(100, 0), tiny_scene, RECIPES["3dgs"]),
+        choose_backend("cpu"),
+    )
     names = sorted(view.name for view in tiny_scene.train_views)
     count = len(names)
     epochs = [
@@ -195,7 +212,7 @@ def test_test_views_are_never_trained_on(tiny_scene: Scene) -> None:
 def test_the_first_state_has_one_gaussian_per_point_and_added_one(
     tiny_scene: Scene, busy_recipe: Recipe
 ) -> None:
-    state = first_state(tiny_scene, busy_recipe, TrainSettings(10, 0))
+    state = first_state(tiny_scene, busy_recipe, resolve(TrainSettings(10, 0), tiny_scene, busy_recipe))
     count = len(tiny_scene.points) + busy_recipe.initialization.shell
     assert len(state.gaussians) == count
     assert state.step == 0
@@ -204,7 +221,12 @@ def test_the_first_state_has_one_gaussian_per_point_and_added_one(
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(tiny_scene: Scene) -> None:
-    trainer = Trainer(tiny_scene, RECIPES["polarguide"], TrainSettings(30, 0), choose_backend("cpu"))
+    trainer = Trainer(
+        tiny_scene,
+        RECIPES["polarguide"],
+        resolve(TrainSettings(30, 0), tiny_scene, RECIPES["polarguide"]),
+        choose_backend("cpu"),
+    )
     with torch.no_grad():
         trainer.state.gaussians["sh_dc"][0, 0] = math.nan
     with pytest.raises(PolarguideError, match="finite"):

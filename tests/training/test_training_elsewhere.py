@@ -14,10 +14,12 @@ from polarguide.capture import Scene
 from polarguide.gaussians.ply import read_ply
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.runs.point_cloud import write_run_ply
 from polarguide.training.recipe import Recipe
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 
 STEPS = TrainSettings(30, 3)
 HALF = 13
@@ -42,7 +44,7 @@ def test_a_training_stays_there_and_goes_on_from_its_checkpoint(
     """Nothing mixes devices, and a step with nothing due before or after it waits for nothing."""
     densified = busy_recipe.densification.every
     with OtherDevice() as device:
-        trainer = Trainer(tiny_scene, busy_recipe, STEPS, BACKEND)
+        trainer = Trainer(tiny_scene, busy_recipe, resolve(STEPS, tiny_scene, busy_recipe), BACKEND)
         counts = [len(trainer.state.gaussians)]
         for step in range(STEPS.steps):
             if step == HALF:
@@ -58,12 +60,14 @@ def test_a_training_stays_there_and_goes_on_from_its_checkpoint(
         assert {n for n, t in tensors.items() if t.device != THERE} == set()
         whole = checkpoint(tmp_path / "whole", trainer)
         state = load_checkpoint(tmp_path / "half", busy_recipe, THERE)
-        again = Trainer(tiny_scene, busy_recipe, STEPS, BACKEND, state)
+        again = Trainer(tiny_scene, busy_recipe, resolve(STEPS, tiny_scene, busy_recipe), BACKEND, state)
         again.run(lambda _: None)
         resumed = checkpoint(tmp_path / "again", again)
     assert {name for name in whole if not torch.equal(whole[name], resumed[name])} == set()
     state = load_checkpoint(tmp_path / "half", busy_recipe)
-    Trainer(tiny_scene, busy_recipe, STEPS, choose_backend("cpu"), state).run(lambda _: None, until=HALF + 1)
+    Trainer(
+        tiny_scene, busy_recipe, resolve(STEPS, tiny_scene, busy_recipe), choose_backend("cpu"), state
+    ).run(lambda _: None, until=HALF + 1)
 
 
 @pytest.mark.parametrize("name", ["3dgs", "polarguide-stokes", "ref-gs"])
@@ -73,7 +77,7 @@ def test_what_a_recipe_begins_and_ends_with(tiny_scene: Scene, tmp_path: Path, n
     for backend in (choose_backend("cpu"), BACKEND):
         here = backend.device.type == "cpu"
         with OtherDevice():
-            trainer = Trainer(tiny_scene, RECIPES[name], STEPS, backend)
+            trainer = Trainer(tiny_scene, RECIPES[name], resolve(STEPS, tiny_scene, RECIPES[name]), backend)
             if RECIPES[name].oriented:
                 trainer._act("orient_normals")
                 outward[here] = trainer.state.gaussians["outward"].detach().to("cpu")

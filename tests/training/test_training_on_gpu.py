@@ -12,9 +12,11 @@ from polarguide.capture import Scene
 from polarguide.raster import Backend, Rasterized, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.training.recipe import Recipe
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 
 OF_GAUSSIANS = [name for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)]
 
@@ -29,7 +31,7 @@ pytestmark = [
 
 def final_psnr(scene: Scene, recipe: Recipe, backend: Backend, steps: int = 200) -> float:
     reports: list[float] = []
-    trainer = Trainer(scene, recipe, TrainSettings(steps, 3), backend)
+    trainer = Trainer(scene, recipe, resolve(TrainSettings(steps, 3), scene, recipe), backend)
     trainer.run(lambda report: reports.append(report.psnr))
     return sum(reports[-20:]) / 20
 
@@ -42,7 +44,12 @@ def test_every_recipe_learns_what_the_cpu_learns(tiny_scene: Scene, name: str) -
 
 def test_all_that_can_happen_happens(tiny_scene: Scene, busy_recipe: Recipe) -> None:
     counts: list[int] = []
-    trainer = Trainer(tiny_scene, busy_recipe, TrainSettings(60, 3), choose_backend("cuda"))
+    trainer = Trainer(
+        tiny_scene,
+        busy_recipe,
+        resolve(TrainSettings(60, 3), tiny_scene, busy_recipe),
+        choose_backend("cuda"),
+    )
     trainer.run(lambda report: counts.append(report.gaussians))
     assert len(set(counts)) > 3
     state = trainer.state.tensors()
@@ -54,7 +61,7 @@ def test_all_that_can_happen_happens(tiny_scene: Scene, busy_recipe: Recipe) -> 
 def test_a_checkpoint_goes_on_elsewhere(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, first: Any, second: Any
 ) -> None:
-    settings = TrainSettings(60, 3)
+    settings = resolve(TrainSettings(60, 3), tiny_scene, busy_recipe)
     begun = Trainer(tiny_scene, busy_recipe, settings, choose_backend(first))
     begun.run(lambda _: None, until=30)
     save_checkpoint(tmp_path, begun.state)
@@ -77,7 +84,7 @@ def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str)
         finally:
             torch.cuda.set_sync_debug_mode("error" if strict else "default")
 
-    settings = TrainSettings(10_000, 0)
+    settings = resolve(TrainSettings(10_000, 0), tiny_scene, RECIPES[name])
     trainer = Trainer(tiny_scene, RECIPES[name], settings, backend._replace(rasterize=rasterize))
     views, begin = len(tiny_scene.train_views), 1
     for stage in RECIPES[name].stages:

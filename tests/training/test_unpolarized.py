@@ -12,6 +12,7 @@ from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, ablations_of, recipe_named
+from polarguide.runs.defaults import resolve
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer
@@ -37,7 +38,7 @@ def trained(scene: Scene, recipe: Recipe) -> dict[str, Tensor]:
     # Density control and huge Gaussians within the thirty steps, too.
     density = replace(recipe.densification, every=5, gradient=1e-5, large_minimum=1)
     recipe = replace(recipe, densification=density)
-    trainer = Trainer(scene, recipe, TrainSettings(STEPS, 3), choose_backend("cpu"))
+    trainer = Trainer(scene, recipe, resolve(TrainSettings(STEPS, 3), scene, recipe), choose_backend("cpu"))
     trainer.run(lambda _: None)
     return trainer.state.tensors()
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from polarguide.capture import Scene
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
+from polarguide.runs.defaults import resolve
 from polarguide.training import view_store
 from polarguide.training.packing import (
     Entry,
@@ -25,7 +26,8 @@ from polarguide.training.packing import (
 )
 from polarguide.training.priors import view_priors
 from polarguide.training.recipe import Recipe, Weights
-from polarguide.training.trainer import Trainer, TrainSettings
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 from polarguide.training.view_store import ViewStore
 
 STEPS, STOP = 24, 13
@@ -41,7 +43,9 @@ def same(a: Entry, b: Entry) -> bool:
 
 
 def trained(scene: Scene, recipe: Recipe, store: ViewStore, *, until: int = STEPS) -> dict[str, Tensor]:
-    trainer = Trainer(scene, recipe, TrainSettings(60, 3), choose_backend("cpu"), store=store)
+    trainer = Trainer(
+        scene, recipe, resolve(TrainSettings(60, 3), scene, recipe), choose_backend("cpu"), store=store
+    )
     trainer.run(lambda _: None, until=until)
     return {name: values.clone() for name, values in trainer.state.tensors().items()}
 
@@ -68,7 +72,7 @@ def test_a_training_goes_on_with_another_store_to_the_same_bits(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
     expected = trained(tiny_scene, busy_recipe, ViewStore())
-    settings, backend = TrainSettings(60, 3), choose_backend("cpu")
+    settings, backend = resolve(TrainSettings(60, 3), tiny_scene, busy_recipe), choose_backend("cpu")
     begun = Trainer(tiny_scene, busy_recipe, settings, backend)
     begun.run(lambda _: None, until=STOP)
     rest = Trainer(tiny_scene, busy_recipe, settings, backend, begun.state, store=ViewStore(3000, tmp_path))

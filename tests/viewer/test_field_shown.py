@@ -11,6 +11,7 @@ from textured_ball import textured_ball
 
 from polarguide.neural.trainer import FieldTrainer
 from polarguide.presentation import Crop
+from polarguide.runs.defaults import resolve
 from polarguide.runs.train import train
 from polarguide.scene_frame import scene_frame
 from polarguide.training.settings import TrainSettings
@@ -59,7 +60,8 @@ def test_what_is_cropped_is_black(shown: ShownField) -> None:
 
 def test_a_training_is_shown_without_a_change(tmp_path: Path) -> None:
     looked, alone = (
-        FieldTrainer(SCENE, small(), TrainSettings(steps=20), torch.device("cpu")) for _ in range(2)
+        FieldTrainer(SCENE, small(), resolve(TrainSettings(steps=20), SCENE, small()), torch.device("cpu"))
+        for _ in range(2)
     )
     for _ in range(20):
         looked.step(), alone.step()

@@ -10,7 +10,7 @@ from polarguide.cli.compare import Options, Scenes, Settings, print_results
 from polarguide.cli.console import use_threads
 from polarguide.cli.job_progress import JobReporter
 from polarguide.system import signals_as_interrupts
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import STEPS
 
 
 def ablate(
@@ -18,7 +18,7 @@ def ablate(
     /,
     *,
     out: Path,
-    steps: int = TrainSettings.steps,
+    steps: int = STEPS,
     settings: Settings,
     options: Options,
     base: str = "polarguide",

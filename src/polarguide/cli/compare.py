@@ -14,14 +14,14 @@ from polarguide.cli.job_progress import JobReporter
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
 from polarguide.system import signals_as_interrupts
-from polarguide.training.settings import Background, Materials, TrainSettings
+from polarguide.training.settings import STEPS, Background, Materials, TrainSettings
 
 if TYPE_CHECKING:
     from polarguide.experiments.results import Results
 
 
 def compared_settings(
-    refractive_index: float = 0.0,
+    refractive_index: float | None = None,
     background: Background = TrainSettings.background,
     materials: Materials = TrainSettings.materials,
 ) -> TrainSettings:
@@ -41,7 +41,7 @@ def compare(
     *,
     recipes: tuple[str, ...],
     out: Path,
-    steps: tuple[str, ...] = (str(TrainSettings.steps),),
+    steps: tuple[str, ...] = (str(STEPS),),
     settings: Settings,
     options: Options,
 ) -> None:
@@ -93,7 +93,7 @@ def chosen_steps(words: tuple[str, ...]) -> tuple[int, dict[str, int]]:
             own[name] = int(number)
         else:
             common.append(int(number))
-    return (common or [TrainSettings.steps])[0], own
+    return (common or [STEPS])[0], own
 
 
 def print_results(results: Results, out: Path) -> None:

@@ -36,7 +36,7 @@ def demo(
     """
     with polarguide.demo_scene() as scene:
         say(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
-        settings = TrainSettings(steps, seed, views_per_step=0)
+        settings = TrainSettings(steps, seed)
         session = SessionOptions(threads=machine.threads)
         train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
         evaluate(out, compute=ComputeOptions(machine.threads))

@@ -21,7 +21,7 @@ def train(
     *,
     out: Path,
     recipe: str = "polarguide-stokes",
-    settings: TrainSettings = TrainSettings(steps=0, views_per_step=0, refractive_index=0.0),
+    settings: TrainSettings = TrainSettings(),
     reading: SceneOptions = SceneOptions(),
     session: SessionOptions = SessionOptions(),
     resume: bool = False,

@@ -23,7 +23,7 @@ def ablate(
     *,
     only: Sequence[str] = (),
     reference: Sequence[str | Method] = (),
-    settings: TrainSettings = TrainSettings(refractive_index=0.0),
+    settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,
 ) -> Results:

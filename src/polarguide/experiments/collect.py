@@ -54,7 +54,7 @@ def collect(
             "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         },
         settings={
-            "steps": comparison.settings.steps,
+            "steps": comparison.steps,
             "seeds": comparison.options.seeds,
             "downscale": comparison.options.downscale,
             "transfer": comparison.options.transfer,
@@ -85,7 +85,7 @@ def _scene_record(scene: SceneEntry, comparison: Comparison) -> SceneRecord:
     )
     if scene.warnings:
         record["warnings"] = list(scene.warnings)
-    if not comparison.settings.refractive_index:
+    if comparison.settings.refractive_index is None:
         record["refractive_index"] = comparison.index_of(scene)
     return record
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -36,7 +35,7 @@ def compare(
     recipes: Sequence[str | Method],
     out: PathLike,
     *,
-    settings: TrainSettings = TrainSettings(refractive_index=0.0),
+    settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     seeds_of: Mapping[str, int] = MappingProxyType({}),
     steps_of: Mapping[str, int] = MappingProxyType({}),
@@ -55,7 +54,8 @@ def compare(
         scenes: scene folders with names of their own.
         recipes: the methods in the order of the tables, by name, or as they are registered.
         out: folder to write.
-        settings: of each training; ``seed`` is the first of ``options.seeds``.
+        settings: of each training; ``seed`` is the first of ``options.seeds``. None takes 5,000 steps, since those of
+            scenes of different sizes are to be comparable; the rest as ``train`` does for every scene.
         options: how runs are trained, timed and shown.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
         steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
@@ -71,7 +71,7 @@ def compare(
     comparison = Comparison(
         scenes=tuple(Path(scene) for scene in scenes),
         recipes=_checked_recipes(recipes),
-        settings=replace(settings, views_per_step=settings.views_per_step or 1),  # a run is one process
+        settings=settings,
         options=options,
         out=Path(out),
         seeds_of=dict(seeds_of),
@@ -177,7 +177,7 @@ def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
             )
         )
     tasks.append(Scoring(str(run.folder), alone, compute))
-    return Job(run.label, run.folder, tuple(tasks), run.settings.steps)
+    return Job(run.label, run.folder, tuple(tasks), run.steps)
 
 
 def _compute(comparison: Comparison) -> ComputeOptions:
@@ -191,9 +191,7 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
         return
     reporter.say(f"timing the pictures of {len(untimed)} runs, one after the other")
     jobs = [
-        Job(
-            run.label, run.folder, (Scoring(str(run.folder), True, _compute(comparison)),), run.settings.steps
-        )
+        Job(run.label, run.folder, (Scoring(str(run.folder), True, _compute(comparison)),), run.steps)
         for run in untimed
     ]
     run_jobs(jobs, parallel=1, reporter=reporter)

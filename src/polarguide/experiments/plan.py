@@ -23,15 +23,14 @@ from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import field_digest, model_digest, scoring_digest, training_digest
 from polarguide.experiments.options import CompareOptions
-from polarguide.options import Exposures, SceneOptions, check_count
+from polarguide.options import Exposures, SceneOptions
 from polarguide.progress import SILENT, Reporter
 from polarguide.recipes.registry import ablations_of
-from polarguide.runs.defaults import INDEX
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, trained_steps
 from polarguide.runs.opened import read_scene
 from polarguide.training.recipe import Method, Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import STEPS, TrainSettings, index_of
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
@@ -68,7 +67,7 @@ class Comparison:
 
     Attributes:
         scenes: folders. recipes: the methods, in the order of the tables.
-        settings: of each training; the first seed, from which others count up.
+        settings: of each training, as asked for; the first seed, from which others count up.
         options: how runs are trained, timed and shown.
         out: folder to write.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
@@ -85,8 +84,10 @@ class Comparison:
     steps_of: Mapping[str, int] = field(default_factory=dict)
     asked: str = ""
 
-    def __post_init__(self) -> None:
-        check_count("steps", self.settings.steps)  # they do not follow from the size: scenes are compared
+    @property
+    def steps(self) -> int:
+        """Of every run whose recipe has no number of its own. They do not follow from the size: scenes are compared."""
+        return STEPS if self.settings.steps is None else self.settings.steps
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
@@ -114,7 +115,7 @@ class Comparison:
 
     def index_of(self, scene: SceneEntry) -> float:
         """The refractive index of a scene's runs: the one that is asked for, or the scene's own."""
-        return self.settings.refractive_index or scene.refractive_index or INDEX
+        return index_of(self.settings.refractive_index, scene.refractive_index)
 
     @property
     def command(self) -> str:
@@ -124,10 +125,11 @@ class Comparison:
         settings, options = self.settings, self.options
         words = ["polarguide", "compare", *map(str, self.scenes)]
         words += ["--recipes", *(recipe.name for recipe in self.recipes)]
-        words += ["--steps", str(settings.steps), *(f"{name}={n}" for name, n in self.steps_of.items())]
+        words += ["--steps", str(self.steps), *(f"{name}={n}" for name, n in self.steps_of.items())]
         words += ["--seeds", str(options.seeds), "--out", str(self.out)]
         words += ["--downscale", str(options.downscale), "--transfer", options.transfer]
-        words += ["--refractive-index", str(settings.refractive_index)]
+        index = settings.refractive_index
+        words += [] if index is None else ["--refractive-index", str(index)]
         words += ["--background", settings.background, "--split", options.split]
         words += [] if settings.materials == "auto" else ["--materials", settings.materials]
         words += ["--exposures", *options.exposures] if options.exposures else []
@@ -154,10 +156,15 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One training: a scene, a row of the tables with its recipe, and a seed."""
+    """One training: a scene, a row of the tables with its recipe, and a seed.
+
+    Attributes:
+        steps: of the training. settings: what it is asked for; what they leave open, ``train`` resolves.
+    """
 
     scene: SceneEntry
     row: TableRow
+    steps: int
     settings: TrainSettings
     reading: SceneOptions
     folder: Path
@@ -184,7 +191,7 @@ class PlannedRun:
         # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
         moved = found.scene != str(self.scene.path.resolve())
         leaves = family_of(self.recipe).leaves
-        finished = (self.folder / leaves).exists() and trained_steps(self.folder) == self.settings.steps
+        finished = (self.folder / leaves).exists() and trained_steps(self.folder) == self.steps
         return "trained" if finished and not moved else "begun"
 
     def metrics(self) -> dict[str, Any] | None:
@@ -193,7 +200,7 @@ class PlannedRun:
             record = read_metrics(self.folder)
         except (OSError, PolarguideError):
             return None
-        whole = record["steps"] == self.settings.steps
+        whole = record["steps"] == self.steps
         return record if whole and record["provenance"].get("sources") == scoring_digest() else None
 
     def _configuration(self) -> RunConfiguration | None:
@@ -205,7 +212,7 @@ class PlannedRun:
         same = (
             found.scene_digest == self.scene.digest
             and found.recipe_data == self.recipe.data()
-            and replace(found.settings, gaussians=self.settings.gaussians) == self.settings
+            and found.settings.fit(self.settings)
             and (found.recipe, found.downscale, found.transfer, found.test_views)
             == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
         )
@@ -234,7 +241,7 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
             raise PolarguideError(
                 path, expected="test views", found="none", remedy="Name some in split.json to score on."
             )
-        if not comparison.settings.refractive_index and scene.refractive_index is not None:
+        if comparison.settings.refractive_index is None and scene.refractive_index is not None:
             reporter.say(f"{scene.name}: refractive index {scene.refractive_index:g}, as scene.json says")
         share = black_share(scene.test_views[0])
         facts = SceneFacts.of(scene)
@@ -277,7 +284,7 @@ def _for(recipe: Method, exposures: Exposures) -> Method:
 
 def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int) -> PlannedRun:
     recipe, options = row.recipe, comparison.options
-    steps = row.steps or comparison.settings.steps
+    steps = comparison.steps if row.steps is None else row.steps
     settings = replace(
         comparison.settings,
         steps=steps,
@@ -289,7 +296,7 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
     code = f"{__version__} {training_digest()}{_own_digest(recipe)}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     folder = comparison.out / RUNS / scene.name / _folder_name(row.name) / f"{seed}-{key}"
-    return PlannedRun(scene, row, settings, reading, folder)
+    return PlannedRun(scene, row, steps, settings, reading, folder)
 
 
 def _own_digest(recipe: Method) -> str:

@@ -41,7 +41,7 @@ class Settings(TypedDict):
     seeds: int
     downscale: int
     transfer: str
-    refractive_index: float
+    refractive_index: float | None
     threads: int
     jobs: int
     against: str | None
@@ -62,7 +62,7 @@ class SceneRecord(_Scene, total=False):
 
     ``black_share`` is the share of black pixels in its first test view, None where that is not known.
     ``warnings``, only where there are some, are what its scores do not mean because ground truth is missing.
-    ``refractive_index`` is that of its runs, where ``Settings`` have 0: each scene its own.
+    ``refractive_index`` is that of its runs, where ``Settings`` have null: each scene its own.
     """
 
     warnings: list[str]
@@ -115,6 +115,8 @@ def read_results(path: Path) -> Results:
         settings, dict
     ):  # the first records lack them: surroundings were taken to be there, metals not sought
         record["settings"] = {"background": "scene", "materials": "dielectric", **settings}
+        if settings.get("refractive_index") == 0:  # as earlier records have it for null
+            record["settings"]["refractive_index"] = None
     if record.get("format") != FORMER:
         return validate_results(record, path)
     results = validate_results(_completed(record), path)

@@ -34,6 +34,7 @@ from polarguide.inspection.verdict import Check, Verdict, worst
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend
 from polarguide.records import check_options
+from polarguide.training.settings import index_of
 
 SURE = 0.98
 """Probability from which on ``auto`` is content with the points."""
@@ -108,7 +109,7 @@ def inspect_scene(
         )
     if settings.calibration is not None:
         capture = corrected(capture, settings.calibration)
-    index = settings.refractive_index or capture.refractive_index or 1.5
+    index = index_of(settings.refractive_index, capture.refractive_index)
     measurements: list[ViewMeasurements] = []
     with reporter.track("measuring", len(capture.views)) as advance:
         for view in capture.views:

@@ -23,13 +23,15 @@ from polarguide.inspection.surfaces import Surface
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
 from polarguide.records import read_record
+from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.shading.gbuffer import render
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import StepReport, Trainer, TrainSettings
+from polarguide.training.trainer import Trainer
 from polarguide.vectors import dot, unit
 
 RECIPE = "3dgs-dr:consistent"
@@ -90,9 +92,8 @@ def short_run(
     }
     until = until or steps
     state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
-    trainer = Trainer(
-        scene, recipe, TrainSettings(steps, 0, refractive_index, begin_again=False), backend, state
-    )
+    asked = TrainSettings(steps, 0, refractive_index, begin_again=False)
+    trainer = Trainer(scene, recipe, resolve(asked, scene, recipe), backend, state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)

@@ -16,7 +16,7 @@ from polarguide.neural.state import FieldState
 from polarguide.neural.targets import Target, target_of
 from polarguide.shading.model import PLAIN, ShadingModel
 from polarguide.training.distributed import ALONE
-from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import seeded
 from polarguide.training.view_store import ViewStore
 from polarguide.vectors import unit
@@ -51,7 +51,7 @@ class FieldTrainer:
         self,
         scene: Scene,
         recipe: NeuralRecipe,
-        settings: TrainSettings,
+        settings: ResolvedSettings,
         device: torch.device,
         state: FieldState | None = None,
         store: ViewStore | None = None,

@@ -18,7 +18,7 @@ from polarguide.options import SceneOptions
 from polarguide.progress import Reporter
 from polarguide.raster import Backend
 from polarguide.runs.angles import report_polarizers
-from polarguide.runs.defaults import most_gaussians, with_defaults
+from polarguide.runs.defaults import most_gaussians
 from polarguide.runs.folder import CHECKPOINT, PLY, AnyState
 from polarguide.runs.forecast import Forecast, forecast
 from polarguide.runs.health import Evidence
@@ -31,7 +31,7 @@ from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
 from polarguide.training.polarizers import predicts_filters
 from polarguide.training.recipe import Method, Recipe
-from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.trainer import Trainer
 from polarguide.training.view_store import ViewStore
 
@@ -40,7 +40,7 @@ class AnyTrainer(Protocol):
     """What the loop of a training asks for; see ``training.trainer.Trainer``."""
 
     scene: Scene
-    settings: TrainSettings
+    settings: ResolvedSettings
     ranks: Ranks
     whole: bool
 
@@ -74,22 +74,12 @@ class Family(ABC):
     """The file that a finished training of this kind has written at last."""
 
     @abstractmethod
-    def filled(
-        self, settings: TrainSettings, scene: Scene, method: Any, resumed: TrainSettings | None
-    ) -> TrainSettings:
-        """The settings with what nobody gave, or what the run to resume took.
-
-        Raises:
-            PolarguideError: a setting that means nothing here.
-        """
-
-    @abstractmethod
     def plan(
-        self, pixels: Sequence[int], method: Any, asked: int, reading: SceneOptions, *, held: bool
+        self, pixels: Sequence[int], method: Any, asked: int | None, reading: SceneOptions, *, held: bool
     ) -> MemoryPlan:
-        """How a training stays within its memory; ``asked``: most Gaussians, 0: by the pixels."""
+        """How a training stays within its memory; ``asked``: most Gaussians, None: by the pixels."""
 
-    def check(self, state: Any, settings: TrainSettings, out: Path) -> None:
+    def check(self, state: Any, settings: ResolvedSettings, out: Path) -> None:
         """Refuse a checkpoint that does not belong to the settings of its run.
 
         Raises:
@@ -108,7 +98,7 @@ class Family(ABC):
         self,
         scene: Scene,
         method: Any,
-        settings: TrainSettings,
+        settings: ResolvedSettings,
         backend: Backend,
         state: Any,
         ranks: Ranks,
@@ -119,13 +109,13 @@ class Family(ABC):
         """What trains; it says what it takes for granted about the scene."""
 
     def forecast(
-        self, scene: Scene, method: Any, settings: TrainSettings, backend: Backend, peak: int
+        self, scene: Scene, method: Any, settings: ResolvedSettings, backend: Backend, peak: int
     ) -> Forecast | None:
         """What the training will take; None: it is not estimated."""
         return None
 
     @abstractmethod
-    def model(self, state: Any, method: Any, settings: TrainSettings, backend: Backend) -> Model:
+    def model(self, state: Any, method: Any, settings: ResolvedSettings, backend: Backend) -> Model:
         """What was learned, for whoever scores or shows it."""
 
     @abstractmethod
@@ -142,20 +132,14 @@ class GaussianFamily(Family):
 
     leaves = PLY
 
-    def filled(
-        self, settings: TrainSettings, scene: Scene, method: Recipe, resumed: TrainSettings | None
-    ) -> TrainSettings:
-        """See ``Family``."""
-        return with_defaults(settings, scene, method, resumed)
-
     def plan(
-        self, pixels: Sequence[int], method: Recipe, asked: int, reading: SceneOptions, *, held: bool
+        self, pixels: Sequence[int], method: Recipe, asked: int | None, reading: SceneOptions, *, held: bool
     ) -> MemoryPlan:
         """See ``Family``."""
-        gaussians = asked or most_gaussians(sum(pixels), method)
+        gaussians = most_gaussians(sum(pixels), method) if asked is None else asked
         return plan_memory(pixels, method, gaussians, limit=reading.memory, held=held)
 
-    def check(self, state: Any, settings: TrainSettings, out: Path) -> None:
+    def check(self, state: Any, settings: ResolvedSettings, out: Path) -> None:
         """See ``Family``; refuses sums of the density control for other views a step, too."""
         super().check(state, settings, out)
         sums = state.statistics.gradient
@@ -172,7 +156,7 @@ class GaussianFamily(Family):
         self,
         scene: Scene,
         method: Recipe,
-        settings: TrainSettings,
+        settings: ResolvedSettings,
         backend: Backend,
         state: Any,
         ranks: Ranks,
@@ -189,12 +173,14 @@ class GaussianFamily(Family):
         return made
 
     def forecast(
-        self, scene: Scene, method: Recipe, settings: TrainSettings, backend: Backend, peak: int
+        self, scene: Scene, method: Recipe, settings: ResolvedSettings, backend: Backend, peak: int
     ) -> Forecast | None:
         """See ``Family``."""
         return forecast(scene, method, settings, backend, peak)
 
-    def model(self, state: Any, method: Recipe, settings: TrainSettings, backend: Backend) -> GaussianModel:
+    def model(
+        self, state: Any, method: Recipe, settings: ResolvedSettings, backend: Backend
+    ) -> GaussianModel:
         """See ``Family``."""
         return GaussianModel(state, method.shading.bind(settings.refractive_index), backend)
 
@@ -218,26 +204,14 @@ class FieldFamily(Family):
 
     leaves = CHECKPOINT
 
-    def filled(
-        self, settings: TrainSettings, scene: Scene, method: NeuralRecipe, resumed: TrainSettings | None
-    ) -> TrainSettings:
-        """See ``Family``."""
-        for name, found, least in (
-            ("gaussians", settings.gaussians, 0),
-            ("views_per_step", settings.views_per_step, 1),
-        ):
-            if found > least:
-                raise PolarguideError(
-                    name,
-                    expected=f"{least} with the recipe {method.name}, a field",
-                    found=str(found),
-                    remedy="Leave it out.",
-                )
-        steps = settings.steps or (resumed.steps if resumed is not None else method.steps)
-        return TrainSettings(**{**vars(settings), "steps": steps})
-
     def plan(
-        self, pixels: Sequence[int], method: NeuralRecipe, asked: int, reading: SceneOptions, *, held: bool
+        self,
+        pixels: Sequence[int],
+        method: NeuralRecipe,
+        asked: int | None,
+        reading: SceneOptions,
+        *,
+        held: bool,
     ) -> MemoryPlan:
         """See ``Family``."""
         return plan_field_memory(pixels, method, limit=reading.memory, held=held)
@@ -246,7 +220,7 @@ class FieldFamily(Family):
         self,
         scene: Scene,
         method: NeuralRecipe,
-        settings: TrainSettings,
+        settings: ResolvedSettings,
         backend: Backend,
         state: Any,
         ranks: Ranks,
@@ -260,7 +234,7 @@ class FieldFamily(Family):
         return FieldTrainer(scene, method, settings, backend.device, state, store)
 
     def model(
-        self, state: Any, method: NeuralRecipe, settings: TrainSettings, backend: Backend
+        self, state: Any, method: NeuralRecipe, settings: ResolvedSettings, backend: Backend
     ) -> FieldModel:
         """See ``Family``."""
         return FieldModel(state, method, backend.device)

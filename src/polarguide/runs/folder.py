@@ -34,7 +34,7 @@ from polarguide.options import Transfer
 from polarguide.records import LARGEST_RECORD, decode
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Method, Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
 AnyState = TrainingState | FieldState
@@ -55,7 +55,7 @@ class RunConfiguration:
         scene: absolute path of the scene folder.
         scene_digest: hash of the scene's files, so that a run does not go on with other data.
         recipe: its name. recipe_data: all its values, for the record.
-        settings: steps, seed, refractive index.
+        settings: steps, seed, refractive index, with what was taken where nothing was specified.
         downscale: side of the averaged pixel boxes. transfer: how the files were read.
         device: what it trained on. version: of the program.
         test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
@@ -65,7 +65,7 @@ class RunConfiguration:
     scene_digest: str
     recipe: str
     recipe_data: dict[str, Any]
-    settings: TrainSettings
+    settings: ResolvedSettings
     downscale: int
     transfer: Transfer
     device: str
@@ -74,7 +74,7 @@ class RunConfiguration:
 
     @classmethod
     def of(
-        cls, scene: Scene, recipe: Method, settings: TrainSettings, device: torch.device
+        cls, scene: Scene, recipe: Method, settings: ResolvedSettings, device: torch.device
     ) -> RunConfiguration:
         """What is recorded of a training."""
         return cls(
@@ -118,12 +118,7 @@ class RunConfiguration:
                 found=f"one of version {written}",
                 remedy=f"Train again into a new folder, or open it with polarguide {_series(written)}.",
             )
-        found = decode(data, cls, path, remedy=remedy)
-        if not found.settings.refractive_index:
-            raise PolarguideError(
-                f"{path} (settings.refractive_index)", expected="between 1 and 4", found="0", remedy=remedy
-            )
-        return found
+        return decode(data, cls, path, remedy=remedy)
 
 
 @dataclass(frozen=True)

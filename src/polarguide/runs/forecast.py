@@ -15,7 +15,7 @@ from polarguide.system import MEBIBYTE, peak_memory_mib
 from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.training.recipe import Recipe
 from polarguide.training.schedule import Schedule
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import ResolvedSettings
 from polarguide.training.sizes import coarse_steps
 from polarguide.training.trainer import Trainer
 
@@ -58,7 +58,7 @@ class Forecast:
 
 
 def forecast(
-    scene: Scene, recipe: Recipe, settings: TrainSettings, backend: Backend, peak: int
+    scene: Scene, recipe: Recipe, settings: ResolvedSettings, backend: Backend, peak: int
 ) -> Forecast | None:
     """Take a few steps of each stage on a state of their own; None for a training that is too short for it.
 
@@ -69,7 +69,7 @@ def forecast(
         return None
     trainer = Trainer(scene, recipe, replace(settings, begin_again=False), backend)
     first = len(trainer.state.gaussians)
-    most = max(first, min(GROWTH * first, settings.gaussians or GROWTH * first))
+    most = max(first, min(GROWTH * first, settings.gaussians))
     coarse = coarse_steps(recipe, scene.train_views, settings.steps)
     seconds, of_view = _measured(trainer, coarse)
     made = _priors_made(recipe, settings, len(scene.train_views), coarse)
@@ -82,7 +82,7 @@ def forecast(
     return Forecast(least, greatest, first, most, peak)
 
 
-def _search_share(scene: Scene, recipe: Recipe, settings: TrainSettings) -> float:
+def _search_share(scene: Scene, recipe: Recipe, settings: ResolvedSettings) -> float:
     """What the search for unknown angles adds, over the time of all steps: as many as there are pixels."""
     if not settings.begin_again:
         return 0.0
@@ -134,7 +134,7 @@ def _timed(trainer: Trainer, step: int) -> float:
     return time.perf_counter() - begin
 
 
-def _priors_made(recipe: Recipe, settings: TrainSettings, views: int, coarse: int) -> dict[bool, int]:
+def _priors_made(recipe: Recipe, settings: ResolvedSettings, views: int, coarse: int) -> dict[bool, int]:
     """How many times priors of a view are computed, by whether its picture is one of the smaller ones."""
     schedule, due = Schedule(recipe, settings.steps), views
     made = {True: 0, False: 0}

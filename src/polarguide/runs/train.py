@@ -23,7 +23,7 @@ from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import with_index
+from polarguide.runs.defaults import resolve
 from polarguide.runs.families import AnyTrainer, Family, family_of
 from polarguide.runs.folder import (
     CHECKPOINT,
@@ -41,7 +41,7 @@ from polarguide.system import MemoryBound, return_freed_memory
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.recipe import Method
-from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
 from polarguide.training.stopwatch import Stopwatch
 from polarguide.training.view_store import ViewStore
 
@@ -69,7 +69,7 @@ def train(
     out: PathLike,
     *,
     recipe: Method | str = "polarguide-stokes",
-    settings: TrainSettings = TrainSettings(refractive_index=0.0),
+    settings: TrainSettings = TrainSettings(),
     session: SessionOptions = SessionOptions(),
     reading: SceneOptions = SceneOptions(),
     resume: bool = False,
@@ -86,7 +86,7 @@ def train(
         scene: a scene, or the folder of one, which is read as ``reading`` says.
         out: folder to write: configuration, checkpoints, log, and a PLY at the end.
         recipe: the method, or the name of one.
-        settings: steps, seed and what else decides the result.
+        settings: steps, seed and what else decides the result; ``resolve`` says what is taken for None.
         session: device, threads, and how often the state is saved.
         resume: go on with the run in ``out``, to the same result.
         reporter: told how far it is.
@@ -105,9 +105,6 @@ def train(
         leads = ranks.rank == 0
         reporter = reporter if leads else SILENT
         _check_out(out, resume, ranks)
-        settings = replace(
-            settings, views_per_step=_views(settings.views_per_step, ranks, out if resume else None, reporter)
-        )
         backend = backend_of(ranks, session.device, reporter)
         earlier = RunConfiguration.load(out).settings if resume else None
         plan = _planned(family, scene, chosen, settings, earlier, reading)
@@ -118,11 +115,13 @@ def train(
         if settings.background == "masked":
             loaded = without_surroundings(loaded)
         _check_scene(loaded)
-        if not settings.refractive_index and not resume and loaded.refractive_index is not None:
+        if settings.refractive_index is None and not resume and loaded.refractive_index is not None:
             reporter.say(f"refractive index {loaded.refractive_index:g}, as scene.json says")
-        settings = with_index(settings, loaded, earlier)
-        settings = family.filled(settings, loaded, chosen, earlier)
-        configuration = RunConfiguration.of(loaded, chosen, settings, backend.device)
+        resolved = resolve(settings, loaded, chosen, earlier, processes=ranks.world)
+        if resolved.views_per_step < ranks.world:
+            idle = ranks.world - resolved.views_per_step
+            reporter.warn(f"{idle} of {ranks.world} processes have no view to look at")
+        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device)
         state = None
         if resume:
             if leads:
@@ -130,16 +129,16 @@ def train(
             _check_same(RunConfiguration.load(out), configuration, out)
             if (out / CHECKPOINT).exists():
                 state = load_checkpoint(out, chosen, backend.device)
-                family.check(state, settings, out)
+                family.check(state, resolved, out)
         expected = None
         if ranks.world == 1 and not resume:
-            expected = family.forecast(loaded, chosen, settings, backend, plan.peak)
+            expected = family.forecast(loaded, chosen, resolved, backend, plan.peak)
             if expected is not None:
                 reporter.say(expected.sentence())
         return_freed_memory()  # of decoded files, and of what was only measured
         store = locked.enter_context(closing(_store(plan, backend, out, reporter)))
         bound = MemoryBound(plan.peak)
-        trainer = family.trainer(loaded, chosen, settings, backend, state, ranks, store, reporter, bound)
+        trainer = family.trainer(loaded, chosen, resolved, backend, state, ranks, store, reporter, bound)
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
@@ -149,14 +148,14 @@ def train(
                         raise problem
                 configuration.save(out)
             seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound).run()
-        model = family.model(trainer.state, chosen, settings, backend)
+        model = family.model(trainer.state, chosen, resolved, backend)
         if expected is not None:
             reporter.say(expected.truth(seconds))
         if leads:
             finished = _Warned(reporter)
             family.finish(out, trainer, model, finished)
             evidence = family.evidence(trainer, chosen)
-            health = examine(model, evidence, loaded.points, settings.steps, reporter)
+            health = examine(model, evidence, loaded.points, resolved.steps, reporter)
             for warning in health.warnings:
                 reporter.warn(warning)
             health = replace(health, warnings=(*health.warnings, *finished.warnings))
@@ -304,8 +303,8 @@ def _planned(
     family: Family,
     scene: Scene | PathLike,
     recipe: Method,
-    settings: TrainSettings,
-    resumed: TrainSettings | None,
+    asked: TrainSettings,
+    resumed: ResolvedSettings | None,
     reading: SceneOptions,
 ) -> MemoryPlan:
     """How the training stays within its memory, as far as headers tell."""
@@ -313,8 +312,10 @@ def _planned(
         pixels = [view.camera.width * view.camera.height for view in scene.train_views]
     else:
         pixels = pixels_of(Path(scene), reading.downscale)
-    asked = settings.gaussians or (resumed.gaussians if resumed is not None else 0)
-    return family.plan(pixels, recipe, asked, reading, held=isinstance(scene, Scene))
+    gaussians = asked.gaussians
+    if gaussians is None and resumed is not None:
+        gaussians = resumed.gaussians or None  # 0: it was open
+    return family.plan(pixels, recipe, gaussians, reading, held=isinstance(scene, Scene))
 
 
 def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
@@ -323,15 +324,6 @@ def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) ->
         return ViewStore()
     make_folder(out)
     return ViewStore(plan.kept, out, reporter.warn)
-
-
-def _views(asked: int, ranks: Ranks, resumed: Path | None, reporter: Reporter) -> int:
-    """Views a step: as asked, or of the run to resume, or one for each process."""
-    old = RunConfiguration.load(resumed).settings.views_per_step if resumed else 0
-    views = asked or old or ranks.world
-    if views < ranks.world:
-        reporter.warn(f"{ranks.world - views} of {ranks.world} processes have no view to look at")
-    return views
 
 
 def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:

@@ -17,7 +17,7 @@ from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
 from polarguide.training.angle_fit import fit_angle
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import ResolvedSettings
 
 FIRST, EVERY, LAST = 0.5, 0.05, 0.65
 """Shares of all steps at which unknown angles are fitted: earlier, what is believed of them would confirm itself, and
@@ -142,11 +142,6 @@ class Judgment:
         return self.tells and self.unexplained > POOR
 
     @property
-    def doubtful(self) -> bool:
-        """Whether an angle that was found may be wrong, or is no better than a guess."""
-        return not self.tells or self.unsettled or self.poorly_explained
-
-    @property
     def off(self) -> float:
         """Degrees from what is said to what was fitted, in [-90, 90); 0 where nothing is said."""
         return 0.0 if self.said.angle is None else (self.angle - self.said.angle + 90.0) % 180.0 - 90.0
@@ -166,7 +161,7 @@ class Judgment:
     @property
     def doubtful(self) -> bool:
         """Whether the angle that the training goes by may well be wrong."""
-        sought = not self.said.known and (self.vague or self.unsettled or self.poorly_explained)
+        sought = not self.said.known and (not self.tells or self.unsettled or self.poorly_explained)
         return sought or self.unfiltered or self.contradicts
 
 
@@ -344,7 +339,7 @@ def predicts_filters(recipe: Recipe) -> bool:
     return recipe.shading.reflects and any(stage.weights.stokes > 0 for stage in recipe.stages)
 
 
-def search_steps(settings: TrainSettings) -> int:
+def search_steps(settings: ResolvedSettings) -> int:
     """Steps of the schedule by which unknown angles are sought before a training begins; 0: it does not begin again."""
     return min(SEARCH_STEPS, settings.steps) if settings.begin_again else 0
 

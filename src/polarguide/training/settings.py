@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from polarguide.errors import PolarguideError
 from polarguide.options import EXPOSURES, Exposures, check_choice, check_count
 
 MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
+INDEX = 1.5
+"""Refractive index of glass, plastic and glaze, for scenes that name none."""
+STEPS = 5000
+"""Steps of a training of Gaussians, at least, and of every run of a comparison."""
 Background = Literal["auto", "scene", "black", "masked"]
 Materials = Literal["auto", "dielectric"]
 MATERIALS: tuple[Materials, ...] = ("auto", "dielectric")
@@ -22,22 +26,25 @@ if TYPE_CHECKING:
 class TrainSettings:
     """What decides a training's result, beside the scene and the recipe.
 
+    None means not specified: the value is that of the run to resume or, in a new run, the one named below. run.json
+    records the value.
+
     A step's gradient is the mean over its views; learning rates are those of the recipe times the square root of their
     number B, and Adam's decays are taken to the power of B, so that its memory spans as many views (Zhao et al. 2024,
     "On scaling up 3D Gaussian splatting training").
 
     Attributes:
-        steps: Optimizer steps in all. 3,000 show the scene, 5,000 and more settle it; 0 takes 5,000, 60 visits to each
-            view where that is more, and twice as many for pictures over a megapixel (or what the run to resume took).
+        steps: Optimizer steps in all. 3,000 show the scene, 5,000 and more settle it. None: 5,000, 60 visits to each
+            view where that is more, and twice as many for pictures over a megapixel.
         seed: Seed of every random draw.
-        refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water; 0 takes what scene.json
-            says, and 1.5 where it does not (or what the run to resume took).
-        views_per_step: Views whose mean gradient makes a step; 0 takes one for each process (or what the run to resume
-            took). Learning rates grow with its square root; steps are steps, so more views are looked at.
+        refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water. None: that of
+            scene.json, and 1.5 where it has none.
+        views_per_step: Views whose mean gradient makes a step. Learning rates grow with its square root; steps are
+            steps, so more views are looked at. None: one for each process.
         background: What is behind the subject: a scene to reconstruct, too; black, that is nothing; masked makes it
             nothing (the subject in masks/ alone is read); auto takes black where the edges of the pictures are.
-        gaussians: Most Gaussians that there may be, each of which takes 4 kB; 0 takes one for 20 pixels of all training
-            views, 400,000 at most (or what the run to resume took).
+        gaussians: Most Gaussians that there may be, each of which takes 4 kB. None: one for 20 pixels of all
+            training views, 400,000 at most.
         exposures: Which pictures of a scene with four to train on, as if no others had been taken: captured, all that
             there are. See compare.
         begin_again: Where angles are unknown, seek them in a short training on small pictures, and begin again with
@@ -46,31 +53,61 @@ class TrainSettings:
             dielectric takes it that there is no metal.
     """
 
-    steps: int = 5000
+    steps: int | None = None
     seed: int = 0
-    refractive_index: float = 1.5
-    views_per_step: int = 1
+    refractive_index: float | None = None
+    views_per_step: int | None = None
     background: Background = "auto"
-    gaussians: int = 0
+    gaussians: int | None = None
     exposures: Exposures = "captured"
     begin_again: bool = True
     materials: Materials = "auto"
 
+    _LEAST_GAUSSIANS: ClassVar[int] = 1
+
     def __post_init__(self) -> None:
-        check_count("steps", self.steps, 0)
-        check_count("gaussians", self.gaussians, 0)
-        check_count("views_per_step", self.views_per_step, 0, MOST_VIEWS)
+        if self.steps is not None:
+            check_count("steps", self.steps)
+        if self.gaussians is not None:
+            check_count("gaussians", self.gaussians, self._LEAST_GAUSSIANS)
+        if self.views_per_step is not None:
+            check_count("views_per_step", self.views_per_step, 1, MOST_VIEWS)
         check_count("seed", self.seed, 0, MOST_SEEDS)
         check_choice("background", self.background, BACKGROUNDS)
         check_choice("exposures", self.exposures, EXPOSURES)
         check_choice("materials", self.materials, MATERIALS)
-        if self.refractive_index and not 1.0 < self.refractive_index < 4.0:
+        if self.refractive_index is not None and not 1.0 < self.refractive_index < 4.0:
             raise PolarguideError(
                 "refractive_index",
-                expected="between 1 and 4, or 0 for that of the scene",
-                found=str(self.refractive_index),
-                remedy="1.5 suits most.",
+                expected="between 1 and 4",
+                found=f"{self.refractive_index:g}",
+                remedy="1.5 suits most; without it, that of scene.json is taken.",
             )
+
+
+@dataclass(frozen=True)
+class ResolvedSettings(TrainSettings):
+    """``TrainSettings`` in which nothing is left open: what a training reads and ``run.json`` records.
+
+    ``runs.defaults.resolve`` makes them; ``gaussians`` is 0 of a field, which has none.
+    """
+
+    steps: int = field(kw_only=True)
+    refractive_index: float = field(kw_only=True)
+    views_per_step: int = field(default=1, kw_only=True)
+    gaussians: int = field(default=0, kw_only=True)
+
+    _LEAST_GAUSSIANS: ClassVar[int] = 0
+
+    def fit(self, asked: TrainSettings) -> bool:
+        """Whether they are as was asked, whatever was left open."""
+        wanted = {name: value for name, value in vars(asked).items() if value is not None}
+        return wanted.items() <= vars(self).items()
+
+
+def index_of(asked: float | None, scene: float | None) -> float:
+    """The refractive index that was asked for, else that of ``scene.json``, else ``INDEX``."""
+    return next((index for index in (asked, scene) if index is not None), INDEX)
 
 
 @dataclass(frozen=True, eq=False)

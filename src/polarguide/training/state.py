@@ -15,7 +15,7 @@ from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians, Trained
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import far_away, initial_parameters
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import ResolvedSettings
 
 
 class Environment(Trained):
@@ -111,7 +111,7 @@ def seeded(*numbers: int) -> torch.Generator:
 def first_state(
     scene: Scene,
     recipe: Recipe,
-    settings: TrainSettings,
+    settings: ResolvedSettings,
     device: torch.device | str = "cpu",
     *,
     surroundings: bool = True,

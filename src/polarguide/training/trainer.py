@@ -33,7 +33,7 @@ from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Action, Recipe, Stage
 from polarguide.training.schedule import Schedule
-from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
 from polarguide.training.sizes import Sizes
 from polarguide.training.state import TrainingState, first_state, seeded
 from polarguide.training.view_store import ViewStore
@@ -76,7 +76,7 @@ class Trainer:
         self,
         scene: Scene,
         recipe: Recipe,
-        settings: TrainSettings,
+        settings: ResolvedSettings,
         backend: Backend,
         state: TrainingState | None = None,
         ranks: Ranks = ALONE,
@@ -113,8 +113,7 @@ class Trainer:
             scene, steps = smaller(scene, SEARCH_SIZE), search
             self.polarizers = Polarizers(scene, recipe, steps, self.state.angles, search)
         self._views, self._steps, self.schedule = scene.train_views, steps, Schedule(recipe, steps)
-        pixels = sum(view.camera.width * view.camera.height for view in self._views)
-        self._limit = settings.gaussians or int(pixels / recipe.densification.pixels_each)
+        self._limit = settings.gaussians
         store = ViewStore() if self._searches else self._store
         index = settings.refractive_index
         self._sizes = Sizes(

@@ -19,7 +19,7 @@ from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.gain import light_gain
 from polarguide.training.metals.words import contradicted
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
 
@@ -37,7 +37,7 @@ class MetalSearch:
         self,
         scene: Scene,
         recipe: Recipe,
-        settings: TrainSettings,
+        settings: ResolvedSettings,
         shading: ShadingModel,
         backend: Backend,
         ranks: Ranks,
