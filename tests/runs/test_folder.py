@@ -311,6 +311,11 @@ def test_more_steps_than_a_training_was_begun_with(demo_scene: Path, trained: Pa
         )
 
 
+def test_a_name_that_no_folder_can_have(demo_scene: Path) -> None:
+    with pytest.raises(PolarguideError, match="expected a folder to write, found a null byte"):
+        polarguide.train(demo_scene, "runs/\0", settings=TrainSettings(3))
+
+
 def test_a_checkpoint_has_the_rights_of_other_files(tmp_path: Path, state: TrainingState) -> None:
     save_checkpoint(tmp_path, state)
     (tmp_path / "other").write_text("x")

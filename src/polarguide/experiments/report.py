@@ -305,14 +305,17 @@ def _recipes(results: Results) -> str:
 
 
 def _provenance(results: Results) -> str:
-    facts = {**results["provenance"], **results["settings"]}
+    facts: dict[str, object] = {**results["provenance"], **results["settings"]}
+    if facts["refractive_index"] is None:
+        facts["refractive_index"] = "that of each scene"
     rows = [
         (key.replace("_", " "), "unknown" if value is None else str(value)) for key, value in facts.items()
     ]
     rows += [
         (
             f"scene {s['name']}",
-            f"{s['views']} views, test: {', '.join(s['test_views'])}; digest {s['digest'][:16]}",
+            f"{s['views']} views, test: {', '.join(s['test_views'])}; digest {s['digest'][:16]}"
+            + (f"; refractive index {s['refractive_index']:g}" if "refractive_index" in s else ""),
         )
         for s in results["scenes"]
     ]
