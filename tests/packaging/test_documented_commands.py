@@ -32,7 +32,9 @@ from polarguide.polarizer import ANGLES
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs" / "get-started").glob("*.md")))
 # A fenced block, or a command or an expression of the API within a sentence.
-SHOWN = re.compile(r"^```(\w*)\n(.*?)^```|`((?:polarguide [a-z]+ |pg\.)[^`\n]+)`", re.MULTILINE | re.DOTALL)
+SHOWN = re.compile(
+    r"^```([^\n]*)\n(.*?)^```|`((?:polarguide [a-z]+ |pg\.)[^`\n]+)`", re.MULTILINE | re.DOTALL
+)
 CHOICES = re.compile(r"# (\w+(?: \| \w+)+)")
 
 EXCLUDED = {
@@ -46,7 +48,8 @@ SHORT = {
     "demo": ["--steps", str(STEPS)],
     "calibrate": [],
     "prepare": [],
-    "inspect": [],
+    "inspect": ["--steps", "50"],
+    "inspect --fix": [],  # its decision takes a trained model
     "train": ["--steps", str(STEPS), "--downscale", "2"],
     "eval": [],
     "view": [],
@@ -58,7 +61,7 @@ SHORT = {
     "priors": [],
     "measure": [],
 }
-"""What is added to each verb: it may do less, and has to do it in the same way."""
+"""What is added to each verb, or to a verb with an option: it may do less, and has to do it in the same way."""
 WITHOUT_EXTRA = ("synth",)
 """Verbs that may say in one line what they lack."""
 PATIENCE = 900.0
@@ -124,6 +127,9 @@ INPUTS: dict[str, dict[str, Callable[[Path], object]]] = {
 def shown(page: Path) -> Iterator[tuple[str, str]]:
     """What a page shows, from the top down: ("sh", a command line) or ("python", code)."""
     for language, block, span in SHOWN.findall(page.read_text(encoding="utf-8")):
+        assert span or language in ("sh", "python") or language.startswith("{"), (
+            f"{page}: how to run {language}?"
+        )
         if language == "python" or span.startswith("pg."):
             yield "python", block or f"import polarguide as pg\n{span}\n"
         elif language == "sh" or span:
@@ -157,13 +163,13 @@ class Reader:
         program, verb, *words = shlex.split(text)
         assert program == "polarguide", f"how to run {text}? Add it to EXCLUDED, with the reason"
         assert verb in SHORT, f"how to shorten {text}? Add {verb} to SHORT"
-        kinds = [f"{verb} {word}" for word in words if f"{verb} {word}" in INPUTS]
-        made = {name: make for name, make in INPUTS.get((kinds or [verb])[0], {}).items() if name in words}
+        kind = next((f"{verb} {word}" for word in words if f"{verb} {word}" in INPUTS), verb)
+        made = {name: make for name, make in INPUTS.get(kind, {}).items() if name in words}
         outputs = [words[k + 1] for k, word in enumerate(words) if word in ("--out", "--video", "--fix")]
         before = self.set_aside([*made, *outputs])
         for name, make in made.items():
             make(self.folder / name)
-        whole = [program, verb, *words, *SHORT[verb]]
+        whole = [program, verb, *words, *SHORT.get(kind, SHORT[verb])]
         if verb == "view":
             self.visit(whole)
         elif verb in WITHOUT_EXTRA:
@@ -264,11 +270,12 @@ def test_the_environment_has_what_is_declared_and_no_more(programs: Path) -> Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [pytest.param(page, id=page.stem) for page in PAGES if any(shown(page))])
-def test_what_a_page_shows_works(page: Path, reader: Reader, trained: Path) -> None:
+def test_what_a_page_shows_works(page: Path, reader: Reader, request: pytest.FixtureRequest) -> None:
     steps = list(shown(page))
     first = next((text for _, text in steps if "runs/mine" in text), "")
     if first and " train " not in first and not (reader.folder / "runs" / "mine").exists():
-        shutil.copytree(trained, reader.folder / "runs" / "mine")  # of an earlier page, which was not run
+        # Of an earlier page, which was not run.
+        shutil.copytree(request.getfixturevalue("trained"), reader.folder / "runs" / "mine")
     for kind, text in steps:
         if text not in reader.typed:
             print(text)
@@ -280,7 +287,9 @@ def test_all_pages_are_read() -> None:
     """What is excluded is still shown somewhere, and so are commands and code."""
     found = [step for page in PAGES for step in shown(page)]
     assert set(EXCLUDED) <= {text for _, text in found}
-    assert {text.split()[1] for kind, text in found if kind == "sh" and text not in EXCLUDED} == set(SHORT)
+    assert {text.split()[1] for kind, text in found if kind == "sh" and text not in EXCLUDED} == {
+        verb for verb in SHORT if " " not in verb
+    }
     assert sum(kind == "python" for kind, _ in found) >= 4
     assert {f"polarguide export runs/mine --format {name}" for name in ("ply", "spz", "cameras")} <= {
         text for _, text in found
