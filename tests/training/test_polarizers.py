@@ -317,12 +317,12 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
     # What was found holds for the pictures in full size.
     view = trainer.scene.train_views[0]
     assert trainer.polarizers.believed(view).codes is view.codes
-    # On a schedule that tells nothing of a search, known angles are looked at twice.
+    # On a schedule that tells nothing of a search, known angles are looked at three times.
     scene = captured_as(WHOLE, "one")
     known = Trainer(
         scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
     )
-    assert [step for step in range(STEPS) if known.polarizers.due(step)] == [8, 12]
+    assert [step for step in range(STEPS) if known.polarizers.due(step)] == [8, 12, 20]
 
 
 @pytest.mark.parametrize("exposures", ["one", "four", "none"])
