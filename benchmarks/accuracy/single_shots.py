@@ -118,7 +118,7 @@ def examine(folder: Path, truth: Path) -> dict[str, Any]:
     scene = pg.load_scene(truth, downscale=run.configuration.downscale)
     burning = Burning(run, scene)
     train = {view.name: burning.look(view) for view in run.scene.train_views}
-    test = {name: burning.look(scene_view(run, scene, name)) for name in scene.test_names}
+    test = {view.name: burning.look(view) for view in run.scene.test_views}
     scores = {name: found["psnr"] for name, found in test.items()}
     kept = [found["highlights kept"] for found in test.values() if "highlights kept" in found]
     return {
@@ -135,12 +135,6 @@ def examine(folder: Path, truth: Path) -> dict[str, Any]:
         "highlights kept": sum(kept) / len(kept) if kept else None,
         "views": scores,
     }
-
-
-def scene_view(run: OpenedRun, scene: Scene, name: str) -> View:
-    """The view as the run's scene has it, which knows the analyzer, else as the true one does."""
-    views = {view.name: view for view in (*scene.views, *run.scene.views)}
-    return views[name]
 
 
 def main() -> None:

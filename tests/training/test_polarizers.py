@@ -215,6 +215,10 @@ def test_only_what_is_an_exception_contradicts(tmp_path: Path) -> None:
     assert told(2, -3, 80, 4, -2)[0] == [2]
     assert told(2, -3, 45, 4, -2)[0] == [2]
     assert told(2, -3, 15, 4, -2)[0] == []
+    right[0, 2, 3] = 20.0  # a picture at a wrong angle hardly tells its own
+    assert told(2, -3, 65, 4, -2)[0] == [2]
+    assert told(2, -3, 55, 4, -2)[0] == []
+    right[0, 2, 3] = 2.0
     found, said = told(12, -14, 45, 10, -11)  # the model is 12 degrees off as a rule
     assert (found, "were not checked" in said) == ([], False)
     found, said = told(-70, 40, 85, -35, 60)  # it knows nothing yet

@@ -156,8 +156,10 @@ class Judgment:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the picture contradicts what is said."""
-        return self.tells and abs(self.off) > self.limit
+        """Whether the picture contradicts what is said. A picture that hardly tells its angle has a wide limit; one at a
+        wrong angle mostly is such a picture.
+        """
+        return not self.unfiltered and abs(self.off) > self.limit
 
     @property
     def doubtful(self) -> bool:
