@@ -156,9 +156,7 @@ class Judgment:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the picture contradicts what is said. A picture that hardly tells its angle has a wide limit; one at a
-        wrong angle mostly is such a picture.
-        """
+        """Whether the picture contradicts what is said: also one that hardly tells its angle, whose limit is wide."""
         return not self.unfiltered and abs(self.off) > self.limit
 
     @property
