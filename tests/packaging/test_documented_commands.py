@@ -43,9 +43,9 @@ EXCLUDED = {
     "make docs": "CI runs it",
     "pip install .": "leaves the environment in which all others run here",
 }
-STEPS = 12
+STEPS = 120  # after so many the relief has a surface, of which a mesh can be made
 SHORT = {
-    "demo": ["--steps", str(STEPS)],
+    "demo": ["--steps", "12"],
     "calibrate": [],
     "prepare": [],
     "inspect": ["--steps", "50"],
@@ -210,23 +210,23 @@ class Reader:
         with socket.socket() as listener:
             listener.bind(("127.0.0.1", 0))
             port = listener.getsockname()[1]
-        process = subprocess.Popen(
+        with subprocess.Popen(
             [self.programs / words[0], *words[1:], "--port", str(port)],
             cwd=self.folder,
             env=self.environment | {"PYTHONUNBUFFERED": "1"},
             text=True,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-        )
-        assert process.stdout is not None
-        said = ""
-        for line in process.stdout:
-            said += line
-            if line.startswith("viewer: "):
-                with urllib.request.urlopen(line.split()[1], timeout=PATIENCE) as answer:
-                    assert b"<html" in answer.read().lower()
-                process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 130, said
+        ) as process:
+            assert process.stdout is not None
+            said = ""
+            for line in process.stdout:
+                said += line
+                if line.startswith("viewer: "):
+                    with urllib.request.urlopen(line.split()[1], timeout=PATIENCE) as answer:
+                        assert b"<html" in answer.read().lower()
+                    process.send_signal(signal.SIGINT)
+        assert process.returncode == 130, said
 
     def set_aside(self, names: list[str]) -> list[str]:
         """Make room for outputs: those that are there already move away; returns their names."""
