@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--record", type=Path, required=True)
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--steps", type=int, default=1200)
-    parser.add_argument("--folds", type=int, default=7)
+    parser.add_argument("--folds", type=int, default=3)
     parser.add_argument("--choices", type=int, default=3)
     parser.add_argument("--most", type=int, default=10_000, help="searches to make before it ends")
     options = parser.parse_args()
