@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--pack", type=Path, default=ROOT / "gpu-pack")
     parser.add_argument("--out", type=Path, default=ROOT / "gpu-check")
     parser.add_argument(
-        "--results", type=Path, default=None, help="the JSON; benchmarks/results/gpu-NAME.json"
+        "--results", type=Path, default=None, help="the JSON; benchmarks/records/gpu-NAME.json"
     )
     parser.add_argument("--minutes", type=float, default=7.5, help="of this call")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
@@ -69,7 +69,7 @@ def main() -> None:
         if not read(arguments.out, part).get("finished"):
             break
     results = {part: read(arguments.out, part) for part in PARTS}
-    path = arguments.results or ROOT / "benchmarks" / "results" / f"gpu-{machine(results)}.json"
+    path = arguments.results or ROOT / "benchmarks" / "records" / f"gpu-{machine(results)}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(results, indent=1) + "\n")
     print(table(results))
