@@ -243,7 +243,7 @@ def test_without_mitsuba_nothing_is_begun(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(PolarguideError, match="[Ii]nstall.* install "):
+    with pytest.raises(PolarguideError, match=r"[Ii]nstall.* install "):
         run_bench(tmp_path / "out", RENDER, bench=bench)
     assert not (tmp_path / "out").exists()
 

@@ -167,7 +167,7 @@ def test_auto_says_why_it_leaves_a_gpu_alone(monkeypatch: pytest.MonkeyPatch) ->
     said: list[str] = []
     assert choose_backend("auto", say=said.append).device == torch.device("cpu")
     assert "gsplat" in said[0]
-    with pytest.raises(PolarguideError, match="Install it with .*install"):
+    with pytest.raises(PolarguideError, match=r"Install it with .*install"):
         choose_backend("cuda")
 
 
