@@ -171,3 +171,9 @@ def test_a_table_that_is_written_can_be_read(tmp_path: Path) -> None:
     path = tmp_path / "angles.csv"
     path.write_text(table_text((f"{k}.png", "a", e, 0.5 if k else None, "") for k, e in enumerate(exposures)))
     assert [item.exposure for item in read_table(path)] == exposures
+
+
+def test_a_table_of_an_earlier_training_can_be_read(tmp_path: Path) -> None:
+    (tmp_path / "angles.csv").write_text("file,view,angle,gain,certainty\na.png,a,10,1.0000,0.90\n")
+    (line,) = read_table(tmp_path / "angles.csv")
+    assert line.exposure.angle == 10.0

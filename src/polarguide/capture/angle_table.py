@@ -19,6 +19,8 @@ UNKNOWN, NONE = "unknown", "none"
 _COLUMNS = ("file", "view", "angle")
 _MORE = ("gain", "modulation", "note")
 """Further columns; the last two are what a training says of its pictures, and are passed over."""
+_EARLIER = "certainty"
+"""What runs of earlier versions call the modulation; their tables stay in use."""
 _LARGEST = 1 << 26
 _LEAST_GAIN = 1e-6
 """A camera exposes over some thirty stops; less leaves no numbers in single precision."""
@@ -80,7 +82,7 @@ def read_table(path: Path, data: bytes | None = None) -> list[Listed]:
 
 def _header(path: Path, row: list[str]) -> list[str]:
     named = [cell.lower() for cell in row]
-    wrong = [name for name in named if name not in (*_COLUMNS, *_MORE)]
+    wrong = [name for name in named if name not in (*_COLUMNS, *_MORE, _EARLIER)]
     if wrong or not set(_COLUMNS) <= set(named) or len(set(named)) < len(named):
         raise PolarguideError(
             f"{path} (line 1)",
