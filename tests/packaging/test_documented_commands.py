@@ -50,7 +50,7 @@ SHORT = {
     "prepare": [],
     "inspect": ["--steps", "50"],
     "inspect --fix": [],  # its decision takes a trained model
-    "train": ["--steps", str(STEPS), "--downscale", "2"],
+    "train": ["--steps", str(STEPS)],
     "eval": [],
     "view": [],
     "render": [],
