@@ -145,7 +145,12 @@ def test_truth_that_some_views_lack_is_said_before_anything_is_trained(
     told = json.loads((scene / "split.json").read_text())["test"]
     (scene / "gt" / f"{told[0]}.npz").unlink()
     question = asked(
-        scenes=(scene,), recipes=(recipe_named("3dgs"),), seeds=1, downscale=4, out=tmp_path / "out"
+        scenes=(scene,),
+        recipes=(recipe_named("3dgs"),),
+        settings=TrainSettings(40, refractive_index=1.5),
+        seeds=1,
+        downscale=4,
+        out=tmp_path / "out",
     )
     reporter = Heard()
     entries = scene_entries(question, reporter)

@@ -35,7 +35,7 @@ from polarguide.runs.folder import (
 )
 from polarguide.runs.train import TrainingStopped
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import ResolvedSettings, TrainSettings
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import first_state
 
@@ -161,7 +161,7 @@ def configuration() -> RunConfiguration:
         scene_digest="abc",
         recipe=recipe.name,
         recipe_data=recipe.data(),
-        settings=TrainSettings(100, 5, 1.4),
+        settings=ResolvedSettings(steps=100, seed=5, refractive_index=1.4),
         downscale=2,
         transfer="linear",
         device="cpu",

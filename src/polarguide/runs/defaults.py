@@ -30,7 +30,7 @@ def resolve(
     settings: TrainSettings,
     scene: Scene,
     method: Method,
-    resumed: TrainSettings | None = None,
+    resumed: ResolvedSettings | None = None,
     *,
     processes: int = 1,
 ) -> ResolvedSettings:

@@ -35,7 +35,7 @@ class TrainSettings:
 
     Attributes:
         steps: Optimizer steps in all. 3,000 show the scene, 5,000 and more settle it. None: 5,000, 60 visits to each
-            view where that is more, and twice as many for pictures over a megapixel.
+            view where that is more, and twice as many for pictures over a megapixel; the recipe's number for a field.
         seed: Seed of every random draw.
         refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water. None: that of
             scene.json, and 1.5 where it has none.
