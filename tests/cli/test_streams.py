@@ -90,6 +90,35 @@ def test_a_machine_without_room_is_one_line(
     assert words in capsys.readouterr().err
 
 
+FULL = """
+import resource, sys
+from polarguide.cli import app
+
+def fill(*_):
+    size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (size + (64 << 20), resource.RLIM_INFINITY))
+    held = []
+    for piece in (1 << 20, 1 << 10):
+        try:
+            while True:
+                held.append(bytearray(piece))
+        except MemoryError as error:
+            last = error
+    raise last
+
+app._call = fill
+sys.exit(app.run(["eval", "run"]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it limits the address space as Linux does")
+def test_memory_that_a_command_holds_is_free_again_for_the_line_that_says_so() -> None:
+    ended = subprocess.run([sys.executable, "-c", FULL], capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 2, ended.stderr
+    (line,) = ended.stderr.splitlines()
+    assert line.startswith("error: memory: expected enough of it")
+
+
 @pytest.mark.parametrize("error", [RuntimeError("a fault of ours"), ModuleNotFoundError("no such module")])
 def test_faults_of_ours_are_not_hidden(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> int:

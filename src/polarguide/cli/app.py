@@ -100,12 +100,13 @@ def run(arguments: Sequence[str]) -> int:
         said = _of_the_machine(error)
         if not said:
             raise
+        traceback.clear_frames(error.__traceback__)  # they hold the memory, and printing takes some
         return _failed(said)
     return status
 
 
 def _errors() -> Console:
-    return Console(stderr=True, highlight=False, soft_wrap=True)
+    return Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 
 
 def _stopped() -> int:
