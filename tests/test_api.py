@@ -71,6 +71,16 @@ def test_every_public_name_is_there() -> None:
         _ = polarguide.nothing
 
 
+def test_runs_open_and_render_in_inference_mode(trained: Path) -> None:
+    run = polarguide.open_run(trained)
+    expected = run.render("v000", run.layers)
+    with torch.inference_mode():
+        within = polarguide.open_run(trained)
+        rendered = [run.render("v000", run.layers), within.render("v000", run.layers)]
+    for layers in (*rendered, within.render("v000", run.layers)):
+        assert all(torch.equal(layers[name], expected[name]) for name in run.layers)
+
+
 def test_training_is_silent_and_tells_the_reporter(
     demo_scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -233,13 +233,17 @@ def test_nothing_lets_a_process_keep_more_than_its_limit(monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("libc", [OSError(), TypeError(), object()], ids=["none", "Windows", "another"])
 def test_elsewhere_the_allocator_is_left_alone(libc: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+
     def load(name: None) -> object:
+        asked.append(libc)
         if isinstance(libc, Exception):
             raise libc
         return libc
 
     monkeypatch.setattr(system.ctypes, "CDLL", load)
     keep_freed_memory()
+    assert asked == [libc]  # and of what came nothing more: it has no such function
 
 
 def test_memory_that_holds_files_is_free(tmp_path: Path) -> None:

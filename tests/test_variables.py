@@ -9,32 +9,28 @@ from polarguide.variables import check_variables
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("name", "value", "refused"),
     [
-        ("POLARGUIDE_THREADS", "1000000000"),
-        ("POLARGUIDE_THREADS", "1025"),
-        ("OPENCV_IO_MAX_IMAGE_PIXELS", "many"),
-        ("OPENCV_IO_MAX_IMAGE_WIDTH", "-1"),
-        ("OPENCV_IO_MAX_IMAGE_HEIGHT", "1e6"),
-        ("OPENCV_IMGCODECS_WEBP_MAX_FILE_SIZE", "64 MB"),
+        ("POLARGUIDE_THREADS", "1000000000", True),
+        ("POLARGUIDE_THREADS", "1025", True),
+        ("POLARGUIDE_THREADS", "1024", False),
+        ("POLARGUIDE_THREADS", "many", False),  # passed over
+        ("OPENCV_IO_MAX_IMAGE_PIXELS", "many", True),
+        ("OPENCV_IO_MAX_IMAGE_PIXELS", "1099511627776", False),
+        ("OPENCV_IO_MAX_IMAGE_PIXELS", "64MB", False),
+        ("OPENCV_IO_MAX_IMAGE_WIDTH", "-1", True),
+        ("OPENCV_IO_MAX_IMAGE_HEIGHT", "1e6", True),
+        ("OPENCV_IMGCODECS_WEBP_MAX_FILE_SIZE", "64 MB", True),
+        ("OPENCV_LOG_LEVEL", "SILENT", False),
     ],
 )
-def test_refused(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+def test_what_would_end_the_process_is_refused(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, refused: bool
+) -> None:
     monkeypatch.setenv(name, value)
-    with pytest.raises(PolarguideError, match=f"the variable {name}: expected"):
+    try:
         check_variables()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("POLARGUIDE_THREADS", "1024"),
-        ("POLARGUIDE_THREADS", "many"),  # passed over
-        ("OPENCV_IO_MAX_IMAGE_PIXELS", "1099511627776"),
-        ("OPENCV_IO_MAX_IMAGE_PIXELS", "64MB"),
-        ("OPENCV_LOG_LEVEL", "SILENT"),
-    ],
-)
-def test_taken(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
-    monkeypatch.setenv(name, value)
-    check_variables()
+        found = None
+    except PolarguideError as error:
+        found = error.where
+    assert found == (f"the variable {name}" if refused else None)

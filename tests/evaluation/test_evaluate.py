@@ -13,6 +13,7 @@ from heard import Heard
 
 from polarguide.api import Run, open_run
 from polarguide.errors import PolarguideError
+from polarguide.evaluation import evaluate
 
 
 @pytest.fixture
@@ -72,6 +73,28 @@ def test_a_scene_without_ground_truth_has_its_stokes_error(changed: tuple[Path, 
     ):
         assert record[key] is None, key
     assert (folder / "errors.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("peaks", "expected"),
+    [
+        ([500.0, 700.0], (700.0, None)),
+        ([500.0, 500.0], (None, "the process had held more memory before it scored")),
+        ([None, None], (None, "the system does not tell")),
+    ],
+)
+def test_peak_memory_is_that_of_scoring(
+    trained: Path,
+    tmp_path: Path,
+    peaks: list[float | None],
+    expected: tuple[float | None, str | None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(evaluate, "peak_memory_mib", iter(peaks).__next__)
+    run = open_run(shutil.copytree(trained, tmp_path / "run"))
+    record = run.evaluate()
+    assert (record["peak_memory_mib"], record["peak_memory_mib_reason"]) == expected
+    assert run.metrics()["peak_memory_mib_reason"] == expected[1]
 
 
 def test_a_table_of_objects_that_is_wrong(changed: tuple[Path, Path]) -> None:

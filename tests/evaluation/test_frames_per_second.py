@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import pytest
@@ -13,20 +12,46 @@ from polarguide.evaluation.evaluate import frames_per_second
 VIEWS: Any = ["a", "b", "c", "d"]
 
 
-@pytest.mark.parametrize(("most", "calls"), [(10.0, 16), (0.16, 4)])
-def test_slow_pictures_are_drawn_less_often(monkeypatch: pytest.MonkeyPatch, most: float, calls: int) -> None:
-    monkeypatch.setattr(evaluate, "MINIMUM_SECONDS", 0.0)
+class Clock:
+    """Time that passes only while a view is drawn, half a second for each but the slower first one."""
+
+    def __init__(self) -> None:
+        self.now, self.drawn = 0.0, list[Any]()
+
+    def draw(self, view: Any) -> None:
+        self.drawn.append(view)
+        self.now += 0.75 if view == "a" else 0.5
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    found = Clock()
+    monkeypatch.setattr(evaluate, "time", found)
+    monkeypatch.setattr(evaluate.Stopwatch, "read", lambda self: (found.now, True))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "drawn", "speed"),
+    [
+        (0.0, 40.0, VIEWS * 4, 2.0),  # a warm-up, and three times each
+        (10.0, 40.0, VIEWS * 6, 2.0),  # until it has taken long enough
+        (0.0, 2.9, ["a", *VIEWS[:3]], 2.0),  # those that fit, once
+        (0.0, 0.1, ["a", "a"], 1 / 0.75),
+    ],
+)
+def test_slow_pictures_are_drawn_less_often(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch, least: float, most: float, drawn: list[str], speed: float
+) -> None:
+    monkeypatch.setattr(evaluate, "MINIMUM_SECONDS", least)
     monkeypatch.setattr(evaluate, "MOST_SECONDS", most)
-    drawn: list[Any] = []
+    assert frames_per_second(clock.draw, VIEWS) == pytest.approx(speed)
+    assert clock.drawn == drawn
 
-    def draw(view: Any) -> None:
-        time.sleep(0.05)
-        drawn.append(view)
 
-    speed = frames_per_second(draw, VIEWS)
-    assert speed is None or speed > 0
-    if most > 1:
-        assert drawn == [*VIEWS, *VIEWS, *VIEWS, *VIEWS]
-    else:
-        assert drawn[0] == "a"
-        assert 2 <= len(drawn) <= calls
+def test_beside_other_work_there_is_no_speed(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluate.Stopwatch, "read", lambda self: (clock.now, False))
+    assert frames_per_second(clock.draw, VIEWS) is None

@@ -24,7 +24,7 @@ from polarguide.runs.point_cloud import shown_colors, write_run_ply
 from polarguide.shading.conversion import convert, mirror_base, scale_light, spread_directions
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
-from polarguide.shading.metal import FIRST_ROUGHNESS, any_metal, metal_pixels, reflectance, reflectance_logits
+from polarguide.shading.metal import FIRST_ROUGHNESS, any_nonzero, metal_pixels, reflectance, reflectance_logits
 from polarguide.shading.model import mirrored
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
@@ -222,12 +222,17 @@ def test_held_layers_send_normals_nothing() -> None:
 
 def test_whether_there_is_metal_follows_every_change() -> None:
     metalness = torch.zeros(5)
-    assert not any_metal(metalness)
+    assert not any_nonzero(metalness)
     metalness[2] = 1
-    assert any_metal(metalness)
+    assert any_nonzero(metalness)
     metalness.zero_()
-    assert not any_metal(metalness)
-    assert any_metal(torch.ones(5))
+    assert not any_nonzero(metalness)
+    assert any_nonzero(torch.ones(5))
+    with torch.inference_mode():
+        counted = torch.zeros(5)
+        assert not any_nonzero(counted)
+        counted[2] = 1
+        assert any_nonzero(counted)
 
 
 def test_reflectances_come_back_from_their_parameter() -> None:

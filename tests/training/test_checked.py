@@ -121,9 +121,11 @@ def test_the_third_scalar_of_the_first_checkpoints_is_let_through(
 ) -> None:
     tensors = stepped(tiny_scene, busy_recipe).tensors()
     for flag in (0, 1):
-        refuse_foreign(
-            {**tensors, "scalars": torch.cat((tensors["scalars"], torch.tensor([flag])))}, busy_recipe
-        )
+        older = {**tensors, "scalars": torch.cat((tensors["scalars"], torch.tensor([flag])))}
+        refuse_foreign(older, busy_recipe)
+        loaded = TrainingState.from_tensors(older, busy_recipe).tensors()
+        assert loaded.keys() == tensors.keys()
+        assert all(torch.equal(loaded[name], tensors[name]) for name in tensors)
 
 
 def test_signs_and_lengths(tiny_scene: Scene, busy_recipe: Recipe) -> None:

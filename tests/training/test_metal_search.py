@@ -14,7 +14,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
-from polarguide.shading.metal import any_metal
+from polarguide.shading.metal import any_nonzero
 from polarguide.training.metals.decision import decide
 from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.words import contradicted, said_by
@@ -50,7 +50,7 @@ def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path
     settings = TrainSettings(60, 3)
     whole = trainer_of(scene, settings, heard)
     whole.run(lambda _: None, until=until)
-    assert any_metal(whole.state.gaussians["metalness"])
+    assert any_nonzero(whole.state.gaussians["metalness"])
     assert not heard
     save_checkpoint(tmp_path, whole.state)
     whole.run(lambda _: None)
@@ -66,7 +66,7 @@ def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path
 def test_dielectric_turns_the_search_off(tiny_scene: Scene) -> None:
     trainer = trainer_of(with_materials(tiny_scene, 2), TrainSettings(60, 3, materials="dielectric"), [])
     trainer.run(lambda _: None)
-    assert not any_metal(trainer.state.gaussians["metalness"])
+    assert not any_nonzero(trainer.state.gaussians["metalness"])
 
 
 @pytest.mark.parametrize("minimum", [1, 1000])

@@ -37,6 +37,7 @@ from polarguide.training.stopwatch import Stopwatch
 
 MINIMUM_SECONDS = 1.5
 MOST_SECONDS = 40.0
+HELD_MORE = "the process had held more memory before it scored"
 NOT_ALONE = "other work ran on the machine meanwhile"
 
 
@@ -54,6 +55,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
     Raises:
         PolarguideError: the scene cannot be read, or has no test views.
     """
+    held_before = peak_memory_mib()
     tests = run.scene.test_views
     if not tests:
         raise PolarguideError(
@@ -76,7 +78,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
             views[view.name] = _score(run, view, facts, by_object, sheet)
             advance(len(views))
     sheet.write(run.folder / ERRORS_FILE)
-    memory = peak_memory_mib()  # before the mesh, which is no part of what a run needs
+    memory = _peak(held_before)  # before the mesh, which is no part of what a run needs
     with reporter.track("measuring the mesh"):
         mesh = mesh_scores(lambda: _surface(run), tests)
     objects, materials = by_object.records()
@@ -93,7 +95,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
             "train_seconds_reason": None if alone and seconds > 0 else "no log of it" if alone else NOT_ALONE,
             "gaussians": run.model.gaussians,
             "steps": run.steps,
-            "peak_memory_mib": memory,
+            **memory,
             **mesh,
         },
         objects=objects,
@@ -117,6 +119,16 @@ def _score(
         in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
     sheet.add(view, target, result, stokes)
     return score_view(target, result, stokes=stokes, in_front=in_front, by_object=by_object)
+
+
+def _peak(before: float | None) -> dict[str, Any]:
+    """The most memory that this process has held since it had held ``before`` at most, in MiB."""
+    peak = peak_memory_mib()
+    if peak is None or before is None:
+        return {"peak_memory_mib": None, "peak_memory_mib_reason": "the system does not tell"}
+    if peak == before:  # as after a training in this process
+        return {"peak_memory_mib": None, "peak_memory_mib_reason": HELD_MORE}
+    return {"peak_memory_mib": peak, "peak_memory_mib_reason": None}
 
 
 def _surface(run: OpenedRun) -> Surface:

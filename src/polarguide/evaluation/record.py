@@ -46,7 +46,7 @@ _REASONS: list[tuple[str, Any, Any]] = [
     *((key, float | None, None) for key in _LATER),
     *((f"{key}_reason", str | None, None) for key in ("lpips", "flip", "stokes_error")),
 ]
-_RUN_REASONS = [(f"{key}_reason", str | None, None) for key in ("fps", "train_seconds", "mesh_fscore_1")]
+_RUN_REASONS = [(f"{key}_reason", str | None, None) for key in ("fps", "train_seconds", "peak_memory_mib", "mesh_fscore_1")]
 _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
 
 
@@ -99,7 +99,7 @@ def write_metrics(
     Args:
         path: the file; its folder must exist.
         views: the scores by view name, at least one.
-        run: values of ``RUN_METRICS`` by key, null where left out, and ``fps_reason`` and ``train_seconds_reason``.
+        run: values of ``RUN_METRICS`` by key, null where left out, and the reasons of what is null, as ``fps_reason``.
         provenance: the keys of ``Provenance``, and others as you like.
         objects, materials: errors by object and by class of material, as of ``ErrorsByObject.records``.
 

@@ -24,8 +24,8 @@ from polarguide.evaluation.metrics import layer_error, normal_mae_deg, normal_wi
 from polarguide.evaluation.target import ViewTarget
 
 HIGHEST_PSNR = 100.0
-MESH_LABEL = "mesh F-score 1 %"
 """What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
+MESH_LABEL = "mesh F-score 1 %"
 
 Layers = Mapping[str, Tensor | None]
 """Rendered layers of a view by name: ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, the

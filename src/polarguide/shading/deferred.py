@@ -26,8 +26,7 @@ from polarguide.shading.metal import (
     FIRST_ROUGHNESS,
     MINIMUM_SHARE,
     MetalPixels,
-    any_given,
-    any_metal,
+    any_nonzero,
     metal_channels,
     metal_mips,
     metal_pixels,
@@ -243,7 +242,7 @@ class DeferredShading(ShadingModel):
 
     def _has_indices(self, gaussians: Parameters) -> bool:
         """Whether one of the Gaussians has a refractive index of its own."""
-        return self.indices and any_given(gaussians["index_offset"])
+        return self.indices and any_nonzero(gaussians["index_offset"])
 
     @property
     def knows_metals(self) -> bool:
@@ -259,9 +258,9 @@ class DeferredShading(ShadingModel):
         gain: Callable[[], float],
     ) -> None:
         """See ``ShadingModel`` and ``shading.conversion``."""
-        first = not any_metal(gaussians["metalness"])
+        first = not any_nonzero(gaussians["metalness"])
         fresh = convert(gaussians, metal, reflectance)
-        if not any_metal(gaussians["metalness"]):
+        if not any_nonzero(gaussians["metalness"]):
             return
         if first:
             scale_light(gaussians, light["texels"], gain())
@@ -270,7 +269,7 @@ class DeferredShading(ShadingModel):
 
     def _has_metal(self, gaussians: Parameters) -> bool:
         """Whether one of the Gaussians is a metal; without, everything is as if there could be none."""
-        return self.metal and any_metal(gaussians["metalness"])
+        return self.metal and any_nonzero(gaussians["metalness"])
 
     @staticmethod
     def _metals(gaussians: Parameters) -> Tensor:

@@ -13,7 +13,6 @@ environment blurred by the roughness (its mips), and l the light of the Gaussian
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -35,8 +34,6 @@ CHANNELS = 5
 # Pixels with less of a metal than this are shaded as dielectrics alone.
 MINIMUM_SHARE = 0.01
 
-_known: dict[int, tuple[weakref.ref[Tensor], int, bool]] = {}
-
 
 class MetalPixels(NamedTuple):
     """What metals add to a picture of P pixels.
@@ -54,24 +51,20 @@ class MetalPixels(NamedTuple):
     slope: Tensor
 
 
-def any_metal(metalness: Tensor) -> bool:
-    """Whether one Gaussian is a metal; see ``any_given``."""
-    return any_given(metalness)
+def any_nonzero(values: Tensor) -> bool:
+    """Whether a value of a tensor that is not trained is other than 0; False of a tensor without values.
 
-
-def any_given(values: Tensor) -> bool:
-    """Whether a value of a tensor that is not trained is other than 0; False of a tensor without values. The device is
-    asked once for each state of a tensor: after a change of the values, and when Gaussians come or go.
+    The device is asked once for each state of the tensor, which keeps the answer: after a change of its values, and when
+    Gaussians come or go. Tensors of ``torch.inference_mode`` do not count their changes: they are read each time.
     """
     if values.is_meta:
         return False
-    kept = _known.get(id(values))
-    if kept is not None and kept[0]() is values and kept[1] == values._version:
-        return kept[2]
-    found = bool((values != 0).any())
-    key = id(values)
-    _known[key] = (weakref.ref(values, lambda _: _known.pop(key, None)), values._version, found)
-    return found
+    version = None if values.is_inference() else values._version
+    kept = getattr(values, "_polarguide_nonzero", None)
+    if kept is None or version is None or kept[0] != version:
+        kept = version, bool((values != 0).any())
+        values._polarguide_nonzero = kept  # type: ignore[attr-defined]
+    return bool(kept[1])
 
 
 def reflectance(logits: Tensor) -> Tensor:

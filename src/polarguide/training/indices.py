@@ -11,7 +11,7 @@ from polarguide._native import MAX_CHANNELS
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.raster import Rasterize
-from polarguide.shading.metal import any_given
+from polarguide.shading.metal import any_nonzero
 from polarguide.shading.model import Parameters
 from polarguide.shading.splatting import splats
 from polarguide.system import UNBOUNDED, MemoryBound
@@ -74,6 +74,6 @@ def index_picture(
 ) -> Tensor | None:
     """Refractive indices [H, W] as blended; None where all Gaussians have the run's."""
     offsets = gaussians.get("index_offset")
-    if offsets is None or not any_given(offsets):
+    if offsets is None or not any_nonzero(offsets):
         return None
     return refractive_index + rasterize(splats(gaussians, offsets[:, None]), camera).features[..., 0]

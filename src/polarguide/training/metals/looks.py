@@ -13,7 +13,7 @@ from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
-from polarguide.shading.metal import any_metal
+from polarguide.shading.metal import any_nonzero
 from polarguide.shading.model import Parameters
 from polarguide.shading.splatting import splats
 from polarguide.training.priors import guide_normals
@@ -95,7 +95,7 @@ def seen_of(looks: Sequence[Tensor], which: slice) -> Seen:
 def metalness_share(gaussians: Parameters, camera: Camera, rasterize: Rasterize) -> Tensor | None:
     """Blended metalness [H, W]; None where no Gaussian is a metal, or none can be."""
     metalness = gaussians.get("metalness")
-    if metalness is None or not any_metal(metalness):
+    if metalness is None or not any_nonzero(metalness):
         return None
     with torch.no_grad():
         return rasterize(splats(gaussians, metalness[:, None]), camera).features[..., 0]
