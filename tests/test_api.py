@@ -226,6 +226,15 @@ def test_a_changed_recipe_is_warned_of_on_opening(copy: Path) -> None:
         polarguide.open_run(copy)
 
 
+@pytest.mark.parametrize("place", ["", "settings"])
+def test_a_run_with_a_setting_that_is_not_known_is_refused(copy: Path, place: str) -> None:
+    record = json.loads((copy / CONFIGURATION).read_text())
+    edit(copy, **({place: record[place] | {"twice": True}} if place else {"twice": True}))
+    with pytest.raises(polarguide.PolarguideError, match=r"expected only .*, found twice") as error:
+        polarguide.open_run(copy)
+    assert error.value.where.endswith(f"({place}.twice)" if place else "(twice)")
+
+
 @pytest.mark.parametrize("version", ["0.1.0", "0.1.7", "9.0.0"])
 def test_a_run_of_another_version_is_refused_with_what_to_do(copy: Path, version: str) -> None:
     edit(copy, version=version, unknown_then=3)

@@ -60,16 +60,23 @@ def test_a_current_folder_that_is_no_more_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [["train", "scene", "--out="], ["train", "scene", "--out", ""], ["train", "", "--out", "x"], ["eval", ""],
-     ["measure", "a", "", "--out", "x"], ["prepare", "a", "--out", "x", "--dark-frame="], ["share", "run", "--out", ""],
-     ["priors", "a", "--out="], ["compare", "", "--recipes", "3dgs", "--out", "x"]],
+    [["train", "scene", "--out=?"], ["train", "scene", "--out", "?"], ["train", "?", "--out", "x"], ["eval", "?"],
+     ["measure", "a", "?", "--out", "x"], ["prepare", "a", "--out", "x", "--dark-frame=?"],
+     ["share", "run", "--out", "?"], ["priors", "a", "--out=?"], ["compare", "?", "--recipes", "3dgs", "--out", "x"],
+     ["render", "run", "--out", "?"], ["export", "run", "--out=?"], ["demo", "--out", "?"]],
 )  # fmt: skip
-def test_an_empty_name_is_not_the_current_folder(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("name", "found"), [("", "an empty one"), ("a\0b", "a null byte")])
+def test_what_names_nothing_is_not_the_current_folder(
+    words: list[str],
+    name: str,
+    found: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(words) == 2
-    assert "expected the name of a file or folder, found an empty one" in capsys.readouterr().err
+    assert run([word.replace("?", name) for word in words]) == 2
+    assert f"expected the name of a file or folder, found {found}" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -45,11 +45,13 @@ def test_a_folder_without_pictures(refused, tmp_path: Path) -> None:
     ("flag", "value"),
     [
         ("--steps", -3),
+        ("--steps", 0),
         ("--gaussians", -1),
         ("--checkpoint-every", 0),
         ("--downscale", 0),
         ("--downscale", 1000),
         ("--threads", -1),
+        ("--refractive-index", 0),
         ("--refractive-index", 1.0),
         ("--refractive-index", "nan"),
         ("--refractive-index", 9),

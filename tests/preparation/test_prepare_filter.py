@@ -13,7 +13,7 @@ import pytest
 from camera_files import ANGLES, behind, busy_light, read_invalid, read_polar, smooth_light, write_shots
 from tiny_capture import encode_srgb, write_picture
 
-from polarguide.capture.filter.align import estimate_shifts
+from polarguide.capture.filter.align import Shift, estimate_shifts
 from polarguide.capture.filter.exif import apply_orientation, orientation
 from polarguide.capture.filter.shots import find_shots
 from polarguide.errors import PolarguideError
@@ -207,6 +207,15 @@ def test_exposures_that_differ_from_shot_to_shot(tmp_path: Path) -> None:
         assert record["pair_ratio"] == pytest.approx(factor, abs=1e-3)
         expected = light * np.sqrt(factor) * found["scale"]
         np.testing.assert_allclose(read_polar(tmp_path / "out", view), expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 400), (400, 1)])
+def test_shots_without_detail_are_not_shifted(tmp_path: Path, size: tuple[int, int]) -> None:
+    light = behind(np.tile([0.5, 0.1, 0.1], (3, *size, 1)).transpose(3, 1, 2, 0))
+    assert estimate_shifts(light.astype(np.float32)) == [Shift(0, 0, True), *[Shift(0, 0, False)] * 3]
+    write_shots(tmp_path / "in", "v", light)
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, align=True))
+    assert done.views == ["v"]
 
 
 def test_saturated_and_black_pixels_are_invalid(tmp_path: Path) -> None:

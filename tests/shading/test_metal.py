@@ -24,7 +24,13 @@ from polarguide.runs.point_cloud import shown_colors, write_run_ply
 from polarguide.shading.conversion import convert, mirror_base, scale_light, spread_directions
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
-from polarguide.shading.metal import FIRST_ROUGHNESS, any_nonzero, metal_pixels, reflectance, reflectance_logits
+from polarguide.shading.metal import (
+    FIRST_ROUGHNESS,
+    any_nonzero,
+    metal_pixels,
+    reflectance,
+    reflectance_logits,
+)
 from polarguide.shading.model import mirrored
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms

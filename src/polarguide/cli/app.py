@@ -170,7 +170,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
     if verb is not None:
         _require_place()
         check_variables()
-        _refuse_empty_paths(verb, arguments[1:])
+        _refuse_paths(verb, arguments[1:])
         words = _sizes_as_numbers(arguments[1:])
         found = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=words)
         return found if isinstance(found, int) else 0
@@ -201,8 +201,9 @@ def _require_place() -> None:
         ) from None
 
 
-def _refuse_empty_paths(verb: str, words: Sequence[str]) -> None:
-    """Refuse empty names of files and folders, as unset variables of a shell leave them: they would mean this folder.
+def _refuse_paths(verb: str, words: Sequence[str]) -> None:
+    """Refuse what names no file or folder: null bytes, and empty texts, as unset variables of a shell leave them, which
+    would mean this folder.
 
     Raises:
         PolarguideError: there is one.
@@ -210,12 +211,12 @@ def _refuse_empty_paths(verb: str, words: Sequence[str]) -> None:
     paths = {
         _flag(name) for name, kind in options_of(function_of(verb)).items() if Path in (kind, *get_args(kind))
     }
-    for place in _empty_words(words):
-        if place in paths or not place.startswith("--"):
+    for place, value in _named_values(words):
+        if (not value or "\0" in value) and (place in paths or not place.startswith("--")):
             raise PolarguideError(
                 place or "the command line",
                 expected="the name of a file or folder",
-                found="an empty one",
+                found="a null byte" if value else "an empty one",
                 remedy="Name it; . is the current folder.",
             )
 
@@ -234,15 +235,15 @@ def _sizes_as_numbers(words: Sequence[str]) -> list[str]:
     return found
 
 
-def _empty_words(words: Sequence[str]) -> Iterator[str]:
-    """The options that are given nothing; an empty text for a word that follows none."""
+def _named_values(words: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """The option that each word is a value of, or an empty text, and the value."""
     before = ""
     for word in words:
         name, equals, value = word.partition("=")
-        if not word:
-            yield before if before.startswith("--") else ""
-        elif equals and not value and name.startswith("--"):
-            yield name
+        if equals and name.startswith("--"):
+            yield name, value
+        elif not word.startswith("--"):
+            yield before if before.startswith("--") else "", word
         before = word
 
 

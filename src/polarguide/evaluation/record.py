@@ -46,7 +46,10 @@ _REASONS: list[tuple[str, Any, Any]] = [
     *((key, float | None, None) for key in _LATER),
     *((f"{key}_reason", str | None, None) for key in ("lpips", "flip", "stokes_error")),
 ]
-_RUN_REASONS = [(f"{key}_reason", str | None, None) for key in ("fps", "train_seconds", "peak_memory_mib", "mesh_fscore_1")]
+_RUN_REASONS = [
+    (f"{key}_reason", str | None, None)
+    for key in ("fps", "train_seconds", "peak_memory_mib", "mesh_fscore_1")
+]
 _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
 
 

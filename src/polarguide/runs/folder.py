@@ -118,7 +118,18 @@ class RunConfiguration:
                 found=f"one of version {written}",
                 remedy=f"Train again into a new folder, or open it with polarguide {_series(written)}.",
             )
-        return decode(data, cls, path, remedy=remedy)
+        found = decode(data, cls, path, remedy=remedy)
+        _refuse_unknown(decode(data, dict[str, Any], path, remedy=remedy), found, path, remedy)
+        return found
+
+
+def _refuse_unknown(data: dict[str, Any], found: RunConfiguration, path: Path, remedy: str) -> None:
+    """Refuse a record with more in it than is known: what was trained then may be something else."""
+    for place, values, of in (("", data, found), ("settings.", data["settings"], found.settings)):
+        known = [field.name for field in dataclasses.fields(of)]
+        for name in sorted(values.keys() - known):
+            where = f"{path} ({place}{name[:100]})"
+            raise PolarguideError(where, expected=f"only {', '.join(known)}", found=name[:100], remedy=remedy)
 
 
 @dataclass(frozen=True)

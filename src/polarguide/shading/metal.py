@@ -54,8 +54,8 @@ class MetalPixels(NamedTuple):
 def any_nonzero(values: Tensor) -> bool:
     """Whether a value of a tensor that is not trained is other than 0; False of a tensor without values.
 
-    The device is asked once for each state of the tensor, which keeps the answer: after a change of its values, and when
-    Gaussians come or go. Tensors of ``torch.inference_mode`` do not count their changes: they are read each time.
+    The device is asked once for each state of the tensor, which keeps the answer: again after a change of its values.
+    Tensors of ``torch.inference_mode`` do not count their changes: they are read each time.
     """
     if values.is_meta:
         return False

@@ -105,6 +105,8 @@ def _detail(shot: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
     height, width = reference.shape
+    if min(height, width) < 2:  # a window that fades out on both sides has no middle there
+        return Shift(0.0, 0.0, False)
     window = cv2.createHanningWindow((width, height), cv2.CV_32F)
     (x, y), _ = cv2.phaseCorrelate(reference, other, window)
     limit = LARGEST_SHARE * width
