@@ -26,7 +26,7 @@ from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_
 from polarguide.inspection.record import write_inspection
 from polarguide.inspection.settings import InspectSettings
 from polarguide.measurement.line import measure_shots
-from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOptions, VisitorOptions
+from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOptions, VisitorOptions, index_of
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
@@ -42,7 +42,7 @@ from polarguide.shots.exposures import find_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.write import FORMATS, WrittenShots, write_shots
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings, index_of
+from polarguide.training.settings import TrainSettings
 from polarguide.viewer import watch
 
 _OF_MAPS = ("full_well", "read_noise", "snr")

@@ -28,12 +28,16 @@ EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
 }
 """The packages that formats need: looked for before a run is loaded."""
 PathLike = str | os.PathLike[str]
+INDEX = 1.5
+"""Refractive index of glass, plastic and glaze, for scenes that name none."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 MOST = 10**9
 """The largest count that any option takes."""
 MOST_THREADS = 1024
+LEAST_MEMORY = 2**-10
+"""In GiB. Nothing fits into less; what is needed, the pictures say."""
 
 
 def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> None:
@@ -102,6 +106,11 @@ def gibibytes(text: str) -> float | None:
     return float(found["count"]) * units[found["unit"].lower()] / _BINARY["g"]
 
 
+def index_of(asked: float | None, scene: float | None = None) -> float:
+    """The refractive index that was asked for, else that of ``scene.json``, else ``INDEX``."""
+    return next((index for index in (asked, scene) if index is not None), INDEX)
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """How a scene folder is read.
@@ -110,19 +119,20 @@ class SceneOptions:
         downscale: Average the pictures over boxes of this many pixels first.
         transfer: How the files encode radiance. Polarization needs linear; srgb undoes the display curve of JPEGs.
         memory: The most memory to take, such as 4GB (a number alone is GiB): of training, all that the process takes;
-            elsewhere what the pictures take, as their headers state. 0 is 80 % of what is free.
+            elsewhere what the pictures take, as their headers state. Without it, 80 % of what is free.
         split: Which views are held out to be scored on where the scene has no split.json, one in eight: directions
             spreads them among the others, every-8th counts through the names.
     """
 
     downscale: int = 1
     transfer: Transfer = "linear"
-    memory: float = 0.0
+    memory: float | None = None
     split: Split = "directions"
 
     def __post_init__(self) -> None:
         check_count("downscale", self.downscale)
-        check_finite("memory", self.memory, 0.0, 1e6)
+        if self.memory is not None:
+            check_finite("memory", self.memory, LEAST_MEMORY, 1e6)
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ def test_a_folder_without_pictures(refused, tmp_path: Path) -> None:
         ("--downscale", 0),
         ("--downscale", 1000),
         ("--threads", -1),
+        ("--memory", 0),
         ("--refractive-index", 0),
         ("--refractive-index", 1.0),
         ("--refractive-index", "nan"),

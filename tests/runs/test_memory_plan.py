@@ -63,9 +63,9 @@ def test_pictures_leave_memory_before_targets_do(monkeypatch: pytest.MonkeyPatch
 def test_without_a_limit_what_is_free_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
     monkeypatch.setattr(memory, "free_memory", lambda: 10**9)
-    assert not plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=0).hold
+    assert not plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).hold
     monkeypatch.setattr(memory, "free_memory", lambda: None)
-    assert plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=0).kept is None
+    assert plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).kept is None
 
 
 @pytest.mark.parametrize(
@@ -93,12 +93,16 @@ def test_what_is_not_specified_follows_from_the_size_or_is_that_of_the_run_to_re
     pixels = sum(view.camera.width * view.camera.height for view in tiny_scene.train_views)
     assert (found.steps, found.gaussians) == (STEPS, int(pixels / STOKES.densification.pixels_each))
     assert found.views_per_step == 3
-    given = TrainSettings(7, 1, 1.7, 2, gaussians=9)
+    assert found.background == "scene"
+    given = TrainSettings(7, 1, 1.7, 2, "black", gaussians=9)
     assert vars(resolve(given, tiny_scene, STOKES, found)) == vars(given)
-    older = ResolvedSettings(steps=700, refractive_index=1.4, views_per_step=2, gaussians=50)
+    older = ResolvedSettings(
+        steps=700, refractive_index=1.4, views_per_step=2, gaussians=50, background="masked"
+    )
     assert resolve(asked, tiny_scene, STOKES, older) == older
     assert resolve(older, tiny_scene, STOKES) == older
-    assert resolve(asked, tiny_scene, STOKES, replace(older, gaussians=0)).gaussians == found.gaussians
+    first = resolve(asked, tiny_scene, STOKES, replace(older, gaussians=0, background="auto"))
+    assert (first.gaussians, first.background) == (found.gaussians, found.background)
 
 
 def test_the_refractive_index_is_the_one_asked_for_or_the_scenes(tiny_scene: Scene) -> None:
@@ -156,6 +160,9 @@ def test_what_is_found_once_of_all_views_is_not_forecast_for_each(
 
 def test_options_take_a_limit() -> None:
     assert SceneOptions(memory=2.5).memory == 2.5
+    assert SceneOptions().memory is None
+    with pytest.raises(PolarguideError, match=r"memory: expected .* found 0"):
+        SceneOptions(memory=0.0)
 
 
 def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -60,9 +60,17 @@ def test_a_training_takes_the_index_of_its_scene_and_goes_on_with_it(water: Path
         polarguide.train(
             water, run, settings=TrainSettings(3, refractive_index=1.5), reading=READING, resume=True
         )
+    record = json.loads((run / CONFIGURATION).read_text())
+    assert record["settings"]["background"] == "scene"
+    assert record["memory"]["peak"] > 0
+    # As the first versions recorded it.
+    del record["memory"]
+    record["settings"]["background"] = "auto"
+    (run / CONFIGURATION).write_text(json.dumps(record))
     opened = polarguide.train(water, run, settings=ASKED, reading=READING, resume=True)
     assert opened.steps == 3
     assert index_of(run) == 1.33
+    assert opened.configuration.settings.background == "scene"
 
 
 def test_without_settings_it_is_that_of_the_scene(water: Path, tmp_path: Path) -> None:

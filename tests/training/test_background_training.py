@@ -17,7 +17,7 @@ from polarguide.training import losses as losses_of_steps
 from polarguide.training.losses import coverage_loss
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import first_state
-from polarguide.training.trainer import Trainer, is_black
+from polarguide.training.trainer import Trainer
 
 BACKEND = choose_backend("cpu")
 
@@ -53,9 +53,11 @@ def test_the_mode_is_found_from_the_pictures_unless_it_is_given(
     tiny_scene: Scene, black_scene: Scene
 ) -> None:
     for scene, found in ((tiny_scene, False), (black_scene, True)):
-        assert is_black(scene, TrainSettings()) == found
-        assert not is_black(scene, TrainSettings(background="scene"))
-        assert is_black(scene, TrainSettings(background="black"))
+        for background, black in (("auto", found), ("scene", False), ("black", True), ("masked", True)):
+            made = trainer(scene, background)
+            assert made.black == black
+            if background == "auto":
+                assert made.settings.background == ("black" if found else "scene")
 
 
 @pytest.mark.parametrize("name", ["3dgs", "3dgs-dr", "ref-gs", "polarguide-stokes"])

@@ -22,14 +22,14 @@ READ = 4 * 3 * 2 * 3
 
 
 def check_memory(
-    layout: Layout, names: Sequence[str], *, factor: int, at_once: int, limit: float, hold: bool = True
+    layout: Layout, names: Sequence[str], *, factor: int, at_once: int, limit: float | None, hold: bool = True
 ) -> None:
     """Refuse pictures that do not fit into memory.
 
     Args:
         layout: the files. names: views to be read, with all their angles.
         factor: side of the boxes over which they are averaged. at_once: views that are read at a time.
-        limit: GiB that may be taken; 0: 80 % of what is free. hold: whether the pictures stay in memory.
+        limit: GiB that may be taken; None: 80 % of what is free. hold: whether the pictures stay in memory.
 
     Raises:
         PolarguideError: the least that suffices is more.
@@ -58,22 +58,23 @@ def require_memory_of_each(paths: Sequence[Path], pixel: int, what: str, *, reme
         require_memory(path, pixel * width * height, f"{what} of {width}x{height}", remedy=remedy)
 
 
-def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: float = 0.0) -> None:
+def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: float | None = None) -> None:
     """Refuse what takes more memory than there is.
 
     Args:
         where, what, remedy: for messages. needed: bytes, at least.
-        limit: GiB that may be taken; 0: 80 % of what is free.
+        limit: GiB that may be taken; None: 80 % of what is free.
 
     Raises:
         PolarguideError: that is less.
     """
-    free = free_memory()
-    if limit <= 0 and free is None:
+    if limit is not None:
+        allowed, whose = int(limit * GIBIBYTE), "as --memory allows"
+    elif (free := free_memory()) is not None:
+        allowed, whose = int(SHARE * free), f"{SHARE:.0%} of what is free"
+    else:
         return
-    allowed = int(limit * GIBIBYTE) if limit > 0 else int(SHARE * (free or 0))
     if needed > allowed:
-        whose = "as --memory allows" if limit > 0 else f"{SHARE:.0%} of what is free"
         raise PolarguideError(
             where,
             expected=f"pictures that take up to {allowed / GIBIBYTE:.1f} GiB, {whose}",

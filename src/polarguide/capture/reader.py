@@ -60,7 +60,7 @@ def load_scene(
     downscale: int = 1,
     transfer: str = "linear",
     views: Sequence[str] | None = None,
-    memory: float = 0.0,
+    memory: float | None = None,
     split: Split = "directions",
     test_views: Sequence[str] | None = None,
     hold: bool = True,
@@ -80,7 +80,7 @@ def load_scene(
             only where all of its box is; it is invalid or saturated where any of it is.
         transfer: how the files are encoded: "linear", or "srgb" for display-encoded pictures.
         views: names of the views to read; all if None. The split is that of the whole capture.
-        memory: GiB that the pictures may take; 0: 80 % of what is free.
+        memory: GiB that the pictures may take; None: 80 % of what is free.
         split: which views are held out where there is no ``split.json``, see ``split.chosen_views``.
         test_views: names of the views to hold out, whatever else says so, as far as there are such views.
         hold: whether pictures stay in memory; otherwise views decode theirs again whenever they are asked for them.

@@ -10,7 +10,6 @@ from polarguide.cli.compare import Options, Scenes, Settings, print_results
 from polarguide.cli.console import use_threads
 from polarguide.cli.job_progress import JobReporter
 from polarguide.system import signals_as_interrupts
-from polarguide.training.settings import STEPS
 
 
 def ablate(
@@ -18,7 +17,7 @@ def ablate(
     /,
     *,
     out: Path,
-    steps: int = STEPS,
+    steps: int | None = None,
     settings: Settings,
     options: Options,
     base: str = "polarguide",
@@ -32,7 +31,7 @@ def ablate(
     Args:
         scenes: Scene folders, as for train.
         out: Folder to write, as for compare.
-        steps: Optimizer steps of every run.
+        steps: Optimizer steps of every run, without it 5,000.
         base: The recipe whose ablations to train.
         only: Names of the ablations to take, such as without-normals; all if none is given.
         reference: Recipes to add as first rows, such as 3dgs-dr.

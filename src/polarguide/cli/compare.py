@@ -14,7 +14,7 @@ from polarguide.cli.job_progress import JobReporter
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
 from polarguide.system import signals_as_interrupts
-from polarguide.training.settings import STEPS, Background, Materials, TrainSettings
+from polarguide.training.settings import Background, Materials, TrainSettings
 
 if TYPE_CHECKING:
     from polarguide.experiments.results import Results
@@ -41,7 +41,7 @@ def compare(
     *,
     recipes: tuple[str, ...],
     out: Path,
-    steps: tuple[str, ...] = (str(STEPS),),
+    steps: tuple[str, ...] = (),
     settings: Settings,
     options: Options,
 ) -> None:
@@ -54,8 +54,8 @@ def compare(
         scenes: Scene folders, as for train.
         recipes: The recipes to compare, by name: 3dgs, 3dgs-dr, polarguide, polarguide:without-normals, ...
         out: Folder to write.
-        steps: Optimizer steps of every run, and RECIPE=STEPS for each recipe that takes its own number: 5000
-            gnerp=10000.
+        steps: Optimizer steps of every run, without it 5,000, and RECIPE=STEPS for each recipe that takes its own
+            number: 5000 gnerp=10000.
     """
     use_threads(options.threads)
     common, steps_of = chosen_steps(steps)
@@ -72,8 +72,8 @@ def compare(
     print_results(results, out)
 
 
-def chosen_steps(words: tuple[str, ...]) -> tuple[int, dict[str, int]]:
-    """The number of steps that all take, and those of recipes by name.
+def chosen_steps(words: tuple[str, ...]) -> tuple[int | None, dict[str, int]]:
+    """The number of steps that all take, None where it is not given, and those of recipes by name.
 
     Raises:
         PolarguideError: a word that is neither, or one twice.
@@ -93,7 +93,7 @@ def chosen_steps(words: tuple[str, ...]) -> tuple[int, dict[str, int]]:
             own[name] = int(number)
         else:
             common.append(int(number))
-    return (common or [STEPS])[0], own
+    return next(iter(common), None), own
 
 
 def print_results(results: Results, out: Path) -> None:

@@ -29,7 +29,7 @@ def priors(
     views: str = "test",
     threshold: float | None = None,
     downscale: int = 1,
-    memory: float = 0.0,
+    memory: float | None = None,
     shots: Annotated[ShotOptions, tyro.conf.arg(name="")],
     angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
     machine: Annotated[ThreadOptions, tyro.conf.arg(name="")],
@@ -53,7 +53,7 @@ def priors(
         views: For a scene: test, train, all, or names separated by commas.
         threshold: For a scene: DoLP above which a pixel's normal is used; without it 0.05.
         downscale: For a scene: average the pictures over boxes of this many pixels first.
-        memory: For a scene: GiB that the pictures may take; 0 is 80 % of what is free.
+        memory: For a scene: GiB that the pictures may take; without it, 80 % of what is free.
     """
     use_threads(machine.threads)
     reporter = ConsoleReporter()

@@ -23,14 +23,15 @@ from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.record import read_metrics
 from polarguide.evaluation.sources import field_digest, model_digest, scoring_digest, training_digest
 from polarguide.experiments.options import CompareOptions
-from polarguide.options import Exposures, SceneOptions
+from polarguide.options import Exposures, SceneOptions, index_of
 from polarguide.progress import SILENT, Reporter
 from polarguide.recipes.registry import ablations_of
+from polarguide.runs.defaults import compared_steps
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, trained_steps
 from polarguide.runs.opened import read_scene
 from polarguide.training.recipe import Method, Recipe
-from polarguide.training.settings import STEPS, TrainSettings, index_of
+from polarguide.training.settings import TrainSettings
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
@@ -87,7 +88,7 @@ class Comparison:
     @property
     def steps(self) -> int:
         """Of every run whose recipe has no number of its own. They do not follow from the size: scenes are compared."""
-        return STEPS if self.settings.steps is None else self.settings.steps
+        return compared_steps(self.settings.steps)
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
@@ -284,7 +285,7 @@ def _for(recipe: Method, exposures: Exposures) -> Method:
 
 def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int) -> PlannedRun:
     recipe, options = row.recipe, comparison.options
-    steps = comparison.steps if row.steps is None else row.steps
+    steps = compared_steps(row.steps, comparison.settings.steps)
     settings = replace(
         comparison.settings,
         steps=steps,

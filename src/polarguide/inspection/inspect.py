@@ -31,10 +31,10 @@ from polarguide.inspection.short_run import LONGEST, short_run, surface_of
 from polarguide.inspection.shots import ShotFindings, find_shots, pictures_check, shot_checks
 from polarguide.inspection.surfaces import Surface, SurfaceSamples, normal_evidence, sample_surfaces
 from polarguide.inspection.verdict import Check, Verdict, worst
+from polarguide.options import index_of
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend
 from polarguide.records import check_options
-from polarguide.training.settings import index_of
 
 SURE = 0.98
 """Probability from which on ``auto`` is content with the points."""
@@ -116,7 +116,7 @@ def inspect_scene(
             measurements.append(measure_view(view, index))
             advance(len(measurements))
     if not capture.four:
-        checks, shots = _shots(capture, measurements, out, settings, backend, reporter)
+        checks, shots = _shots(capture, measurements, out, settings, index, backend, reporter)
         return Inspection(capture, settings, index, tuple(measurements), tuple(checks), shots)
     pairing = find_pairing(capture)
     checks = picture_checks(capture, measurements, pairing)
@@ -135,6 +135,7 @@ def _shots(
     measurements: Sequence[ViewMeasurements],
     out: Path,
     settings: InspectSettings,
+    index: float,
     backend: Backend,
     reporter: Reporter,
 ) -> tuple[list[Check], ShotFindings]:
@@ -156,6 +157,7 @@ def _shots(
                 scene,
                 out / RUN_FOLDER,
                 steps=settings.steps,
+                refractive_index=index,
                 backend=backend,
                 on_step=lambda report: advance(min(report.step + 1, settings.steps)),
             )

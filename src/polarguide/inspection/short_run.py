@@ -64,9 +64,9 @@ def short_run(
     steps: int,
     backend: Backend,
     on_step: Callable[[StepReport], None],
+    refractive_index: float | None = None,
     recipe: Recipe | None = None,
     until: int = 0,
-    refractive_index: float = 1.5,
 ) -> TrainingState:
     """Train, or go on, or take what is there.
 
@@ -76,24 +76,26 @@ def short_run(
         steps: optimizer steps.
         backend: device and rasterizer.
         on_step: called after every step.
+        refractive_index: of the surfaces; None: that of the scene.
         recipe: what trains; None: ``RECIPE``.
-        until: the step to stop after; 0: the last. refractive_index: of the surfaces.
+        until: the step to stop after; 0: the last.
     """
     if recipe is None:
         named = recipe_named(RECIPE)
         assert isinstance(named, Recipe)
         recipe = named
+    asked = TrainSettings(steps, 0, refractive_index, begin_again=False)
+    settings = resolve(asked, scene, recipe)
     wanted = {
         "photographs": photograph_digest(scene),
         "steps": steps,
         "recipe": recipe.name,
-        "refractive_index": refractive_index,
+        "refractive_index": settings.refractive_index,
         "version": __version__,
     }
     until = until or steps
     state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
-    asked = TrainSettings(steps, 0, refractive_index, begin_again=False)
-    trainer = Trainer(scene, recipe, resolve(asked, scene, recipe), backend, state)
+    trainer = Trainer(scene, recipe, settings, backend, state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)

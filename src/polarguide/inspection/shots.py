@@ -103,6 +103,7 @@ def find_shots(
     folder: Path,
     *,
     steps: int,
+    refractive_index: float,
     backend: Backend,
     on_step: Callable[[StepReport], None],
 ) -> ShotFindings:
@@ -110,7 +111,8 @@ def find_shots(
 
     Args:
         scene: at the size to train at, with views that are trained on. folder: where the state is kept.
-        steps: about how many to take. backend: device and rasterizer. on_step: called after every step.
+        steps: about how many to take. refractive_index: of the surfaces.
+        backend: device and rasterizer. on_step: called after every step.
     """
     if not any(exposure.filtered for view in scene.train_views for exposure in view.exposures):
         return ShotFindings(why="No picture was taken through a filter.", unfiltered=True)
@@ -119,7 +121,14 @@ def find_shots(
     blind, total = untold(scene), math.ceil(steps / LAST)
     until = Polarizers(blind, recipe, total).search + 1  # angles are fitted when a step begins
     state = short_run(
-        blind, folder, steps=total, until=until, recipe=recipe, backend=backend, on_step=on_step
+        blind,
+        folder,
+        steps=total,
+        until=until,
+        recipe=recipe,
+        refractive_index=refractive_index,
+        backend=backend,
+        on_step=on_step,
     )
     judgments = Polarizers(blind, recipe, total, state.angles).judgments()
     said = {view.name: view.exposures for view in scene.train_views}

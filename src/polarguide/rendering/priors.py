@@ -11,7 +11,7 @@ from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
-from polarguide.options import PathLike, SceneOptions, check_finite
+from polarguide.options import PathLike, SceneOptions, check_finite, index_of
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
 from polarguide.runs.opened import OpenedRun, read_scene
@@ -26,7 +26,7 @@ def write_priors(
     *,
     run: OpenedRun | None = None,
     views: str = "test",
-    refractive_index: float = 1.5,
+    refractive_index: float | None = None,
     threshold: float = 0.05,
     reading: SceneOptions = SceneOptions(),
     reporter: Reporter = SILENT,
@@ -42,7 +42,7 @@ def write_priors(
         out: folder to write.
         run: a run trained on this scene at this size, whose normals resolve the ambiguity.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        refractive_index: of the surfaces.
+        refractive_index: of the surfaces; None: that of the scene.
         threshold: DoLP above which a pixel's normal is used.
 
     Returns:
@@ -52,10 +52,11 @@ def write_priors(
         PolarguideError: there is no such view, its pictures do not determine its polarization, or the run was trained
             at another size.
     """
-    check_finite("refractive_index", refractive_index, 1.0001, 4.0)
     check_finite("threshold", threshold, 0.0, 1.0)
     if not isinstance(scene, Scene):
         scene = read_scene(scene, reading, reporter)
+    index = index_of(refractive_index, scene.refractive_index)
+    check_finite("refractive_index", index, 1.0001, 4.0)
     if run is not None and run.configuration.downscale != scene.downscale:
         raise PolarguideError(
             "downscale",
@@ -73,7 +74,7 @@ def write_priors(
     names: list[str] = []
     with reporter.track("drawing", len(chosen)) as advance:
         for number, view in enumerate(chosen):
-            pictures = prior_pictures(view, run, refractive_index, threshold)
+            pictures = prior_pictures(view, run, index, threshold)
             names = list(pictures)
             for name, picture in pictures.items():
                 figures.write_png(out / f"{view.name}_{name}.png", picture)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from polarguide.capture import Scene
+from polarguide.capture.background import has_black_background
 from polarguide.errors import PolarguideError
 from polarguide.neural.recipe import NeuralRecipe
+from polarguide.options import index_of
 from polarguide.training.recipe import Method, Recipe
-from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings, index_of
+from polarguide.training.settings import STEPS, Background, ResolvedSettings, TrainSettings
 
+OPEN = ("steps", "refractive_index", "views_per_step", "background")
+"""Settings that may be left open, beside the number of Gaussians, which bounds memory before the pictures are read."""
 VISITS = 60
 """Least number of times that each training view is looked at."""
 LARGE = 1_000_000
@@ -21,9 +26,28 @@ more of them would give at full size was not studied.
 """
 
 
-def most_gaussians(pixels: int, recipe: Recipe) -> int:
-    """How many Gaussians there may be for so many pixels of all views."""
-    return min(int(pixels / recipe.densification.pixels_each), MOST_GAUSSIANS)
+def most_gaussians(
+    pixels: int, method: Method, asked: TrainSettings, resumed: ResolvedSettings | None = None
+) -> int:
+    """How many Gaussians there may be for so many pixels of all views; 0 of a field, which has none.
+
+    Args:
+        pixels: of the training views. asked, resumed: as for ``resolve``.
+    """
+    if isinstance(method, NeuralRecipe):
+        return 0
+    assert isinstance(method, Recipe)
+    recorded = {} if resumed is None else _recorded(resumed)
+    by_size = min(int(pixels / method.densification.pixels_each), MOST_GAUSSIANS)
+    return recorded.get("gaussians", by_size) if asked.gaussians is None else asked.gaussians
+
+
+def compared_steps(*specified: int | None) -> int:
+    """Steps of a run of a comparison: the first number that was specified, else ``STEPS``.
+
+    They do not follow from the size of the pictures: scenes are compared.
+    """
+    return next((steps for steps in specified if steps is not None), STEPS)
 
 
 def resolve(
@@ -44,28 +68,41 @@ def resolve(
     Raises:
         PolarguideError: a setting that means nothing for this method.
     """
+    recorded = {} if resumed is None else _recorded(resumed)
+    sizes = [view.camera.width * view.camera.height for view in scene.train_views]
     taken: dict[str, Any] = {
-        **_by_size(scene, method),
+        **vars(settings),
+        "steps": _steps(sizes, method),
         "refractive_index": index_of(None, scene.refractive_index),
         "views_per_step": processes,
+        **{name: recorded[name] for name in OPEN if name in recorded},
+        "gaussians": most_gaussians(sum(sizes), method, settings, resumed),
+        **settings.specified(),
     }
-    if resumed is not None:  # where it was open, the run recorded 0
-        taken |= {name: value for name in taken if (value := getattr(resumed, name))}
-    taken |= {name: value for name, value in vars(settings).items() if value is not None}
+    if taken["background"] == "auto":
+        taken["background"] = _background(scene, method)
     found = ResolvedSettings(**taken)
     if isinstance(method, NeuralRecipe):
         _refuse_for_field(found, method)
     return found
 
 
-def _by_size(scene: Scene, method: Method) -> dict[str, int]:
-    """Steps, and the most Gaussians."""
+def _recorded(resumed: ResolvedSettings) -> dict[str, Any]:
+    """What a run recorded of its settings; the first versions recorded 0, and "auto", for what was open."""
+    return {name: value for name, value in resumed.specified().items() if value != 0}
+
+
+def _steps(sizes: Sequence[int], method: Method) -> int:
     if isinstance(method, NeuralRecipe):
-        return {"steps": method.steps, "gaussians": 0}
-    assert isinstance(method, Recipe)
-    sizes = [view.camera.width * view.camera.height for view in scene.train_views]
-    steps = max(STEPS, 500 * math.ceil(VISITS * len(sizes) / 500)) * (2 if max(sizes) > LARGE else 1)
-    return {"steps": steps, "gaussians": most_gaussians(sum(sizes), method)}
+        return method.steps
+    return max(STEPS, 500 * math.ceil(VISITS * len(sizes) / 500)) * (2 if max(sizes) > LARGE else 1)
+
+
+def _background(scene: Scene, method: Method) -> Background:
+    """What is behind the subject, by the edges of the pictures; a field takes no notice of it."""
+    if isinstance(method, NeuralRecipe):
+        return "scene"
+    return "black" if has_black_background(scene.train_views) else "scene"
 
 
 def _refuse_for_field(settings: ResolvedSettings, method: NeuralRecipe) -> None:

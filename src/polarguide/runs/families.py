@@ -14,11 +14,9 @@ from polarguide.errors import PolarguideError
 from polarguide.neural.model import FieldModel
 from polarguide.neural.recipe import NeuralRecipe
 from polarguide.neural.trainer import FieldTrainer
-from polarguide.options import SceneOptions
 from polarguide.progress import Reporter
 from polarguide.raster import Backend
 from polarguide.runs.angles import report_polarizers
-from polarguide.runs.defaults import most_gaussians
 from polarguide.runs.folder import CHECKPOINT, PLY, AnyState
 from polarguide.runs.forecast import Forecast, forecast
 from polarguide.runs.health import Evidence
@@ -75,9 +73,9 @@ class Family(ABC):
 
     @abstractmethod
     def plan(
-        self, pixels: Sequence[int], method: Any, asked: int | None, reading: SceneOptions, *, held: bool
+        self, pixels: Sequence[int], method: Any, gaussians: int, limit: float | None, *, held: bool
     ) -> MemoryPlan:
-        """How a training stays within its memory; ``asked``: most Gaussians, None: by the pixels."""
+        """How a training stays within its memory; see ``plan_memory``."""
 
     def check(self, state: Any, settings: ResolvedSettings, out: Path) -> None:
         """Refuse a checkpoint that does not belong to the settings of its run.
@@ -133,11 +131,10 @@ class GaussianFamily(Family):
     leaves = PLY
 
     def plan(
-        self, pixels: Sequence[int], method: Recipe, asked: int | None, reading: SceneOptions, *, held: bool
+        self, pixels: Sequence[int], method: Recipe, gaussians: int, limit: float | None, *, held: bool
     ) -> MemoryPlan:
         """See ``Family``."""
-        gaussians = most_gaussians(sum(pixels), method) if asked is None else asked
-        return plan_memory(pixels, method, gaussians, limit=reading.memory, held=held)
+        return plan_memory(pixels, method, gaussians, limit=limit, held=held)
 
     def check(self, state: Any, settings: ResolvedSettings, out: Path) -> None:
         """See ``Family``; refuses sums of the density control for other views a step, too."""
@@ -166,8 +163,6 @@ class GaussianFamily(Family):
     ) -> Trainer:
         """See ``Family``."""
         made = Trainer(scene, method, settings, backend, state, ranks, store, reporter.warn, memory)
-        if made.black and settings.background == "auto":
-            reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
         if made.polarizers.ignored:
             reporter.warn(_ignored(method))
         return made
@@ -208,13 +203,13 @@ class FieldFamily(Family):
         self,
         pixels: Sequence[int],
         method: NeuralRecipe,
-        asked: int | None,
-        reading: SceneOptions,
+        gaussians: int,
+        limit: float | None,
         *,
         held: bool,
     ) -> MemoryPlan:
         """See ``Family``."""
-        return plan_field_memory(pixels, method, limit=reading.memory, held=held)
+        return plan_field_memory(pixels, method, limit=limit, held=held)
 
     def trainer(
         self,

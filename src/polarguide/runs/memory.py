@@ -53,13 +53,13 @@ class MemoryPlan:
 
 
 def plan_memory(
-    pixels: Sequence[int], recipe: Recipe, gaussians: int, *, limit: float, held: bool = False
+    pixels: Sequence[int], recipe: Recipe, gaussians: int, *, limit: float | None, held: bool = False
 ) -> MemoryPlan:
     """Share out memory among a training's step, its Gaussians and its views.
 
     Args:
         pixels: of each view as it is trained on. recipe: the method. gaussians: most that there may be.
-        limit: GiB that the process may take; 0: what is free, but a fifth.
+        limit: GiB that the process may take; None: what is free, but a fifth.
         held: whether the pictures are in memory already.
 
     Raises:
@@ -76,7 +76,7 @@ def plan_memory(
 
 
 def plan_field_memory(
-    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float, held: bool = False
+    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, held: bool = False
 ) -> MemoryPlan:
     """The same for a field: ``plan_memory``."""
     largest = max(pixels, default=0)
@@ -85,7 +85,7 @@ def plan_field_memory(
 
 
 def _shared(
-    pixels: Sequence[int], own: int, of_view: int, limit: float, held: bool, what: str, less: str
+    pixels: Sequence[int], own: int, of_view: int, limit: float | None, held: bool, what: str, less: str
 ) -> MemoryPlan:
     """Share out memory: ``own`` is what a training takes beside its views, ``of_view`` a pixel of what it keeps of
     them.
@@ -102,7 +102,7 @@ def _shared(
     least = work + masks + (KEPT + of_view) * largest
     least = max(least, now + PROCESS + MASKS * total + 4 * READ * largest)
     whole = work + masks + pictures + of_view * total
-    if limit > 0:
+    if limit is not None:
         allowed = int(limit * GIBIBYTE)
         if allowed < least:
             raise too_little(least, allowed, what, less)

@@ -23,7 +23,7 @@ from polarguide.options import PathLike, SceneOptions, SessionOptions
 from polarguide.progress import SILENT, Advance, Reporter
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import resolve
+from polarguide.runs.defaults import most_gaussians, resolve
 from polarguide.runs.families import AnyTrainer, Family, family_of
 from polarguide.runs.folder import (
     CHECKPOINT,
@@ -121,7 +121,9 @@ def train(
         if resolved.views_per_step < ranks.world:
             idle = ranks.world - resolved.views_per_step
             reporter.warn(f"{idle} of {ranks.world} processes have no view to look at")
-        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device)
+        if settings.background == "auto" and resolved.background == "black" and leads:
+            reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
+        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device, plan)
         state = None
         if resume:
             if leads:
@@ -312,10 +314,8 @@ def _planned(
         pixels = [view.camera.width * view.camera.height for view in scene.train_views]
     else:
         pixels = pixels_of(Path(scene), reading.downscale)
-    gaussians = asked.gaussians
-    if gaussians is None and resumed is not None:
-        gaussians = resumed.gaussians or None  # 0: it was open
-    return family.plan(pixels, recipe, gaussians, reading, held=isinstance(scene, Scene))
+    gaussians = most_gaussians(sum(pixels), recipe, asked, resumed)
+    return family.plan(pixels, recipe, gaussians, reading.memory, held=isinstance(scene, Scene))
 
 
 def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
@@ -367,6 +367,8 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
+    if old.settings.background == "auto":  # as the first versions recorded it
+        old = replace(old, settings=replace(old.settings, background=new.settings.background))
     if old.settings != new.settings and replace(old.settings, steps=new.settings.steps) == new.settings:
         raise PolarguideError(
             f"{out}/{CONFIGURATION} (steps)",

@@ -15,7 +15,7 @@ from polarguide.camera import Camera
 from polarguide.capture.colmap.model import fit_camera, read_model
 from polarguide.errors import PolarguideError
 from polarguide.numerals import decimal
-from polarguide.options import check_finite
+from polarguide.options import check_finite, index_of
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Map, ShotMaps
 from polarguide.shots.read import tiles
@@ -97,17 +97,20 @@ def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) 
 
 
 @torch.no_grad()
-def surface_maps(maps: ShotMaps, camera: Camera | None = None, refractive_index: float = 1.5) -> SurfaceMaps:
+def surface_maps(
+    maps: ShotMaps, camera: Camera | None = None, refractive_index: float | None = None
+) -> SurfaceMaps:
     """Candidates of the normals, one of them, and both separations.
 
     Args:
         maps: of the shot.
         camera: of its pixels, for their rays; None takes rays parallel to the axis, which a long lens nearly has.
-        refractive_index: of all surfaces.
+        refractive_index: of all surfaces; None: ``INDEX``.
 
     Raises:
         PolarguideError: the refractive index is out of range.
     """
+    refractive_index = index_of(refractive_index)
     check_finite("refractive_index", refractive_index, 1.0001, 4.0)
     channels, height, width = maps.intensities.shape[3], *maps.reason.shape
     zeniths = torch.empty((3, height, width))

@@ -56,7 +56,7 @@ def write_shots(
     *,
     formats: Collection[str] = FORMATS,
     intrinsics: str | None = None,
-    refractive_index: float = 1.5,
+    refractive_index: float | None = None,
     reporter: Reporter = SILENT,
 ) -> WrittenShots:
     """Write all maps of one or many shots, a folder for each.
@@ -71,7 +71,7 @@ def write_shots(
         formats: png (with legends), exr and npy (numbers; ``maps.json`` says their units), page.
         intrinsics: ``fx,fy,cx,cy`` of the developed pictures; without them, and without poses of a scene, rays are
             parallel.
-        refractive_index: of all surfaces.
+        refractive_index: of all surfaces; None: as ``surface_maps`` takes it.
         reporter: where messages and progress go.
 
     Raises:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from polarguide.errors import PolarguideError
 from polarguide.options import EXPOSURES, Exposures, check_choice, check_count
 
 MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
-INDEX = 1.5
-"""Refractive index of glass, plastic and glaze, for scenes that name none."""
 STEPS = 5000
 """Steps of a training of Gaussians, at least, and of every run of a comparison."""
 Background = Literal["auto", "scene", "black", "masked"]
@@ -42,7 +40,8 @@ class TrainSettings:
         views_per_step: Views whose mean gradient makes a step. Learning rates grow with its square root; steps are
             steps, so more views are looked at. None: one for each process.
         background: What is behind the subject: a scene to reconstruct, too; black, that is nothing; masked makes it
-            nothing (the subject in masks/ alone is read); auto takes black where the edges of the pictures are.
+            nothing (the subject in masks/ alone is read); auto, which is not specified, is black where the edges of the
+            pictures are, else scene.
         gaussians: Most Gaussians that there may be, each of which takes 4 kB. None: one for 20 pixels of all
             training views, 400,000 at most.
         exposures: Which pictures of a scene with four to train on, as if no others had been taken: captured, all that
@@ -84,6 +83,11 @@ class TrainSettings:
                 remedy="1.5 suits most; without it, that of scene.json is taken.",
             )
 
+    def specified(self) -> dict[str, Any]:
+        """What is not left open, by name."""
+        open_values = (("background", "auto"), *((name, None) for name in vars(self)))
+        return {name: value for name, value in vars(self).items() if (name, value) not in open_values}
+
 
 @dataclass(frozen=True)
 class ResolvedSettings(TrainSettings):
@@ -101,13 +105,7 @@ class ResolvedSettings(TrainSettings):
 
     def fit(self, asked: TrainSettings) -> bool:
         """Whether they are as was asked, whatever was left open."""
-        wanted = {name: value for name, value in vars(asked).items() if value is not None}
-        return wanted.items() <= vars(self).items()
-
-
-def index_of(asked: float | None, scene: float | None) -> float:
-    """The refractive index that was asked for, else that of ``scene.json``, else ``INDEX``."""
-    return next((index for index in (asked, scene) if index is not None), INDEX)
+        return asked.specified().items() <= vars(self).items()
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.capture.background import has_black_background
 from polarguide.capture.smaller import smaller
 from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
@@ -33,22 +32,13 @@ from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.training.priors import ViewPriors
 from polarguide.training.recipe import Action, Recipe, Stage
 from polarguide.training.schedule import Schedule
-from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
+from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.sizes import Sizes
 from polarguide.training.state import TrainingState, first_state, seeded
 from polarguide.training.view_store import ViewStore
 
 # From so many training views on, what only one of them sees goes where nothing is behind the subject.
 ENOUGH_VIEWS = 12
-
-
-def is_black(scene: Scene, settings: TrainSettings) -> bool:
-    """Whether a training takes it that nothing is behind the subject; a scene's pictures are looked at once."""
-    if settings.background != "auto":
-        return settings.background != "scene"
-    if "_black" not in vars(scene):
-        vars(scene)["_black"] = has_black_background(scene.train_views)
-    return bool(vars(scene)["_black"])
 
 
 class Trainer:
@@ -88,7 +78,7 @@ class Trainer:
         self.ranks, self._device, self._memory = ranks, backend.device, memory
         self.whole = True
         self.shading = recipe.shading.bind(settings.refractive_index)
-        self.black = is_black(scene, settings)
+        self.black = settings.background != "scene"
         self.state = state or self._first_state()
         self._rate = math.sqrt(settings.views_per_step)
         centers = torch.stack([view.camera.center for view in scene.train_views])
