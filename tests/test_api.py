@@ -71,6 +71,12 @@ def test_every_public_name_is_there() -> None:
         _ = polarguide.nothing
 
 
+def test_the_demo_scene_is_a_folder_like_any_other(demo_scene: Path) -> None:
+    scene = polarguide.load_scene(polarguide.demo_scene(), views=["v000"])
+    assert scene.root == demo_scene
+    assert scene.view("v000").camera.width == 128
+
+
 def test_runs_open_and_render_in_inference_mode(trained: Path) -> None:
     run = polarguide.open_run(trained)
     expected = run.render("v000", run.layers)

@@ -6,11 +6,9 @@ Nothing here prints or installs signal handlers: progress and messages go to a `
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from polarguide.errors import PolarguideError
 from polarguide.evaluation import evaluate
 from polarguide.evaluation.record import read_metrics
 from polarguide.export import formats
-from polarguide.files import read_file
+from polarguide.files import read_file, require_folder
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
 from polarguide.inspection.record import write_inspection
 from polarguide.inspection.settings import InspectSettings
@@ -293,16 +291,16 @@ def inspect(
     return found
 
 
-@contextmanager
-def demo_scene() -> Iterator[Path]:
+def demo_scene() -> Path:
     """The folder of the small scene that ships with the package: glossy objects, 50 views, four angles each.
+
+    Example:
+        >>> polarguide.load_scene(polarguide.demo_scene()).view("v000").camera.width    # doctest: +SKIP
+        128
 
     Raises:
         PolarguideError: the package is not whole.
     """
-    with resources.as_file(resources.files("polarguide") / "data" / "demo") as scene:
-        if not scene.is_dir():
-            raise PolarguideError(
-                scene, expected="the demo scene", found="nothing", remedy="Install the package again."
-            )
-        yield scene
+    scene = Path(__file__).parent / "data" / "demo"
+    require_folder(scene, expected="the demo scene", remedy="Install the package again.")
+    return scene

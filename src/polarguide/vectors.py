@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,15 @@ def unit(vectors: Tensor, floor: float = 1e-6) -> Tensor:
     """Vectors [..., 3] divided by their length, or by ``floor`` where they are shorter; no NaN at zero."""
     squared = dot(vectors, vectors)
     return vectors * torch.rsqrt(squared.clamp(min=floor * floor))[..., None]
+
+
+def spread_directions(count: int) -> Tensor:
+    """Unit vectors [count, 3] float64, spread evenly over the sphere: a Fibonacci lattice."""
+    place = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1 - 2 * place / count
+    around = math.pi * (1 + math.sqrt(5)) * place
+    flat = (1 - z * z).sqrt()
+    return torch.stack((flat * around.cos(), flat * around.sin(), z), dim=1)
 
 
 def unit_array(vectors: NDArray[Any]) -> NDArray[np.float64]:

@@ -8,7 +8,8 @@ import torch
 from plyfile import PlyData
 
 from polarguide.errors import PolarguideError
-from polarguide.gaussians.ply import fibonacci_sphere, read_ply, refit_sh_to_display, write_ply
+from polarguide.gaussians.ply import read_ply, refit_sh_to_display, write_ply
+from polarguide.vectors import spread_directions
 
 COUNT = 7
 SHAPES = {
@@ -236,7 +237,7 @@ def test_refit_refuses_colors_of_another_shape():
 
 
 def test_directions_are_spread_evenly():
-    points = fibonacci_sphere(64)
+    points = spread_directions(64)
     assert torch.allclose(points.norm(dim=-1), torch.ones(64, dtype=torch.float64))
     nearest = (points @ points.T - 2 * torch.eye(64, dtype=torch.float64)).amax(1).clamp(max=1).acos()
     assert nearest.min() > 0.7 * nearest.max()

@@ -10,7 +10,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import View
 from polarguide.polarizer import ANGLES
-from polarguide.shading.conversion import spread_directions
+from polarguide.vectors import spread_directions
 from tests.helpers.glossy_ball import ball, camera_at
 
 METALS = {"gold": (0.95, 0.78, 0.37), "aluminum": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
@@ -99,7 +99,7 @@ def views_of(material: str, degree: float = 0.0, other: str | None = None) -> li
 
 def gaussians_of_the_ball(count: int = 900) -> dict[str, Tensor]:
     """Flat, opaque Gaussians on the unit ball."""
-    normals = spread_directions(count)
+    normals = spread_directions(count).float()
     z = torch.tensor([0.0, 0.0, 1.0])
     # The rotation that takes z to the normal.
     quaternions = torch.cat((1 + normals[:, 2:], torch.linalg.cross(z.expand_as(normals), normals)), dim=1)

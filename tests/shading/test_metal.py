@@ -21,7 +21,7 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.runs.point_cloud import shown_colors, write_run_ply
-from polarguide.shading.conversion import convert, mirror_base, scale_light, spread_directions
+from polarguide.shading.conversion import convert, mirror_base, scale_light
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import (
@@ -34,6 +34,7 @@ from polarguide.shading.metal import (
 from polarguide.shading.model import mirrored
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
+from polarguide.vectors import spread_directions
 
 RESOLUTION = 8
 WITHOUT = DeferredShading("fresnel", local=True)
@@ -134,7 +135,7 @@ def test_the_point_cloud_says_what_metals_are(tmp_path: Path) -> None:
     torch.testing.assert_close(read["reflectance"], expected)
     torch.testing.assert_close(read["roughness"], torch.sigmoid(state.gaussians["roughness_logits"]).detach())
     # Ordinary viewers show what the metals mirror, not the base color that does not count.
-    directions = spread_directions(12)
+    directions = spread_directions(12).float()
     shown = shown_colors(state, shading, directions)
     state.gaussians.overwrite("sh_dc", state.gaussians["sh_dc"] + 1.0)
     after = shown_colors(state, shading, directions)
@@ -257,7 +258,7 @@ def test_what_becomes_a_metal_looks_as_before() -> None:
     assert torch.equal(convert(values, fresh, torch.full((COUNT, 3), 0.8)), fresh)
     texels = torch.full((6, RESOLUTION, RESOLUTION, 3), -1.0)
     mirror_base(values, texels, fresh, torch.exp)
-    toward = spread_directions(40)
+    toward = spread_directions(40).float()
     normals = shortest_axis_normals(
         values["means"], values["quaternions"], values["log_scales"], torch.zeros(3), None
     ).detach()

@@ -44,16 +44,16 @@ def test_options_of_mosaics_are_refused_for_four_shots(tmp_path: Path, given: di
 @pytest.mark.parametrize("given", [*MOSAIC_ONLY, {"gains": "auto"}, {"align": False}])
 def test_options_of_sensors_and_filters_are_refused_for_views(given: dict[str, Any]) -> None:
     name = next(iter(given))
-    with polarguide.demo_scene() as scene:
-        option = "--no-align" if name == "align" else "--" + name.replace("_", "-")
-        refused(option, [scene], given, "a view of a scene")
+    scene = polarguide.demo_scene()
+    option = "--no-align" if name == "align" else "--" + name.replace("_", "-")
+    refused(option, [scene], given, "a view of a scene")
 
 
 def test_gains_of_a_calibration_are_refused_for_views() -> None:
-    with polarguide.demo_scene() as scene:
-        given = {"calibration": Calibration(gains=(1.0, 1.1, 1.0, 1.0))}
-        refused("calibration (gains)", [scene], given, "a view of a scene")
-        assert find_shots([scene], ShotOptions(calibration=Calibration(sense="cw")))
+    scene = polarguide.demo_scene()
+    given = {"calibration": Calibration(gains=(1.0, 1.1, 1.0, 1.0))}
+    refused("calibration (gains)", [scene], given, "a view of a scene")
+    assert find_shots([scene], ShotOptions(calibration=Calibration(sense="cw")))
 
 
 @pytest.mark.parametrize("given", [{"transfer": "srgb"}, {"align": False}])
@@ -138,20 +138,21 @@ def test_options_of_shots_are_refused_for_a_scene_with_poses(tmp_path: Path, giv
     name = next(iter(given))
     where = r"calibration \((order|gains)\)" if name == "calibration" else f"--{name.replace('_', '-')}"
     expected = f"^{where}: expected shots, found a scene with poses"
-    with polarguide.demo_scene() as scene, pytest.raises(PolarguideError, match=expected):
+    scene = polarguide.demo_scene()
+    with pytest.raises(PolarguideError, match=expected):
         polarguide.priors(scene, tmp_path / "x", views="v000", shots=ShotOptions(**given))
     assert not (tmp_path / "x").exists()
 
 
 def test_noise_counts_for_the_maps_of_a_scene_with_poses(tmp_path: Path) -> None:
-    with polarguide.demo_scene() as scene:
-        noisy = ShotOptions(full_well=100.0)
-        polarguide.priors(scene, tmp_path, views="v000", shots=noisy, formats=["npy"])
-        record = json.loads((tmp_path / "v000" / "maps.json").read_text())
-        assert record["noise"]["source"] == "given"
-        wrong = ShotOptions(calibration=Calibration(order=(90, 45, 0, 135)))
-        with pytest.raises(PolarguideError, match=r"calibration \(order\): expected shots"):
-            polarguide.priors(scene, tmp_path, views="v000", shots=wrong, formats=["npy"])
+    scene = polarguide.demo_scene()
+    noisy = ShotOptions(full_well=100.0)
+    polarguide.priors(scene, tmp_path, views="v000", shots=noisy, formats=["npy"])
+    record = json.loads((tmp_path / "v000" / "maps.json").read_text())
+    assert record["noise"]["source"] == "given"
+    wrong = ShotOptions(calibration=Calibration(order=(90, 45, 0, 135)))
+    with pytest.raises(PolarguideError, match=r"calibration \(order\): expected shots"):
+        polarguide.priors(scene, tmp_path, views="v000", shots=wrong, formats=["npy"])
 
 
 @pytest.mark.parametrize(

@@ -32,8 +32,8 @@ VIEW = "v000"
 
 @pytest.fixture(scope="module")
 def demo() -> Path:
-    with polarguide.demo_scene() as scene:
-        return scene
+    scene = polarguide.demo_scene()
+    return scene
 
 
 def degrees_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -101,14 +101,14 @@ def test_wrong_format(tmp_path: Path) -> None:
 
 
 def test_a_scene_with_poses_keeps_its_pictures_and_gets_maps_on_demand(tmp_path: Path) -> None:
-    with polarguide.demo_scene() as scene:
-        sheet = polarguide.priors(scene, tmp_path, views="v000", formats=["npy"])
-        assert sheet == tmp_path / "contact_sheet.png"
-        assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == ["v000"]
-        assert json.loads((tmp_path / "v000" / "maps.json").read_text())["rays"] == "of a pinhole camera"
-        for given in ({"intrinsics": "1,1,1,1"}, {"shots": ShotOptions(sensor="IMX250MZR")}):
-            with pytest.raises(PolarguideError, match="expected shots, found a scene with poses"):
-                polarguide.priors(scene, tmp_path / "x", **given)  # type: ignore[arg-type]
+    scene = polarguide.demo_scene()
+    sheet = polarguide.priors(scene, tmp_path, views="v000", formats=["npy"])
+    assert sheet == tmp_path / "contact_sheet.png"
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == ["v000"]
+    assert json.loads((tmp_path / "v000" / "maps.json").read_text())["rays"] == "of a pinhole camera"
+    for given in ({"intrinsics": "1,1,1,1"}, {"shots": ShotOptions(sensor="IMX250MZR")}):
+        with pytest.raises(PolarguideError, match="expected shots, found a scene with poses"):
+            polarguide.priors(scene, tmp_path / "x", **given)  # type: ignore[arg-type]
 
 
 def test_the_page_asks_for_nothing_and_escapes_names(tmp_path: Path) -> None:

@@ -34,14 +34,14 @@ def demo(
         steps: Optimizer steps.
         seed: Seed of every random draw.
     """
-    with polarguide.demo_scene() as scene:
-        say(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
-        settings = TrainSettings(steps, seed)
-        session = SessionOptions(threads=machine.threads)
-        train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
-        evaluate(out, compute=ComputeOptions(machine.threads))
-        render(out)
-        picture = _first_picture(out)
+    scene = polarguide.demo_scene()
+    say(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
+    settings = TrainSettings(steps, seed)
+    session = SessionOptions(threads=machine.threads)
+    train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
+    evaluate(out, compute=ComputeOptions(machine.threads))
+    render(out)
+    picture = _first_picture(out)
     say(f"look at {picture}: {FIRST_VIEW}, which training has not seen, and its layers")
     say(
         f"then at {out / 'render' / 'contact_sheet.png'}: rows are views, columns are layers, each beside the true "

@@ -20,9 +20,10 @@ from polarguide import __version__
 from polarguide.camera import Camera
 from polarguide.files import atomic
 from polarguide.gaussians.harmonics import sh_basis
-from polarguide.gaussians.ply import REST_COUNT, fibonacci_sphere
+from polarguide.gaussians.ply import REST_COUNT
 from polarguide.presentation import Presentation
 from polarguide.scene_frame import SceneFrame
+from polarguide.vectors import spread_directions
 
 HARMONICS = ("f_rest", "linear_rest")
 """Fields of harmonics in our PLY files; the first channel-major, the second with the channel last."""
@@ -85,7 +86,7 @@ class Placement:
 
         Functions of each degree turn into functions of the same degree, so that a fit to samples is exact.
         """
-        directions = fibonacci_sphere(64)
+        directions = spread_directions(64)
         before = sh_basis(directions @ self.rotation, 3)[:, 1:]
         turned = torch.linalg.lstsq(sh_basis(directions, 3)[:, 1:], before).solution
         return np.asarray(turned.numpy())

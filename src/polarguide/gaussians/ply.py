@@ -24,6 +24,7 @@ from torch import Tensor
 from polarguide.errors import PolarguideError
 from polarguide.files import atomic
 from polarguide.gaussians.harmonics import sh_basis
+from polarguide.vectors import spread_directions
 
 REST_COUNT = 15
 DIRECTIONS = 64
@@ -173,7 +174,7 @@ def refit_sh_to_display(
     Raises:
         ValueError: ``color_fn`` returns another shape.
     """
-    directions = fibonacci_sphere(DIRECTIONS)
+    directions = spread_directions(DIRECTIONS)
     basis = sh_basis(directions, degree)
     solve = torch.linalg.pinv(basis)
     fitted = torch.zeros(count, 1 + REST_COUNT, 3)
@@ -188,15 +189,6 @@ def refit_sh_to_display(
             "dk,nkc->ndc", solve[:, chunk].to(torch.float32), colors - 0.5
         )
     return fitted[:, :1].clone(), fitted[:, 1:].clone()
-
-
-def fibonacci_sphere(count: int) -> Tensor:
-    """Unit vectors [count, 3] float64, spread evenly: equal steps in z, golden-angle steps around it."""
-    index = torch.arange(count, dtype=torch.float64)
-    z = 1 - (2 * index + 1) / count
-    angle = index * (math.pi * (3 - math.sqrt(5)))
-    radius = torch.sqrt(1 - z * z)
-    return torch.stack((radius * torch.cos(angle), radius * torch.sin(angle), z), dim=-1)
 
 
 def _check_extra(name: str, tensor: Tensor, count: int) -> None:

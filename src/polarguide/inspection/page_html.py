@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Sequence
 from string import Template
-
-import torch
 
 from polarguide.inspection.angle_checks import AngleFindings
 from polarguide.inspection.inspect import Inspection
@@ -147,30 +144,9 @@ def _legends(layers: Sequence[Layer]) -> str:
             stops = figures.color_gradient(layer.ramp)
             bar = f'<span class="ramp" style="background:linear-gradient(90deg,{stops})"></span>'
         elif layer.key == "aolp":
-            bar = aolp_wheel()
+            bar = figures.aolp_wheel()
         parts.append(f'<p class="legend {layer.key}">{bar}{html.escape(layer.legend)}</p>')
     return "".join(parts)
-
-
-def aolp_wheel() -> str:
-    """The color code of the AoLP as an SVG half disc: 0 degrees to the right, counter-clockwise."""
-    count, cx, cy, radius = 36, 66.0, 58.0, 40.0
-    angles = (torch.arange(count, dtype=torch.float64) + 0.5) * math.pi / count
-    colors = figures.aolp_to_rgb(angles[None])[0].tolist()
-    wedges = []
-    for k, (r, g, b) in enumerate(colors):
-        (x1, y1), (x2, y2) = (
-            (cx + radius * math.cos(a), cy - radius * math.sin(a))
-            for a in (k * math.pi / count, (k + 1.15 if k < count - 1 else k + 1) * math.pi / count)
-        )
-        wedges.append(f'<path fill="rgb({r},{g},{b})" d="M{cx} {cy}L{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}Z"/>')
-    texts = "".join(
-        f'<text x="{cx + (radius + 12) * math.cos(math.radians(a)):.1f}" '
-        f'y="{cy - (radius + 8) * math.sin(math.radians(a)) + 2:.1f}">{a}°</text>'
-        for a in (0, 45, 90, 135, 180)
-    )
-    drawing = "".join(wedges) + texts
-    return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by color">{drawing}</svg>'
 
 
 def _tile(uris: dict[str, str], layers: Sequence[Layer], measured: ViewMeasurements, marked: bool) -> str:

@@ -18,6 +18,7 @@ from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import sh_basis
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.metal import FIRST_ROUGHNESS, reflectance, reflectance_logits
+from polarguide.vectors import spread_directions
 
 MOST_STRENGTH = 0.98
 # Directions in which functions are compared, and Gaussians at a time.
@@ -97,12 +98,3 @@ def mirror_base(
         found[0][chosen], found[1][chosen] = local[:, 0], local[:, 1:]
     for name, values in zip(("local_dc", "local_rest"), found, strict=True):
         gaussians.overwrite(name, values, fresh)
-
-
-def spread_directions(count: int) -> Tensor:
-    """Unit vectors [count, 3], evenly over the sphere (a Fibonacci lattice)."""
-    place = torch.arange(count, dtype=torch.float64) + 0.5
-    z = 1 - 2 * place / count
-    around = math.pi * (1 + math.sqrt(5)) * place
-    flat = (1 - z * z).sqrt()
-    return torch.stack((flat * around.cos(), flat * around.sin(), z), dim=1).float()

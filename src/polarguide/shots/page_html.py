@@ -10,7 +10,6 @@ from string import Template
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from polarguide.shots.catalog import KINDS, REASON_COLORS, MapKind
@@ -115,7 +114,7 @@ def _legend(kind: MapKind, stretch: Stretch) -> str:
             f"<span>{stretch.high:g}{unit}</span>"
         )
     elif kind.look == "angle":
-        mark = _wheel()
+        mark = figures.aolp_wheel()
     elif kind.look == "reason":
         mark = "".join(
             f'<span class="patch" style="background:rgb{color}"></span><span>{code.name.lower()}</span>'
@@ -126,24 +125,6 @@ def _legend(kind: MapKind, stretch: Stretch) -> str:
     said = "" if kind.fixed or not stretch.text else f"<span>stretch: {html.escape(stretch.text)}</span>"
     note = f'<span class="note">{html.escape(kind.note)}</span>' if kind.note else ""
     return f'<p class="legend" hidden>{mark}{said}{note}</p>'
-
-
-def _wheel() -> str:
-    """The colors of the AoLP as a half disc: 0 degrees to the right, counter-clockwise."""
-    count, cx, cy, radius = 36, 66.0, 50.0, 36.0
-    angles = (torch.arange(count, dtype=torch.float64) + 0.5) * math.pi / count
-    wedges = []
-    for k, (r, g, b) in enumerate(figures.aolp_to_rgb(angles[None])[0].tolist()):
-        ends = (k * math.pi / count, min(k + 1.15, count) * math.pi / count)
-        (x1, y1), (x2, y2) = ((cx + radius * math.cos(a), cy - radius * math.sin(a)) for a in ends)
-        wedges.append(f'<path fill="rgb({r},{g},{b})" d="M{cx} {cy}L{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}Z"/>')
-    texts = "".join(
-        f'<text x="{cx + (radius + 13) * math.cos(math.radians(a)):.1f}" '
-        f'y="{cy - (radius + 6) * math.sin(math.radians(a)) + 3:.1f}">{a}°</text>'
-        for a in (0, 45, 90, 135, 180)
-    )
-    drawing = "".join(wedges) + texts
-    return f'<svg class="wheel" viewBox="0 0 132 58" role="img" aria-label="AoLP by color">{drawing}</svg>'
 
 
 def _facts(maps: ShotMaps, surface: SurfaceMaps) -> str:

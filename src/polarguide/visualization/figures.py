@@ -124,6 +124,27 @@ def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
     return _to_uint8(color * value[..., None])
 
 
+def aolp_wheel() -> str:
+    """The color code of the AoLP as an SVG half disc: 0 degrees to the right, counter-clockwise."""
+    count, cx, cy, radius = 36, 66.0, 58.0, 40.0
+    angles = (torch.arange(count, dtype=torch.float64) + 0.5) * math.pi / count
+    colors = aolp_to_rgb(angles[None])[0].tolist()
+    wedges = []
+    for k, (r, g, b) in enumerate(colors):
+        (x1, y1), (x2, y2) = (
+            (cx + radius * math.cos(a), cy - radius * math.sin(a))
+            for a in (k * math.pi / count, (k + 1.15 if k < count - 1 else k + 1) * math.pi / count)
+        )
+        wedges.append(f'<path fill="rgb({r},{g},{b})" d="M{cx} {cy}L{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}Z"/>')
+    texts = "".join(
+        f'<text x="{cx + (radius + 12) * math.cos(math.radians(a)):.1f}" '
+        f'y="{cy - (radius + 8) * math.sin(math.radians(a)) + 2:.1f}">{a}°</text>'
+        for a in (0, 45, 90, 135, 180)
+    )
+    drawing = "".join(wedges) + texts
+    return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by color">{drawing}</svg>'
+
+
 def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = 0.25) -> Picture:
     """Absolute difference of two shown pictures, averaged over channels: black at 0 to bright at ``high``."""
     true = shown(true_linear.detach().cpu())
