@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from polarguide.capture.colmap.chance import connected_views
 from polarguide.capture.colmap.features import match_features, pipeline_options, run_step
 from polarguide.capture.colmap.write import PosedCamera
 from polarguide.color import srgb_encode_array
@@ -77,7 +78,7 @@ def reconstruct(
         The folder of the model, with one camera for pictures of one size: of the model given, or SIMPLE_RADIAL.
 
     Raises:
-        NotConnectedError: fewer than three views were registered.
+        NotConnectedError: fewer than three views were registered, or than matches connect better than by chance.
         PolarguideError: COLMAP failed.
     """
     model = folder / "model"
@@ -102,11 +103,13 @@ def reconstruct(
         models = max(models, others, key=_registered)
     best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
     registered = _registered(models)
-    if best is None or registered < LEAST_VIEWS:
+    by_chance = best is not None and connected_views(database, sizes) < LEAST_VIEWS
+    if best is None or registered < LEAST_VIEWS or by_chance:
+        why = ", by matches that agree no better than wrong ones would" if by_chance else ""
         raise NotConnectedError(
             images,
             expected="pictures that structure from motion can connect",
-            found=f"{registered} of {len(sizes)} views registered",
+            found=f"{registered} of {len(sizes)} views registered{why}",
             remedy=f"{ADVICE} {untried}",
         )
     chosen = folder / "chosen"
