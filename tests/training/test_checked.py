@@ -52,6 +52,7 @@ SPOILED: dict[str, Callable[[Tensor], Tensor]] = {
     "infinite": filled(math.inf),
     "longer": lambda t: torch.cat((t.reshape(t.shape or (1,)), t.reshape(t.shape or (1,)))),
     "shorter": lambda t: t.reshape(-1)[:-1].clone() if t.numel() > 1 else t.reshape(1, 1, 1),
+    "wider": lambda t: torch.cat([t.reshape(t.shape or (1,))] * 2, dim=-1),
     "one axis more": lambda t: t[None].clone(),
     "flat": lambda t: t.reshape(-1).clone() if t.ndim > 1 else t.reshape(1, 1, -1).clone(),
     "halves": lambda t: t.to(torch.float16),
