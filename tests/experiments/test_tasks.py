@@ -63,7 +63,8 @@ def test_a_new_run_is_trained_and_scored(planned: Planned) -> None:
     train, scoring = comparing._job(question, only, alone=True).tasks
     assert isinstance(train, Training)
     assert (train.scene, train.folder) == (str(question.scenes[0]), str(only.folder))
-    assert (train.settings, train.reading) == (question.settings, SceneOptions(4, "linear"))
+    asked = dataclasses.replace(question.settings, refractive_index=1.5)  # the scene names none
+    assert (train.settings, train.reading) == (asked, SceneOptions(4, "linear"))
     assert not train.resume
     assert scoring == Scoring(folder=str(only.folder), speed=True, compute=ComputeOptions(1, "cpu"))
     assert not only.folder.exists()
