@@ -132,7 +132,7 @@ def test_black_pixels_are_counted(tiny_scene: Scene) -> None:
     codes = torch.zeros_like(view.codes)
     codes[0, 1, 2, 1] = 200  # one pixel is not black
     height, width = codes.shape[1:3]
-    assert black_share(dataclasses.replace(view, codes=codes)) == pytest.approx(1 - 1 / (height * width))
+    assert black_share(dataclasses.replace(view, pictures=codes)) == pytest.approx(1 - 1 / (height * width))
     assert black_share(view) == 0
 
 

@@ -50,7 +50,7 @@ def empty_pixels(view: View) -> Tensor:
     return torch.from_numpy(~_grown(subject, GROWN))
 
 
-def without_surroundings(scene: Scene) -> Scene:
+def mask_background(scene: Scene) -> Scene:
     """The scene with its subject alone: black outside the masks, and points of the subject only.
 
     Raises:
@@ -65,7 +65,7 @@ def without_surroundings(scene: Scene) -> Scene:
                 found=f"none of view {view.name}",
                 remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
             )
-        views.append(view.subject_alone())
+        views.append(view.masked())
     # The masks of test views tell training nothing.
     inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])
     if len(scene.points) and not bool(inside.any()):

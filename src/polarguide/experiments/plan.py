@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from polarguide import __version__
 from polarguide.capture import View
-from polarguide.capture.background import without_surroundings
+from polarguide.capture.background import mask_background
 from polarguide.capture.view import FULL_CODE
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.facts import SceneFacts
@@ -229,7 +229,7 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
     for path in comparison.scenes:
         scene = read_scene(path, comparison.options, reporter)
         if comparison.settings.background == "masked":
-            scene = without_surroundings(scene)
+            scene = mask_background(scene)
         if scene.name in [entry.name for entry in entries]:
             raise PolarguideError(
                 path,
