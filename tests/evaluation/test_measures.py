@@ -15,6 +15,7 @@ from polarguide.capture.exposures import Exposure
 from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.scores import score_view, summarize
 from polarguide.evaluation.target import ViewTarget, without_jumps
+from polarguide.experiments.plan import black_share
 
 CPU = torch.device("cpu")
 PIXELS = [(y, x) for y in range(HEIGHT) for x in range(WIDTH)]
@@ -240,6 +241,22 @@ def test_coverage_of_an_object_on_black():
     assert 0 < len(beyond) < len(valid)
     expected = sum(float(result.alpha[p]) for p in beyond) / len(beyond)
     assert got["alpha_outside"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_noise_before_nothing_is_black_to_every_measure():
+    scene = known_scene()
+
+    def noisy(view):
+        faint = torch.randint(0, 600, view.codes.shape, generator=torch.Generator().manual_seed(0))
+        codes = torch.where(view.ground_truth.mask[None, ..., None], view.codes.int(), faint)
+        return dataclasses.replace(view, pictures=codes.to(torch.uint16))
+
+    dark = dataclasses.replace(scene, views=tuple(noisy(view) for view in scene.views))
+    brightest = dark.views[0].photograph().amax(dim=-1)[~dark.views[0].ground_truth.mask]
+    assert float((brightest > 1 / 255).float().mean()) > 0.3
+    assert SceneFacts.of(dark).object_only
+    share = float((~scene.views[0].ground_truth.mask).float().mean())
+    assert black_share(dark.views[0]) == pytest.approx(share, abs=0.2)
 
 
 def test_coverage_is_not_scored_where_there_is_a_background():

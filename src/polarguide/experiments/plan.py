@@ -16,8 +16,7 @@ from typing import Any, Literal
 
 from polarguide import __version__
 from polarguide.capture import View
-from polarguide.capture.background import mask_background
-from polarguide.capture.view import FULL_CODE
+from polarguide.capture.background import black_pixels, mask_background
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.record import read_metrics
@@ -34,8 +33,6 @@ from polarguide.training.settings import STEPS, TrainSettings, index_of
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
-BLACK = 0.002
-"""Share of full scale under which a pixel is black."""
 KEY_DIGITS = 10
 
 
@@ -257,9 +254,8 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
 
 
 def black_share(view: View) -> float:
-    """The share of a view's pixels that are black, as it is scored."""
-    brightest = view.codes[0].float().amax(dim=-1)
-    return float((brightest < BLACK * FULL_CODE).float().mean())
+    """The share of a view's pixels that are black."""
+    return float(black_pixels(view).float().mean())
 
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:
