@@ -34,8 +34,9 @@ class Loader(Generic[T]):
         kept = self._latest.kept
         if kept is not None and kept[0] is self:
             return kept[1]
+        del kept  # so that its memory can be taken for the next
         if not self._derived:
-            kept = self._latest.kept = None  # its memory can be taken for the next
+            self._latest.kept = None
         value = self._make()
         self._latest.kept = self, value
         return value

@@ -1,4 +1,4 @@
-"""Smaller pictures, made from those that were read: of a whole scene, or of a view whenever they are asked for."""
+"""Downscaled views, made from views that were read."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from polarguide.capture.view import Scene, View
 def smaller_view(view: View, factor: int, latest: Latest) -> View:
     """A view averaged over boxes of pixels, as if it had been read so; its codes are made when they are read.
 
-    Codes are averaged, which are linear, and with them Stokes vectors, never angles. A pixel is invalid or saturated
-    where one of its box is, and of the subject or of a material where all are. Remainders of a box are cut. Ground
-    truth stays behind.
+    Codes are averaged; they are linear, so Stokes vectors are averaged, and angles never are. A pixel is invalid or
+    saturated where any pixel of its box is; it belongs to the mask or to a material where all are. Incomplete boxes at
+    the right and bottom are dropped. The view has no ground truth.
 
     Args:
         view: the whole view. factor: side of the boxes in pixels. latest: where the codes of a view in memory stay.
@@ -50,7 +50,7 @@ def smaller_view(view: View, factor: int, latest: Latest) -> View:
 
 
 class SmallerViews(Sequence[View]):
-    """Views averaged over boxes of pixels, each made when it is first asked for."""
+    """Views averaged over boxes of pixels, each made at its first use."""
 
     def __init__(self, views: Sequence[View], factor: int) -> None:
         self._views, self._factor = views, factor
@@ -76,7 +76,7 @@ class SmallerViews(Sequence[View]):
 def smaller(scene: Scene, longest: int) -> Scene:
     """The training views averaged until none has a side longer than ``longest`` pixels, see ``smaller_view``.
 
-    Masks and ground truth stay behind, and so do the views that are held out.
+    It has neither masks nor ground truth, nor the views that are held out.
 
     Returns:
         The scene itself where its pictures are small enough.

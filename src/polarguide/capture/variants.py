@@ -1,4 +1,4 @@
-"""The same scene as if it had been captured with fewer pictures: what ``compare --exposures`` trains on."""
+"""A scene with fewer pictures of each view, computed from four: what ``compare --exposures`` trains on."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from polarguide.polarizer import ANGLES
 
 THREE = (0.0, 60.0, 120.0)
 EVERY = 4
-"""One view in so many has four pictures where the others have none through a filter, or are left out."""
+"""``mixed`` and ``sparse`` keep the four pictures of one view in this number."""
 
 Change = Callable[[View, int], View | None]
-"""A training view as it would have been captured, given its place among them; None: it would not."""
+"""A training view with other pictures, given its place among the training views; None: the view is left out."""
 
 
 def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
@@ -29,10 +29,10 @@ def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
 
     Args:
         scene: with pictures at 0, 45, 90 and 135 degrees of every training view.
-        exposures: ``captured``, as it is; ``four``, all of these; ``three``, at 0, 60 and 120 degrees, computed from
-            the Stokes vectors; ``two``, of every view a pair at right angles, 0 and 90 or 45 and 135 in turn; ``one``,
-            of every view one, 0, 45, 90, 135 in turn; ``unknown``, the same without a word about the angles; ``mixed``,
-            four of every fourth view and S0/2 of the others; ``sparse``, the former alone; ``none``, S0/2.
+        exposures: ``captured``: the scene as it is. ``four``: all four pictures. ``three``: at 0, 60 and 120 degrees,
+            computed from the Stokes vectors. ``two``: a pair at right angles, 0 and 90 or 45 and 135 in turn. ``one``:
+            one picture, at 0, 45, 90, 135 in turn. ``unknown``: the same with unknown angles. ``mixed``: all four of
+            every fourth view, S0/2 of the others. ``sparse``: every fourth view alone. ``none``: S0/2.
 
     Raises:
         PolarguideError: there is no such choice, or the scene has other pictures.
