@@ -46,7 +46,7 @@ def one_each(scene: Scene, first: int, withheld: Sequence[bool]) -> Scene:
     for k, view in enumerate(scene.train_views):
         place = (k + first) % len(FOUR)
         exposure = Exposure() if withheld[k] else FOUR[place]
-        changed[view.name] = replace(view, codes=view.codes[place : place + 1], exposures=(exposure,))
+        changed[view.name] = replace(view, pictures=view.codes[place : place + 1], exposures=(exposure,))
     views: list[View] = [changed.get(view.name, view) for view in scene.views]
     return replace(scene, views=tuple(views))
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         prepare,
         present,
         priors,
+        shot_priors,
         train,
     )
     from polarguide.capture import Scene, load_scene
@@ -54,6 +55,7 @@ _NAMES = {
         "prepare",
         "present",
         "priors",
+        "shot_priors",
         "train",
     ),
     "capture": ("Scene", "load_scene"),
@@ -113,6 +115,7 @@ __all__ = [
     "priors",
     "read_analyzers",
     "read_shot",
+    "shot_priors",
     "surface_maps",
     "train",
     "watch_folder",

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,6 @@ from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOption
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
-from polarguide.records import option_name
 from polarguide.rendering import film, pictures, relight
 from polarguide.rendering import present as presenting
 from polarguide.rendering.pictures import select_views
@@ -36,15 +34,15 @@ from polarguide.rendering.priors import write_priors
 from polarguide.runs import train as training
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.sensor_calibration.calibrate import calibrate_sensor
-from polarguide.shots.exposures import find_shots
+from polarguide.shots.develop import require_four_pictures
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.write import FORMATS, WrittenShots, write_shots
+from polarguide.shots.write import FORMATS, WrittenShots, check_formats, write_shots, write_view_maps
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.viewer import watch
 
 _OF_MAPS = ("full_well", "read_noise", "snr")
-"""Options of shots that maps of a scene with poses depend on."""
+"""Options of shots that maps of views of a scene depend on."""
 
 
 class Run(OpenedRun):
@@ -130,134 +128,102 @@ def train(
 
 
 def priors(
-    paths: Scene | PathLike | Sequence[PathLike],
+    scene: Scene | PathLike,
     out: PathLike,
     *,
     run: OpenedRun | None = None,
     views: str = "test",
     refractive_index: float | None = None,
-    threshold: float | None = None,
+    threshold: float = 0.05,
     reading: SceneOptions = SceneOptions(),
-    shots: ShotOptions | None = None,
+    formats: Sequence[str] = (),
+    shots: ShotOptions = ShotOptions(),
+    reporter: Reporter = SILENT,
+) -> Path:
+    """What polarization says about views of a scene: pictures and a contact sheet, and maps if ``formats`` are given.
+
+    All of it is of the scene's views as they are: with their masks, exposures and size. ``shot_priors`` is the same for
+    files of a camera.
+
+    Args:
+        scene: a scene with poses, or its folder, which is read as ``reading`` says.
+        out: folder to write.
+        run, views, threshold, reading: as ``rendering.priors.write_priors`` takes them.
+        refractive_index: of the surfaces; None: as ``scene.json`` says, else 1.5.
+        formats: of maps as ``shot_priors`` writes them, a folder for each view: png, exr, npy, page.
+        shots: ``full_well``, ``read_noise`` and ``snr`` for the maps.
+
+    Returns:
+        The contact sheet.
+
+    Raises:
+        PolarguideError: the scene cannot be read, a view has no such pictures, or an option is wrong or means nothing
+            here.
+    """
+    _require_options_of_maps(shots, maps=bool(formats))
+    refuse_scene(Path(out))
+    found = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
+    index = index_of(refractive_index, found.refractive_index)
+    chosen = select_views(found, views)
+    if formats:
+        check_formats(formats)
+        for view in chosen:
+            require_four_pictures(view)
+    sheet = write_priors(
+        found, out, run=run, views=views, refractive_index=index, threshold=threshold, reporter=reporter
+    )
+    if formats:
+        write_view_maps(chosen, out, shots, formats=formats, refractive_index=index, reporter=reporter)
+    return sheet
+
+
+def shot_priors(
+    paths: PathLike | Sequence[PathLike],
+    out: PathLike,
+    *,
+    refractive_index: float | None = None,
+    shots: ShotOptions = ShotOptions(),
     formats: Sequence[str] | None = None,
     intrinsics: str | None = None,
     reporter: Reporter = SILENT,
-) -> Path | WrittenShots:
-    """What polarization says, with poses or without: of one scene with poses, or of shots.
-
-    Of a scene with poses, pictures of some views and a contact sheet (``rendering.priors.write_priors``), and their
-    maps if ``formats`` are given. Of anything else, all maps of every shot (``shots.write.write_shots``).
+) -> WrittenShots:
+    """What polarization says about single shots, without poses: all maps of every shot (``shots.write.write_shots``).
 
     Args:
-        paths: a scene, its folder, or files and folders of shots as ``find_shots`` takes them.
-        out: folder to write.
-        run, views, threshold, reading: as ``write_priors`` takes them, for a scene with poses alone.
-        refractive_index: of the surfaces; None: as ``scene.json`` says, else 1.5.
-        shots, intrinsics: as ``write_shots`` takes them, for shots alone; noise and ``snr`` for maps of scenes, too.
-        formats: of the maps: png, exr, npy, page; None: all of them for shots, none for a scene with poses.
-
-    Returns:
-        The contact sheet of a scene with poses; else what was written.
+        paths: files and folders of shots as ``find_shots`` takes them.
+        out: folder to write, a folder for each shot in it.
+        refractive_index: of the surfaces; None: as the ``scene.json`` in the only folder says, else 1.5.
+        shots, formats, intrinsics: as ``write_shots`` takes them; None: all formats.
 
     Raises:
         PolarguideError: nothing can be read, or an option is wrong or means nothing here.
     """
-    many = (
-        [] if isinstance(paths, Scene) else [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-    )
-    posed = isinstance(paths, Scene) or (len(many) == 1 and os.path.lexists(Path(many[0]) / "sparse"))
-    if not posed:
-        _refuse_for_shots(run, views, threshold, reading, shots)
-        return write_shots(
-            many,
-            out,
-            shots,
-            formats=FORMATS if formats is None else formats,
-            intrinsics=intrinsics,
-            refractive_index=index_of(refractive_index, _said_index(many)),
-            reporter=reporter,
-        )
-    _refuse_with_poses(intrinsics, shots, reading, bool(formats))
-    refuse_scene(Path(out))
-    scene = paths if isinstance(paths, Scene) else read_scene(many[0], reading, reporter)
-    index = index_of(refractive_index, scene.refractive_index)
-    sheet = write_priors(
-        scene,
+    many = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    index = index_of(refractive_index, _index_from_scene_json(many))
+    return write_shots(
+        many,
         out,
-        run=run,
-        views=views,
+        shots,
+        formats=FORMATS if formats is None else formats,
+        intrinsics=intrinsics,
         refractive_index=index,
-        threshold=0.05 if threshold is None else threshold,
         reporter=reporter,
     )
-    if formats:
-        chosen = {view.name for view in select_views(scene, views)}
-        options = replace(shots or ShotOptions(), transfer=reading.transfer)
-        sets = [
-            replace(found, downscale=reading.downscale)
-            for found in find_shots([scene.root], options)
-            if found.view in chosen
-        ]
-        write_shots(sets, out, options, formats=formats, refractive_index=index, reporter=reporter)
-    return sheet
 
 
-def _said_index(paths: Sequence[PathLike]) -> float | None:
+def _index_from_scene_json(paths: Sequence[PathLike]) -> float | None:
     """The refractive index in the ``scene.json`` of shots from one folder; None where it has none."""
     file = Path(paths[0]) / "scene.json" if len(paths) == 1 else None
     return refractive_index_of(file, read_file(file)) if file is not None and file.is_file() else None
 
 
-def _refuse_for_shots(
-    run: OpenedRun | None,
-    views: str,
-    threshold: float | None,
-    reading: SceneOptions,
-    shots: ShotOptions | None,
-) -> None:
-    """Refuse what means something for a scene with poses alone."""
-    default = SceneOptions()
-    for name, given in (
-        ("run", run is not None),
-        ("views", views != "test"),
-        ("threshold", threshold is not None),
-        ("memory", reading.memory != default.memory),
-        ("split", reading.split != default.split),
-        (
-            "transfer",
-            reading.transfer not in (default.transfer, (shots or ShotOptions()).transfer),
-        ),
-    ):
-        if given:
-            raise PolarguideError(
-                option_name(name),
-                expected="a scene with poses",
-                found="shots",
-                remedy="Leave it out, or name the scene.",
-            )
-    if reading.downscale != 1:
-        raise PolarguideError(
-            "downscale",
-            expected="1 for shots",
-            found=str(reading.downscale),
-            remedy="Use --demosaic quarter.",
-        )
-
-
-def _refuse_with_poses(
-    intrinsics: str | None, shots: ShotOptions | None, reading: SceneOptions, maps: bool
-) -> None:
-    """Refuse what means something for shots alone; ``maps``: maps of the views are written, too."""
-    changed = [] if shots is None else shots.changed()
-    if shots is not None and shots.transfer in ("auto", reading.transfer):
-        changed = [name for name in changed if name != "transfer"]
-    given = (["intrinsics"] if intrinsics is not None else []) + [
-        name for name in changed if not (maps and name in _OF_MAPS)
-    ]
+def _require_options_of_maps(shots: ShotOptions, *, maps: bool) -> None:
+    """Refuse options of shots that mean nothing for views of a scene; ``maps``: maps are written."""
+    given = [name for name in shots.changed() if not (maps and name in _OF_MAPS)]
     if given:
         more = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
         raise PolarguideError(
-            (shots or ShotOptions()).called(given[0]),
+            shots.called(given[0]),
             expected="shots",
             found="a scene with poses",
             remedy=f"Leave it out: the scene has developed pictures and cameras.{more}",

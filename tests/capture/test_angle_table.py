@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from polarguide import PolarguideError
 from polarguide.capture import load_scene
 from polarguide.capture.angle_table import read_table, table_text
 from polarguide.capture.exposures import FOUR, Exposure
+from polarguide.capture.filter.single_shots import find_single_shots
 from polarguide.inspection.capture import read_capture
 from polarguide.polarizer import malus, stokes_of_four
 from tests.helpers.tiny_capture import NAMES, TinyCapture, write_picture, write_tiny_capture
@@ -108,18 +110,19 @@ def test_the_frame_of_a_filter(tiny: TinyCapture) -> None:
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (["v000_000.png,v000"], r"line 2\): expected 4 cells"),
+        (["v000_000.png,v000"], r"line 2\), v000_000.png: expected an angle"),
+        (["v000_000.png"], r"line 2\): expected 4 cells"),
         (["v000_000.png,v000,0,1,2"], r"line 2\): expected 4 cells"),
         (["v000_000.png,v000,0", "v000_000.png,v000,45"], r"line 3\): expected one line for each file"),
         (
             ["v000_000.png,v000,fifty"],
-            r"line 2\): expected a number of degrees, unknown or none as angle, found 'fifty'",
+            r"line 2\), v000_000.png: expected an angle in degrees up to 3600, unknown or none, found .fifty",
         ),
-        (["v000_000.png,v000,inf"], r"line 2\): expected a number of degrees"),
-        (["v000_000.png,v000,"], r"line 2\): expected a number of degrees"),
-        (["v000_000.png,v000,0,-1"], r"line 2\): expected a positive number as gain, found '-1'"),
-        (["v000_000.png,,0"], r"line 2\): expected the name of a view"),
-        (["../v000_000.png,v000,0"], r"line 2\): expected the name of a picture inside polar/"),
+        (["v000_000.png,v000,inf"], r"line 2\), v000_000.png: expected an angle in degrees"),
+        (["v000_000.png,v000,"], r"line 2\), v000_000.png: expected an angle in degrees"),
+        (["v000_000.png,v000,0,-1"], r"line 2\), v000_000.png: expected a gain from 1e-06 to 1e\+06"),
+        (["v000_000.png,,0"], r"expected the picture of view v000 at 0 degrees"),
+        (["../v000_000.png,v000,0"], r"line 2\): expected a picture in polar/, found none called ../v000"),
         (["", "gone.png,v000,0"], r"line 3\): expected a picture in polar/, found none called gone.png"),
     ],
 )
@@ -134,7 +137,7 @@ def test_each_fault_is_one_line(tiny: TinyCapture, lines: list[str], message: st
 @pytest.mark.parametrize("header", ["file,view", "file,view,angle,angle", "picture,view,angle"])
 def test_the_header_is_checked(tiny: TinyCapture, header: str) -> None:
     write(tiny, header=header)
-    with pytest.raises(PolarguideError, match=r"line 1\): expected the header file,view,angle"):
+    with pytest.raises(PolarguideError, match=r"line 1\): expected the header file,angle"):
         load_scene(tiny.root)
 
 
@@ -177,3 +180,51 @@ def test_a_table_of_an_earlier_training_can_be_read(tmp_path: Path) -> None:
     (tmp_path / "angles.csv").write_text("file,view,angle,gain,certainty\na.png,a,10,1.0000,0.90\n")
     (line,) = read_table(tmp_path / "angles.csv")
     assert line.exposure.angle == 10.0
+
+
+TABLES = {
+    "all columns": "file,view,angle,gain,modulation,note\nv001.png,v001,30,2,0.9,doubtful\n",
+    "other order": "angle,gain,file,view\n30,2,v001.png,v001\n",
+    "spaces, quotes and another end of lines": '\ufefffile, view, angle, gain\r\n"v001.png", v001 , "390", 2\r\n\r\n',
+    "upper case": "File,View,Angle,Gain\nv001.png,v001,-150,2\n",
+    "no view": "file,angle,gain\nv001.png,30,2\n",
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_one_table_says_the_same_of_a_scene_and_of_photographs(tmp_path: Path, name: str) -> None:
+    tiny = write_tiny_capture(tmp_path / "scene")
+    replaced(tiny, "v001", {"v001.png": tiny.linear["v001"][0]})
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    shutil.copy(tiny.root / "polar" / "v001.png", shots)
+    for folder in (tiny.root, shots):
+        (folder / "angles.csv").write_text(TABLES[name])
+    assert load_scene(tiny.root).view("v001").exposures == (Exposure(30.0, gain=2.0),)
+    (shot,) = find_single_shots(shots)[0]
+    assert (shot.path.name, shot.view, shot.gain) == ("v001.png", "v001", 2.0)
+    assert isinstance(shot.angle, float)
+    assert shot.angle % 180 == 30
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "file,angle\na.png,3601\n",
+        "file,angle,gain\na.png,0,1e7\n",
+        'file,angle\n"a.png,0\n',
+        "file,angle\n\0,0\n",
+    ],
+)
+def test_a_table_is_refused_for_both_or_for_none(tmp_path: Path, text: str) -> None:
+    tiny = write_tiny_capture(tmp_path / "scene")
+    (tmp_path / "shots").mkdir()
+    shutil.copy(tiny.picture("v000", 0), tmp_path / "shots" / "a.png")
+    shutil.copy(tiny.picture("v000", 0), tiny.root / "polar" / "a.png")
+    said = []
+    for folder, read in ((tiny.root, load_scene), (tmp_path / "shots", find_single_shots)):
+        (folder / "angles.csv").write_text(text)
+        with pytest.raises(PolarguideError) as caught:
+            read(folder)
+        said.append((caught.value.expected, caught.value.found, caught.value.remedy))
+    assert said[0] == said[1]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera, look_at
 from polarguide.capture import Scene, View
-from polarguide.capture.background import empty_pixels, has_black_background, without_surroundings
+from polarguide.capture.background import empty_pixels, has_black_background, mask_background
 from polarguide.errors import PolarguideError
 
 WIDTH, HEIGHT = 40, 30
@@ -70,7 +70,7 @@ def test_a_tenth_of_the_views_may_show_the_subject_at_the_edge_and_no_more() -> 
 
 
 def test_pictures_that_are_black_throughout_are_no_background() -> None:
-    dark = replace(view(), codes=torch.zeros(4, HEIGHT, WIDTH, 3, dtype=torch.uint16))
+    dark = replace(view(), pictures=torch.zeros(4, HEIGHT, WIDTH, 3, dtype=torch.uint16))
     assert not has_black_background([dark])
 
 
@@ -88,8 +88,8 @@ def test_a_mask_says_what_is_empty_whatever_the_picture_shows() -> None:
     assert bool(empty[:, :6].all())
 
 
-def test_without_surroundings_only_the_subject_and_its_points_are_left() -> None:
-    alone = without_surroundings(scene_of(view(background=0.5, mask=subject_mask())))
+def test_mask_background_only_the_subject_and_its_points_are_left() -> None:
+    alone = mask_background(scene_of(view(background=0.5, mask=subject_mask())))
     (left,) = alone.views
     assert not bool(left.codes.int()[:, ~subject_mask()].any())
     assert torch.equal(left.codes[:, 9, 12], picture(0.5)[:, 9, 12])
@@ -100,18 +100,18 @@ def test_without_surroundings_only_the_subject_and_its_points_are_left() -> None
 def test_masks_of_test_views_do_not_choose_points() -> None:
     nothing = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     scene = scene_of(view(mask=subject_mask()), view("v1", mask=nothing))
-    assert without_surroundings(replace(scene, test_names=("v1",))).points.tolist() == [[0.0, 0.0, 0.0]]
+    assert mask_background(replace(scene, test_names=("v1",))).points.tolist() == [[0.0, 0.0, 0.0]]
     with pytest.raises(PolarguideError, match="none of 2 points"):
-        without_surroundings(scene)
+        mask_background(scene)
 
 
 def test_a_view_without_a_mask_is_named() -> None:
     with pytest.raises(PolarguideError, match=r"none of view v1.*masks/v1\.png"):
-        without_surroundings(scene_of(view(mask=subject_mask()), view("v1")))
+        mask_background(scene_of(view(mask=subject_mask()), view("v1")))
 
 
 def test_masks_that_hold_no_point_are_refused() -> None:
     corner = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     corner[:3, :3] = True
     with pytest.raises(PolarguideError, match="none of 2 points"):
-        without_surroundings(scene_of(view(mask=corner)))
+        mask_background(scene_of(view(mask=corner)))

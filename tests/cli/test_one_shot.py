@@ -33,6 +33,9 @@ def test_four_files_and_a_calibration(tmp_path: Path) -> None:
     ("arguments", "line"),
     [
         (["--threshold", "0.1"], "--threshold: expected a scene with poses, found shots"),
+        (["--views", "all"], "--views: expected a scene with poses, found shots"),
+        (["--memory", "1GB"], "--memory: expected a scene with poses, found shots"),
+        (["--run", "runs/x"], "--run: expected a scene with poses, found shots"),
         (["--downscale", "2"], "--downscale: expected 1 for shots, found 2"),
         (["--formats", "pdf"], "--formats: expected some of png, exr, npy, page, found pdf"),
         (["--full-well", "3"], "--full-well: expected 10 to 1000000000, found 3"),

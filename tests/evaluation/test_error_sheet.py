@@ -70,7 +70,7 @@ def test_columns_are_those_that_a_run_has(monkeypatch, tmp_path):
         "picture error",
         "normal error",
     ]
-    bare = tuple(dataclasses.replace(view, ground_truth=None) for view in scene.views)
+    bare = tuple(dataclasses.replace(view, truth=None) for view in scene.views)
     stand_in = dataclasses.replace(scene, views=bare)
     seen = {}
     monkeypatch.setattr(

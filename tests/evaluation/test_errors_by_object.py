@@ -127,12 +127,11 @@ def test_an_object_that_no_test_view_shows():
 def test_views_without_numbers_add_nothing():
     scene = known_scene()
     truth = dataclasses.replace(scene.views[1].ground_truth, object_ids=None)
-    views = (scene.views[0], dataclasses.replace(scene.views[1], ground_truth=truth))
+    views = (scene.views[0], dataclasses.replace(scene.views[1], truth=truth))
     by_object, _ = errors(dataclasses.replace(scene, views=views))
     assert by_object["cup"]["views"] == 1
     bare = tuple(
-        dataclasses.replace(v, ground_truth=dataclasses.replace(v.ground_truth, object_ids=None))
-        for v in views
+        dataclasses.replace(v, truth=dataclasses.replace(v.ground_truth, object_ids=None)) for v in views
     )
     assert errors(dataclasses.replace(scene, views=bare)) == ({}, {})
 

@@ -16,7 +16,7 @@ def changed(scene, number, **fields):
     """The scene with other ground truth in one view."""
     views = list(scene.views)
     truth = views[number].ground_truth
-    views[number] = dataclasses.replace(views[number], ground_truth=dataclasses.replace(truth, **fields))
+    views[number] = dataclasses.replace(views[number], truth=dataclasses.replace(truth, **fields))
     return dataclasses.replace(scene, views=tuple(views))
 
 
@@ -38,7 +38,7 @@ def test_ground_truth_of_some_views():
 
 def test_masks_of_some_views():
     scene = known_scene()
-    views = (scene.views[0], dataclasses.replace(scene.views[1], ground_truth=None))
+    views = (scene.views[0], dataclasses.replace(scene.views[1], truth=None))
     facts = SceneFacts.of(dataclasses.replace(scene, views=views))
     assert facts.masks is None, "or some views would be scored over their foreground, others whole"
     assert "masks of 1, normals of 1" in facts.warnings[0]
@@ -73,7 +73,7 @@ def test_a_material_that_is_not_said():
 
 def test_a_scene_without_ground_truth_has_no_objects_and_no_warnings():
     scene = known_scene()
-    views = tuple(dataclasses.replace(view, ground_truth=None) for view in scene.views)
+    views = tuple(dataclasses.replace(view, truth=None) for view in scene.views)
     facts = SceneFacts.of(dataclasses.replace(scene, views=views))
     assert (facts.objects, facts.warnings, facts.masks, facts.object_only) == ((), (), None, False)
 

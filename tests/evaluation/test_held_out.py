@@ -20,7 +20,7 @@ FINAL = STOKES[0] / 2
 
 def single(place: int, gain: float = 1.0) -> View:
     codes = (WHOLE.codes[place : place + 1].to(torch.float32) * gain).round().to(torch.int32).to(torch.uint16)
-    return dataclasses.replace(WHOLE, codes=codes, exposures=(Exposure(),))
+    return dataclasses.replace(WHOLE, pictures=codes, exposures=(Exposure(),))
 
 
 @pytest.mark.parametrize("place", range(4))
@@ -37,7 +37,7 @@ def test_no_pixel_takes_part_in_its_own_fit() -> None:
     middle = changed.shape[2] // 2
     changed[:, :, :middle] = (changed[:, :, :middle].to(torch.int32) // 2).to(torch.uint16)
     ours = cross_fitted(view, FINAL, STOKES)
-    theirs = cross_fitted(dataclasses.replace(view, codes=changed), FINAL, STOKES)
+    theirs = cross_fitted(dataclasses.replace(view, pictures=changed), FINAL, STOKES)
     assert torch.equal(ours[:, :middle], theirs[:, :middle])
     assert not torch.allclose(ours[:, middle:], theirs[:, middle:], atol=1e-2)
 

@@ -15,6 +15,7 @@ from polarguide.capture.exposures import Exposure
 from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.scores import score_view, summarize
 from polarguide.evaluation.target import ViewTarget, without_jumps
+from polarguide.experiments.plan import black_share
 
 CPU = torch.device("cpu")
 PIXELS = [(y, x) for y in range(HEIGHT) for x in range(WIDTH)]
@@ -70,12 +71,12 @@ def test_stokes_error_of_no_prediction_and_of_the_truth():
 
 def without(view, **fields):
     truth = dataclasses.replace(view.ground_truth, **fields)
-    return dataclasses.replace(view, ground_truth=truth)
+    return dataclasses.replace(view, truth=truth)
 
 
 def test_stokes_error_without_masks_is_over_the_whole_picture():
     scene = known_scene()
-    views = tuple(dataclasses.replace(view, ground_truth=None) for view in scene.views)
+    views = tuple(dataclasses.replace(view, truth=None) for view in scene.views)
     bare = dataclasses.replace(scene, views=views)
     _, predicted, _ = rendered(scene.views[0], 5)
     target = ViewTarget.of_view(views[0], SceneFacts.of(bare), CPU)
@@ -98,7 +99,7 @@ def test_the_users_masks_count_for_stokes_vectors():
     scene = known_scene()
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     mask[2:9, 5:20] = True
-    views = tuple(dataclasses.replace(view, ground_truth=None, mask=mask) for view in scene.views)
+    views = tuple(dataclasses.replace(view, truth=None, mask=mask) for view in scene.views)
     facts = SceneFacts.of(dataclasses.replace(scene, views=views))
     _, predicted, _ = rendered(scene.views[0], 5)
     result, *_ = rendered(scene.views[0], 5)
@@ -115,13 +116,13 @@ def test_stokes_error_without_layers_or_polarization():
     assert got["stokes_error"] is None
     assert "no specular and diffuse layers" in got["stokes_error_reason"]
     codes = view.codes.to(torch.float64).mean(dim=0, keepdim=True).expand(4, -1, -1, -1)
-    depolarized = dataclasses.replace(view, codes=codes.round().to(torch.uint16))
+    depolarized = dataclasses.replace(view, pictures=codes.round().to(torch.uint16))
     got = score(depolarized, facts)
     assert (got["stokes_error"], got["stokes_error_reason"]) == (
         None,
         "hardly any polarization was measured where it counts",
     )
-    pair = dataclasses.replace(view, codes=view.codes[[0, 2]], exposures=(Exposure(0.0), Exposure(90.0)))
+    pair = dataclasses.replace(view, pictures=view.codes[[0, 2]], exposures=(Exposure(0.0), Exposure(90.0)))
     got = score(pair, facts)
     assert (got["stokes_error"], got["stokes_error_reason"]) == (
         None,
@@ -131,7 +132,7 @@ def test_stokes_error_without_layers_or_polarization():
     for share, known in ((0.9e-3, False), (1.1e-3, True)):
         half = view.intensities().mean(dim=0)
         four = torch.stack((half * (1 + share), half, half * (1 - share), half))
-        weak = dataclasses.replace(view, codes=(four * 65535).round().to(torch.uint16))
+        weak = dataclasses.replace(view, pictures=(four * 65535).round().to(torch.uint16))
         measured = weak.codes.double() / 65535
         counts = view.ground_truth.mask & ~view.invalid & ~view.saturated
         size = (measured[0] - measured[2]).abs()[counts].sum() + (measured[1] - measured[3]).abs()[
@@ -221,7 +222,7 @@ def test_jumps_of_depth():
 def on_black(view):
     """The view with light inside its mask alone."""
     codes = torch.where(view.ground_truth.mask[None, ..., None], view.codes.int(), 0).to(torch.uint16)
-    return dataclasses.replace(view, codes=codes)
+    return dataclasses.replace(view, pictures=codes)
 
 
 def test_coverage_of_an_object_on_black():
@@ -240,6 +241,22 @@ def test_coverage_of_an_object_on_black():
     assert 0 < len(beyond) < len(valid)
     expected = sum(float(result.alpha[p]) for p in beyond) / len(beyond)
     assert got["alpha_outside"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_noise_before_nothing_is_black_to_every_measure():
+    scene = known_scene()
+
+    def noisy(view):
+        faint = torch.randint(0, 600, view.codes.shape, generator=torch.Generator().manual_seed(0))
+        codes = torch.where(view.ground_truth.mask[None, ..., None], view.codes.int(), faint)
+        return dataclasses.replace(view, pictures=codes.to(torch.uint16))
+
+    dark = dataclasses.replace(scene, views=tuple(noisy(view) for view in scene.views))
+    brightest = dark.views[0].photograph().amax(dim=-1)[~dark.views[0].ground_truth.mask]
+    assert float((brightest > 1 / 255).float().mean()) > 0.3
+    assert SceneFacts.of(dark).object_only
+    share = float((~scene.views[0].ground_truth.mask).float().mean())
+    assert black_share(dark.views[0]) == pytest.approx(share, abs=0.2)
 
 
 def test_coverage_is_not_scored_where_there_is_a_background():

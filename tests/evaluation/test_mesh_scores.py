@@ -184,7 +184,7 @@ def test_the_mesh_of_a_run_is_scored() -> None:
 
 
 def test_nothing_to_compare_or_to_fuse(monkeypatch: pytest.MonkeyPatch) -> None:
-    unknown = [dataclasses.replace(view, ground_truth=None) for view in views()]
+    unknown = [dataclasses.replace(view, truth=None) for view in views()]
     assert measured.mesh_scores(fused(sphere_result), unknown) == {}
 
     def nothing(camera: Camera) -> RenderResult:
@@ -203,7 +203,7 @@ def test_a_package_that_is_missing_is_the_reason(monkeypatch: pytest.MonkeyPatch
     assert set(got) == {"mesh_fscore_1_reason"}
     assert "skimage is not installed" in str(got["mesh_fscore_1_reason"])
     assert install_package("skimage") in str(got["mesh_fscore_1_reason"])
-    unknown = [dataclasses.replace(view, ground_truth=None) for view in views()]
+    unknown = [dataclasses.replace(view, truth=None) for view in views()]
     assert measured.mesh_scores(fused(sphere_result), unknown) == {}
 
 

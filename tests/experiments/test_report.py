@@ -62,7 +62,7 @@ def test_the_truth_of_metalness_is_that_of_the_objects(tiny_scene: Scene) -> Non
     ids[:4], ids[4:8], ids[8:12] = 1, 2, 3
     kinds = ("metal", "plastic", "roughconductor")
     objects = tuple(SceneObject(k + 1, kind, True, Material(kind)) for k, kind in enumerate(kinds))
-    view = dataclasses.replace(view, ground_truth=GroundTruth(object_ids=ids))
+    view = dataclasses.replace(view, truth=GroundTruth(object_ids=ids))
     tile = _ground_truth_tile(dataclasses.replace(tiny_scene, objects=objects), view)
     shown = tile.pictures["metalness"].astype(int).sum(axis=2)
     assert bool((shown[:4] > 600).all())

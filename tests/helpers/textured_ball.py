@@ -81,7 +81,7 @@ def textured_ball(
         codes = (values.clamp(0, 1) * 65535).round().to(torch.uint16)
         nothing = torch.zeros(height, width, dtype=torch.bool)
         truth = GroundTruth(normal=torch.where(hit[..., None], normal, 0.0).float(), mask=hit)
-        made.append(View(f"v{k:02d}", camera, codes, nothing, nothing, ground_truth=truth))
+        made.append(View(f"v{k:02d}", camera, codes, nothing, nothing, truth=truth))
     middle = (views - tests) // 2
     held_out = tuple(view.name for view in made[middle : middle + tests])
     nowhere, black = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)

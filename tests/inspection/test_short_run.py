@@ -25,8 +25,8 @@ def test_its_key_ignores_the_order_of_the_pictures_and_nothing_else(small) -> No
         return dataclasses.replace(small, views=tuple(views))
 
     key = photograph_digest(small)
-    assert photograph_digest(with_first(codes=lambda v: v.codes[[2, 1, 0, 3]])) == key
-    assert photograph_digest(with_first(codes=lambda v: (v.codes.int() + 1).to(torch.uint16))) != key
+    assert photograph_digest(with_first(pictures=lambda v: v.codes[[2, 1, 0, 3]])) == key
+    assert photograph_digest(with_first(pictures=lambda v: (v.codes.int() + 1).to(torch.uint16))) != key
     moved = with_first(camera=lambda v: dataclasses.replace(v.camera, translation=v.camera.translation + 0.1))
     assert photograph_digest(moved) != key
 

@@ -13,7 +13,7 @@ from textured_ball import ball_radius, textured_ball
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.capture.variants import captured_as
+from polarguide.capture.variants import select_exposures
 from polarguide.errors import PolarguideError
 from polarguide.neural.march import _strata
 from polarguide.neural.model import FieldModel
@@ -113,7 +113,7 @@ def test_all_recipes_take_a_step(ball: Scene, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_views_whose_pictures_say_no_polarization_count_as_color(ball: Scene) -> None:
-    made = trainer(captured_as(ball, "none"), 3)
+    made = trainer(select_exposures(ball, "none"), 3)
     assert all(bool(made.step().measured.isfinite().all()) for _ in range(3))
 
 

@@ -17,7 +17,7 @@ import polarguide
 from polarguide.camera import Camera
 from polarguide.capture import Scene, View, load_scene
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
-from polarguide.capture.variants import captured_as
+from polarguide.capture.variants import select_exposures
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions, SessionOptions
 from polarguide.progress import SILENT
@@ -181,7 +181,7 @@ def test_a_wrong_angle_shows_behind_the_filter(kind: str) -> None:
     """The picture itself may be right: what is behind the filter is compared, of four pictures and of one."""
     scene = around(WHOLE)
     model = StandIn(scene, **{view.name: noisy for view in scene.views})
-    views = scene.views if kind == "four" else captured_as(scene, "one").views
+    views = scene.views if kind == "four" else select_exposures(scene, "one").views
     exposures = tuple(dataclasses.replace(e, angle=(e.angle + 90) % 180) for e in views[4].exposures)
     right = examined(model, scene, views)
     wrong = examined(model, scene, (*views[:4], views[4].with_exposures(exposures), *views[5:]))
@@ -209,7 +209,7 @@ def test_half_and_double_the_limits_tell_the_same_of_a_burned_view() -> None:
 
 
 def test_the_word_says_what_most_views_tell_and_what_is_in_doubt() -> None:
-    one, plain = captured_as(WHOLE, "one"), captured_as(WHOLE, "none")
+    one, plain = select_exposures(WHOLE, "one"), select_exposures(WHOLE, "none")
     truth = {view.name: view.stokes() for view in WHOLE.views}
     polarizers = Polarizers(one, STOKES, 40)
     polarizers.take(polarizers.fit(lambda view: truth[view.name])[None])

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 from textured_ball import cameras
+from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.neural.recipe import NeuralRecipe
 from polarguide.neural.state import FieldState
-from polarguide.options import SceneOptions, gibibytes
+from polarguide.options import Exposures, SceneOptions, gibibytes
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs import forecast as forecasts
 from polarguide.runs import memory
+from polarguide.runs import train as training
 from polarguide.runs.defaults import MOST_GAUSSIANS, resolve
 from polarguide.runs.memory import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.flat import Flat
@@ -180,3 +184,21 @@ def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(PolarguideError, match="memory: expected at least") as error:
         plan_field_memory(SMALL, field, limit=0.01)
     assert "Gaussians" not in str(error.value)
+
+
+@pytest.mark.parametrize("exposures", ["three", "one"])
+def test_other_exposures_leave_the_pictures_in_their_files(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exposures: Exposures
+) -> None:
+    means = []
+    settings = TrainSettings(12, exposures=exposures)
+    for hold in (True, False):
+        plan = MemoryPlan(hold, None, 4 << 30)
+        monkeypatch.setattr(training, "_planned", lambda *_, plan=plan: plan)
+        run = training.train(
+            demo_scene, tmp_path / f"run {hold}", settings=settings, reading=SceneOptions(downscale=8)
+        )
+        held = [isinstance(view.pictures, Tensor) for view in run.scene.train_views]
+        assert held == [hold] * len(held)
+        means.append(run.gaussians["means"])
+    assert torch.equal(*means)

@@ -111,7 +111,7 @@ def test_shots_of_a_scene_without_poses_have_its_index(water: Path, tmp_path: Pa
     shutil.rmtree(water / "sparse")
     for index, expected in ((None, 1.33), (1.4, 1.4)):
         out = tmp_path / f"maps {index}"
-        found = polarguide.priors(water, out, refractive_index=index, formats=["npy"])
+        found = polarguide.shot_priors(water, out, refractive_index=index, formats=["npy"])
         (record, *_) = (
             path for path in sorted(out.rglob("*.json")) if "refractive_index" in path.read_text()
         )

@@ -12,7 +12,6 @@ import pytest
 import polarguide
 from polarguide.capture.calibration import Calibration
 from polarguide.errors import PolarguideError
-from polarguide.options import SceneOptions
 from polarguide.shots import ShotOptions, find_shots, read_shot, write_shots
 from polarguide.shots.exposures import ExposureSet
 from tests.helpers.heard import Heard
@@ -74,7 +73,7 @@ def test_no_paths() -> None:
         with pytest.raises(PolarguideError, match="paths: expected at least one file or folder"):
             call([])
     with pytest.raises(PolarguideError, match="paths: expected at least one file or folder"):
-        polarguide.priors([], "out")
+        polarguide.shot_priors([], "out")
 
 
 def test_a_name_that_leads_out_of_the_folder(tmp_path: Path) -> None:
@@ -153,18 +152,6 @@ def test_noise_counts_for_the_maps_of_a_scene_with_poses(tmp_path: Path) -> None
     wrong = ShotOptions(calibration=Calibration(order=(90, 45, 0, 135)))
     with pytest.raises(PolarguideError, match=r"calibration \(order\): expected shots"):
         polarguide.priors(scene, tmp_path, views="v000", shots=wrong, formats=["npy"])
-
-
-@pytest.mark.parametrize(
-    ("name", "given"),
-    [("views", {"views": "all"}), ("memory", {"reading": SceneOptions(memory=1.0)}),
-     ("transfer", {"reading": SceneOptions(transfer="srgb")})],
-)  # fmt: skip
-def test_options_of_scenes_are_refused_for_shots(tmp_path: Path, name: str, given: dict[str, Any]) -> None:
-    paths = write_four(tmp_path / "in", CUP)
-    with pytest.raises(PolarguideError, match=f"^--{name}: expected a scene with poses, found shots"):
-        polarguide.priors(paths, tmp_path / "out", **given)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import polarguide
+from polarguide import optics
+from polarguide.capture.exposures import FOUR
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions
 from polarguide.shots import (
@@ -25,6 +29,7 @@ from polarguide.shots import (
     write_shots,
 )
 from polarguide.shots.catalog import KINDS
+from polarguide.shots.maps import Reason
 from polarguide.shots.page_html import PAGE
 from polarguide.shots.pictures import drawn, stretch_of, with_legend
 from polarguide.shots.surface import parse_intrinsics
@@ -106,9 +111,58 @@ def test_a_scene_with_poses_keeps_its_pictures_and_gets_maps_on_demand(tmp_path:
     assert sheet == tmp_path / "contact_sheet.png"
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == ["v000"]
     assert json.loads((tmp_path / "v000" / "maps.json").read_text())["rays"] == "of a pinhole camera"
-    for given in ({"intrinsics": "1,1,1,1"}, {"shots": ShotOptions(sensor="IMX250MZR")}):
-        with pytest.raises(PolarguideError, match="expected shots, found a scene with poses"):
-            polarguide.priors(scene, tmp_path / "x", **given)  # type: ignore[arg-type]
+    with pytest.raises(PolarguideError, match="expected shots, found a scene with poses"):
+        polarguide.priors(scene, tmp_path / "x", shots=ShotOptions(sensor="IMX250MZR"))
+
+
+def test_what_is_written_is_of_the_views_of_the_scene_that_is_given(demo_scene: Path, tmp_path: Path) -> None:
+    """Not of the files in its folder: a view may have another mask, other pictures, or another frame of its angles."""
+    scene = polarguide.load_scene(demo_scene, downscale=4, views=["v000", "v008"])
+    view = scene.view("v000")
+    mask = torch.zeros_like(view.invalid)
+    mask[:, 10:] = True
+    stokes = view.stokes()
+    half = view.changed(lambda codes: (codes.int() // 2).to(torch.uint16))
+    changed = {
+        "masked": replace(view, mask=mask).masked(),
+        "darker": half,
+        "filter": replace(view, mount="filter"),
+    }
+    maps = {}
+    for name, other in changed.items():
+        given = replace(scene, views=(other, scene.view("v008")))
+        polarguide.priors(given, tmp_path / name, views="v000", formats=["npy"])
+        maps[name] = {
+            key: np.load(tmp_path / name / "v000" / f"{key}.npy") for key in ("S0", "DoLP", "reason")
+        }
+        expected = optics.luminance(other.stokes())
+        np.testing.assert_allclose(maps[name]["S0"].mean(axis=-1), expected[0], atol=1e-4)
+        np.testing.assert_allclose(maps[name]["DoLP"][:, 10:], optics.dolp(expected)[:, 10:], atol=2e-3)
+    assert (maps["masked"]["reason"][:, :10] == Reason.MASKED).all()
+    assert not (maps["masked"]["reason"][:, 10:] == Reason.MASKED).all()
+    np.testing.assert_allclose(maps["darker"]["S0"], stokes[0] / 2, atol=1e-3)
+    one = replace(scene, views=tuple(view.changed(lambda codes: codes[:1], FOUR[:1]) for view in scene.views))
+    with pytest.raises(PolarguideError, match="view v000: expected pictures at 0, 45, 90 and 135 degrees"):
+        polarguide.priors(one, tmp_path / "one", views="v000", formats=["npy"])
+    assert not (tmp_path / "one").exists()
+
+
+def test_pixels_of_a_view_say_what_those_of_its_files_say(demo_scene: Path) -> None:
+    view = polarguide.load_scene(demo_scene, views=["v000"]).view("v000")
+    (shot,) = (found for found in find_shots([demo_scene]) if found.view == "v000")
+    options = ShotOptions(full_well=1e4)
+    ours, theirs = read_shot(view, options), read_shot(shot, options)
+    for name in ("intensities", "stokes", "dolp", "aolp"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
+    assert ours.noise.slope == theirs.noise.slope
+    assert (
+        ours.reason != theirs.reason
+    ).mean() < 2e-3  # the demo's values are rounded more than its files tell
+    black, burned = view.codes.clone(), torch.zeros_like(view.invalid)
+    black[:, :, :8], burned[:, :16] = 0, True
+    found = read_shot(replace(view, pictures=black, saturated=burned), options).reason
+    assert (found[:, :8] == Reason.DARK).all()
+    assert (found[:, 8:16][view.codes.numpy().max(axis=(0, 3))[:, 8:16] > 30000] == Reason.SATURATED).all()
 
 
 def test_the_page_asks_for_nothing_and_escapes_names(tmp_path: Path) -> None:

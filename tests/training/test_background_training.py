@@ -30,7 +30,7 @@ def black_scene(tiny_scene: Scene) -> Scene:
     for view in tiny_scene.views:
         shown = (view.photograph() - background).abs().amax(dim=-1) > 0.02
         shown[:2] = shown[-2:] = shown[:, :2] = shown[:, -2:] = False
-        views.append(replace(view, codes=view.codes * shown.to(view.codes)[None, ..., None]))
+        views.append(replace(view, pictures=view.codes * shown.to(view.codes)[None, ..., None]))
     return replace(tiny_scene, views=tuple(views))
 
 

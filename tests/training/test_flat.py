@@ -85,7 +85,7 @@ def test_what_is_not_polarized_and_what_is_noise_is_not_flat() -> None:
     view = photographed(of, normals, nothing)
     assert flat_surface(view, INDEX) is None
     noise = torch.rand(view.codes.shape, generator=torch.Generator().manual_seed(2)) * FULL_CODE
-    assert flat_surface(replace(view, codes=noise.to(torch.int32).to(torch.uint16)), INDEX) is None
+    assert flat_surface(replace(view, pictures=noise.to(torch.int32).to(torch.uint16)), INDEX) is None
     assert flat_surface(replace(floor(of)[0], invalid=~nothing), INDEX) is None
 
 

@@ -138,7 +138,7 @@ def test_the_users_words_need_no_polarization(tiny_scene: Scene) -> None:
     views = [
         dataclasses.replace(
             view,
-            codes=view.codes[:1],
+            pictures=view.codes[:1],
             exposures=view.exposures[:1],
             materials=torch.where(view.invalid, 0, 2).to(torch.uint8),
         )

@@ -133,7 +133,7 @@ def test_two_pictures_tell_what_polarization_they_differ_by() -> None:
     result = rendered()
     view = measured(result, KINDS["askew"])
     unpolarized = replace(
-        view, codes=view.codes.float().mean(0, keepdim=True).expand(2, -1, -1, -1).to(torch.uint16)
+        view, pictures=view.codes.float().mean(0, keepdim=True).expand(2, -1, -1, -1).to(torch.uint16)
     )
     total, _ = terms(result, unpolarized, replace(WEIGHTS, photometric=0.0))
     gradients = torch.autograd.grad(total, (result.specular, result.diffuse, result.normal))

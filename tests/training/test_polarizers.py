@@ -14,7 +14,7 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.capture.angle_table import read_table
 from polarguide.capture.exposures import FOUR, Exposure
-from polarguide.capture.variants import captured_as
+from polarguide.capture.variants import select_exposures
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.angles import report_polarizers
@@ -55,7 +55,7 @@ def with_exposures(scene: Scene, **said: Exposure) -> Scene:
 
 
 def test_unknown_angles_are_found_and_believed() -> None:
-    scene, true = captured_as(WHOLE, "unknown"), captured_as(WHOLE, "one")
+    scene, true = select_exposures(WHOLE, "unknown"), select_exposures(WHOLE, "one")
     polarizers = Polarizers(scene, STOKES, STEPS)
     assert polarizers.judgments() == []
     assert next(step for step in range(STEPS) if polarizers.due(step)) == STEPS // 2
@@ -78,7 +78,7 @@ def test_four_pictures_of_a_sensor_are_left_alone() -> None:
 
 
 def test_recipes_without_the_term_ignore_angles() -> None:
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     for name in ("3dgs", "polarguide", "polarguide-stokes:unpolarized"):
         polarizers = Polarizers(scene, recipe_named(name), STEPS)
         assert polarizers.ignored
@@ -100,7 +100,7 @@ def test_the_mean_of_fits_goes_by_what_each_is_sure_of() -> None:
 
 
 def test_pictures_whose_fits_do_not_agree_are_named(tmp_path: Path) -> None:
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     polarizers = Polarizers(scene, STOKES, STEPS)
     fits = polarizers.fit(predicted).repeat(4, 1, 1)
     fits[:, :, 3] = 2.0
@@ -122,7 +122,7 @@ def test_pictures_whose_fits_do_not_agree_are_named(tmp_path: Path) -> None:
 
 def test_pictures_that_are_explained_poorly_are_named(tmp_path: Path) -> None:
     """What is predicted of one view is another view's, so that its angle is sure, for all that it says, and wrong."""
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     poor = scene.train_views[2].name
 
     def mixed(view: View) -> Tensor:
@@ -151,7 +151,7 @@ def test_pictures_that_are_explained_poorly_are_named(tmp_path: Path) -> None:
 
 
 def test_a_guess_is_better_than_a_photograph(tmp_path: Path) -> None:
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     polarizers = Polarizers(scene, STOKES, STEPS)
     fits = polarizers.fit(predicted).repeat(4, 1, 1)
     sure, guessed, lost = 0, 1, 2
@@ -178,8 +178,8 @@ def test_a_guess_is_better_than_a_photograph(tmp_path: Path) -> None:
 
 
 def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
-    ones = captured_as(WHOLE, "one")
-    plain = {view.name: view for view in captured_as(WHOLE, "none").views}
+    ones = select_exposures(WHOLE, "one")
+    plain = {view.name: view for view in select_exposures(WHOLE, "none").views}
     views = [plain[v.name] if v.name == "v3" else v for v in ones.views]
     said = {"v1": Exposure(90.0), "v3": Exposure(45.0), "v4": Exposure(135.0)}  # true: 0, none, 135
     polarizers = judged(with_exposures(dataclasses.replace(ones, views=tuple(views)), **said))
@@ -199,7 +199,7 @@ def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
 
 def test_only_what_is_an_exception_contradicts(tmp_path: Path) -> None:
     """A fit is evidence as far as those of the other pictures agree with their angles."""
-    scene = captured_as(WHOLE, "one")
+    scene = select_exposures(WHOLE, "one")
     polarizers = Polarizers(scene, STOKES, STEPS)
     right = polarizers.fit(predicted)[None]
     right[..., 3] = 2.0
@@ -226,7 +226,7 @@ def test_only_what_is_an_exception_contradicts(tmp_path: Path) -> None:
 
 
 def test_where_most_angles_are_doubtful_it_says_what_to_do(tmp_path: Path) -> None:
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     polarizers = Polarizers(scene, STOKES, STEPS)
     fits = polarizers.fit(predicted)[None]
     fits[..., 3] = 2.0
@@ -243,9 +243,9 @@ def test_where_most_angles_are_doubtful_it_says_what_to_do(tmp_path: Path) -> No
 
 
 def test_exposure_times_are_found() -> None:
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     brighter = [
-        dataclasses.replace(view, codes=(view.codes.to(torch.int32) * 3 // 4).to(torch.uint16))
+        dataclasses.replace(view, pictures=(view.codes.to(torch.int32) * 3 // 4).to(torch.uint16))
         if view.name == "v2"
         else view
         for view in scene.views
@@ -265,7 +265,7 @@ def trained(scene: Scene, until: int, state: TrainingState | None = None) -> Tra
 
 
 def test_it_begins_again_with_the_angles_that_it_found() -> None:
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     reports: list[StepReport] = []
     settings = resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES)
     trainer = Trainer(scene, STOKES, settings, CPU)
@@ -296,7 +296,7 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
 def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("polarguide.training.polarizers.SEARCH_STEPS", 20)
     monkeypatch.setattr("polarguide.training.trainer.SEARCH_SIZE", 16)
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     width = scene.views[0].camera.width
     assert width > 16
     trainer = Trainer(
@@ -322,7 +322,7 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
     view = trainer.scene.train_views[0]
     assert trainer.polarizers.believed(view).codes is view.codes
     # On a schedule that tells nothing of a search, known angles are looked at three times.
-    scene = captured_as(WHOLE, "one")
+    scene = select_exposures(WHOLE, "one")
     known = Trainer(
         scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
     )
@@ -331,7 +331,7 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("exposures", ["one", "four", "none"])
 def test_where_all_angles_are_known_nothing_begins_again(exposures: str) -> None:
-    scene = captured_as(WHOLE, exposures)  # type: ignore[arg-type]
+    scene = select_exposures(WHOLE, exposures)  # type: ignore[arg-type]
     trainer = Trainer(
         scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
     )
@@ -340,7 +340,7 @@ def test_where_all_angles_are_known_nothing_begins_again(exposures: str) -> None
 
 @pytest.mark.parametrize("until", [STEPS // 2, 23, 27, 39])
 def test_a_resumed_training_gives_the_same_bits(until: int) -> None:
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     whole = trained(scene, STEPS)
     stored = {name: values.clone() for name, values in trained(scene, until).state.tensors().items()}
     refuse_foreign(stored, STOKES)
@@ -353,7 +353,7 @@ def test_a_resumed_training_gives_the_same_bits(until: int) -> None:
 
 @pytest.mark.parametrize("exposures", ["three", "two", "one", "mixed", "none", "sparse"])
 def test_all_captures_train(exposures: str) -> None:
-    scene = captured_as(WHOLE, exposures)  # type: ignore[arg-type]
+    scene = select_exposures(WHOLE, exposures)  # type: ignore[arg-type]
     trainer = trained(scene, STEPS)
     assert all(bool(values.isfinite().all()) for values in trainer.state.tensors().values())
 
@@ -370,7 +370,7 @@ def test_four_pictures_train_as_ever() -> None:
 
 
 def test_the_fits_of_the_latest_search_hold() -> None:
-    scene = captured_as(WHOLE, "unknown")
+    scene = select_exposures(WHOLE, "unknown")
     polarizers = Polarizers(scene, STOKES, STEPS, search=STEPS)
     fit = polarizers.fit(predicted)
     fit[:, 3] = 2.0

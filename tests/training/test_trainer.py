@@ -198,7 +198,7 @@ def test_test_views_are_never_trained_on(tiny_scene: Scene) -> None:
     blackened = dataclasses.replace(
         tiny_scene,
         views=tuple(
-            dataclasses.replace(view, codes=torch.zeros_like(view.codes))
+            dataclasses.replace(view, pictures=torch.zeros_like(view.codes))
             if view.name in tiny_scene.test_names
             else view
             for view in tiny_scene.views

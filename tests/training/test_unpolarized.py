@@ -26,7 +26,7 @@ def repolarized(view: View) -> View:
     order = torch.tensor([1, 0, 3, 2])  # 0 with 45 and 90 with 135 degrees
     codes = view.codes[order]
     codes[:, :, ::2] = codes[:, :, ::2][torch.tensor([2, 3, 0, 1])]
-    return replace(view, codes=codes)
+    return replace(view, pictures=codes)
 
 
 @pytest.fixture(scope="module")

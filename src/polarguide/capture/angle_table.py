@@ -1,146 +1,146 @@
-"""``angles.csv``: which picture of ``polar/`` belongs to which view, and what was before the lens."""
+"""``angles.csv``: the polarizer angle of each picture of a scene, or of each photograph that is to be prepared."""
 
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from polarguide.capture.exposures import Exposure, normalized
+from polarguide.capture.polarizer_angles import LARGEST, Angle, parse_angle
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
 from polarguide.numerals import decimal
+from polarguide.records import shortened
 from polarguide.spreadsheet import csv_lines
 
 TABLE = "angles.csv"
-UNKNOWN, NONE = "unknown", "none"
-_COLUMNS = ("file", "view", "angle")
-_MORE = ("gain", "modulation", "note")
-"""Further columns; the last two are what a training says of its pictures, and are passed over."""
-_EARLIER = "certainty"
-"""What runs of earlier versions call the modulation; their tables stay in use."""
-_LARGEST = 1 << 26
-_LEAST_GAIN = 1e-6
-"""A camera exposes over some thirty stops; less leaves no numbers in single precision."""
-_REMEDY = f"Correct the line: file,view,angle[,gain] with the angle in degrees, {UNKNOWN} or {NONE}."
+_COLUMNS = ("file", "view", "angle", "gain", "modulation", "note")
+_NEEDED = ("file", "angle")
+_WRITTEN_BY_TRAINING = ("modulation", "note", "certainty")
+"""Columns that a training writes, and that are not read; ``certainty`` in earlier versions."""
+_LARGEST_TABLE = 1 << 26
+_LARGEST_GAIN = 1e6
+"""A camera exposes over some twenty stops either way; more leaves no numbers in single precision."""
+_REMEDY = "Columns are file, angle (degrees, unknown or none) and, where wanted, view and gain, with commas between."
 
 
 @dataclass(frozen=True)
-class Listed:
+class Line:
     """A line of the table.
 
     Attributes:
-        line: its number, from 1. file: name inside ``polar/``. view: name of the view. exposure: what it says.
+        number: of the line, from 1.
+        file: the picture's name: inside ``polar/`` of a scene, else relative to the folder of the photographs.
+        view: pictures of one view share their pose; None for a view of its own, called like the file without suffix.
+        angle: of the polarizer.
+        gain: exposure relative to the other pictures; None if it is not given.
     """
 
-    line: int
+    number: int
     file: str
-    view: str
-    exposure: Exposure
+    view: str | None
+    angle: Angle
+    gain: float | None
+
+    @property
+    def exposure(self) -> Exposure:
+        """The exposure; its gain is 1 if it is not given."""
+        gain = 1.0 if self.gain is None else self.gain
+        if isinstance(self.angle, str):
+            return Exposure(filtered=self.angle == "unknown", gain=gain)
+        return Exposure(normalized(self.angle), gain=gain)
 
 
-def read_table(path: Path, data: bytes | None = None) -> list[Listed]:
-    """The lines of a table, in their order.
-
-    Args:
-        path: of the table, for messages. data: its content; None: it is read.
+def read_table(path: Path) -> list[Line]:
+    """The lines of a table, in their order. Empty cells at the end of a line may be left out.
 
     Raises:
-        PolarguideError: a line is not as it should be, or a file has two; the message has its number.
+        PolarguideError: it cannot be read, a column is missing or unknown, a file is listed twice, or an angle or a
+            gain is not a number; the message has the line.
     """
-    data = read_file(path, largest=_LARGEST, remedy=_REMEDY) if data is None else data
+    data = read_file(path, largest=_LARGEST_TABLE, remedy=_REMEDY)
     try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
+        text = io.StringIO(data.decode("utf-8-sig"), newline="")
+        reader = csv.reader(text, strict=True, skipinitialspace=True)
+        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except (UnicodeDecodeError, csv.Error) as error:
         raise PolarguideError(
-            path, expected="text in UTF-8", found=str(error), remedy="Save the table anew."
+            path, expected="CSV text in UTF-8", found=f"something else ({error})", remedy=_REMEDY
         ) from None
-    rows = csv.reader(text.splitlines(), skipinitialspace=True)
-    try:
-        cells = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
-    except csv.Error as error:
-        raise PolarguideError(
-            f"{path} (line {rows.line_num})", expected="CSV", found=str(error), remedy=_REMEDY
-        ) from None
-    cells = [(line, row) for line, row in cells if any(row)]
-    columns = _header(path, cells[0][1] if cells else [])
-    lines: dict[str, Listed] = {}
-    for line, row in cells[1:]:
-        item = _listed(f"{path} (line {line})", line, row, columns)
-        if item.file in lines:
+    rows = [(number, row) for number, row in rows if any(row)]
+    columns = _header(path, rows[0][1] if rows else [])
+    lines: dict[str, Line] = {}
+    for number, row in rows[1:]:
+        where = f"{path} (line {number})"
+        if not len(_NEEDED) <= len(row) <= len(columns):
+            found = f"{len(row)}: {shortened(','.join(row))}"
+            raise PolarguideError(where, expected=f"{len(columns)} cells", found=found, remedy=_REMEDY)
+        line = _line(where, number, dict(zip(columns, row, strict=False)))
+        if line.file in lines:
             raise PolarguideError(
-                f"{path} (line {line})",
+                where,
                 expected="one line for each file",
-                found=f"{item.file}, which line {lines[item.file].line} has, too",
+                found=f"two for {line.file}, lines {lines[line.file].number} and {number}",
                 remedy="Remove one of them.",
             )
-        lines[item.file] = item
+        lines[line.file] = line
     return list(lines.values())
 
 
 def _header(path: Path, row: list[str]) -> list[str]:
-    named = [cell.lower() for cell in row]
-    wrong = [name for name in named if name not in (*_COLUMNS, *_MORE, _EARLIER)]
-    if wrong or not set(_COLUMNS) <= set(named) or len(set(named)) < len(named):
+    columns = [cell.lower() for cell in row]
+    known = set(columns) <= {*_COLUMNS, *_WRITTEN_BY_TRAINING} and len(set(columns)) == len(columns)
+    if not known or not set(_NEEDED) <= set(columns):
         raise PolarguideError(
             f"{path} (line 1)",
-            expected="the header file,view,angle or file,view,angle,gain",
-            found=",".join(row)[:100] or "an empty table",
-            remedy="Write that as the first line.",
-        )
-    return named
-
-
-def _listed(where: str, line: int, row: list[str], columns: list[str]) -> Listed:
-    if len(row) > len(columns) or len(row) < len(_COLUMNS):
-        raise PolarguideError(
-            where,
-            expected=f"{len(columns)} cells, {','.join(columns)}",
-            found=f"{len(row)}: {','.join(row)[:100]}",
+            expected="the header file,angle or file,view,angle,gain",
+            found=shortened(",".join(row)) if row else "an empty file",
             remedy=_REMEDY,
         )
-    cells = dict(zip(columns, row, strict=False))
-    for name in ("file", "view"):
-        if not cells.get(name) or (name == "file" and _is_path(cells[name])):
-            expected = "the name of a picture inside polar/" if name == "file" else "the name of a view"
-            raise PolarguideError(where, expected=expected, found=repr(cells.get(name, "")), remedy=_REMEDY)
-    angle = cells.get("angle", "")
-    gain = _number(where, "gain", cells.get("gain") or "1", least=_LEAST_GAIN)
-    if angle.lower() in (UNKNOWN, NONE):
-        exposure = Exposure(filtered=angle.lower() == UNKNOWN, gain=gain)
-    else:
-        exposure = Exposure(normalized(_number(where, "angle", angle)), gain=gain)
-    return Listed(line, cells["file"], cells["view"], exposure)
+    return columns
 
 
-def _is_path(name: str) -> bool:
-    return "/" in name or "\\" in name or name in (".", "..") or "\0" in name
-
-
-def _number(where: str, name: str, text: str, least: float = -math.inf) -> float:
-    words = f", {UNKNOWN} or {NONE}" if name == "angle" else ""
-    expected = "a positive number" if math.isfinite(least) else "a number of degrees"
-    try:
-        value = decimal(text)
-    except ValueError:
-        value = math.nan
-    small = f"{value:g}, less than {least:g}" if 0 < value < least else ""
-    if not math.isfinite(value) or value < least or abs(value) > 1e6:
+def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
+    """One line from its cells by column."""
+    file = cells["file"]
+    if not file or "\0" in file:
+        found = shortened(file) if file else "an empty cell"
+        raise PolarguideError(where, expected="the name of a file", found=found, remedy=_REMEDY)
+    angle = parse_angle(cells.get("angle", ""))
+    if angle is None:
         raise PolarguideError(
-            where, expected=f"{expected}{words} as {name}", found=small or repr(text), remedy=_REMEDY
+            f"{where}, {file}",
+            expected=f"an angle in degrees up to {LARGEST:g}, unknown or none",
+            found=shortened(cells.get("angle", "")),
+            remedy="Write unknown where the angle was not noted, none where there was no filter.",
         )
-    return value
+    gain = _number(cells["gain"]) if cells.get("gain") else None
+    if gain is not None and not 1 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
+        raise PolarguideError(
+            f"{where}, {file}",
+            expected=f"a gain from {1 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}, or an empty cell",
+            found=shortened(cells["gain"]),
+            remedy="Leave it empty if it is not known.",
+        )
+    return Line(number, file, cells.get("view") or None, angle, gain)
+
+
+def _number(text: str) -> float:
+    try:
+        return decimal(text)
+    except ValueError:
+        return math.nan
 
 
 def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) -> str:
     """A table as CSV text: file, view, exposure, modulation as of ``FittedAngle`` (None: not fitted), and a note."""
-    rows: list[list[object]] = [[*_COLUMNS, *_MORE]]
+    rows: list[list[object]] = [[*_COLUMNS]]
     for file, view, exposure, modulation, note in lines:
-        angle = (
-            NONE if not exposure.filtered else UNKNOWN if exposure.angle is None else f"{exposure.angle:.2f}"
-        )
+        known = "unknown" if exposure.angle is None else f"{exposure.angle:.2f}"
         shown = None if modulation is None else f"{modulation:.2f}"
-        rows.append([file, view, angle, f"{exposure.gain:.4f}", shown, note])
+        rows.append([file, view, known if exposure.filtered else "none", f"{exposure.gain:.4f}", shown, note])
     return csv_lines(rows)

@@ -1,4 +1,4 @@
-"""What lies behind the subject: surroundings, or nothing."""
+"""What is behind the subject: a background, or nothing; and where a picture is black."""
 
 from __future__ import annotations
 
@@ -16,16 +16,26 @@ from polarguide.camera import seen_at
 from polarguide.capture.view import Scene, View
 from polarguide.errors import PolarguideError
 
-DARK = 0.005
-"""Linear S0/2 up to which a pixel counts as black, taken over 3 x 3 pixels, so that noise does not lighten it."""
+BLACK = 0.005
+"""Linear S0/2 up to which a pixel is black: a little over one step of 8 bits, which is what noise and rounding leave of
+no light."""
 BLACK_EDGE = 0.95
 """Share of a picture's outermost pixels that are black where there is nothing behind the subject."""
 BLACK_VIEWS = 0.9
-"""Share of the views of which that has to be true."""
+"""Share of the views whose edge has to be black."""
 GROWN = 3
 """Pixels by which a subject is grown before what is outside counts as empty: edges are blended."""
 INSIDE = 0.8
-"""Share of the pictures that see a point in which it has to lie in the mask, to belong to the subject."""
+"""A point belongs to the subject if it is in the mask in this share of the pictures that see it."""
+
+
+def black_pixels(view: View) -> Tensor:
+    """Where the photograph shows no light, [H, W] bool, on the CPU: what *black* means wherever pictures are judged.
+
+    It is the mean over the color channels and 3 x 3 pixels that is compared, so that noise does not lighten a pixel.
+    """
+    picture = view.photograph().cpu().mean(dim=-1).numpy()
+    return torch.from_numpy(np.asarray(cv2.blur(picture, (3, 3)) <= BLACK))
 
 
 def has_black_background(views: Sequence[View]) -> bool:
@@ -50,8 +60,8 @@ def empty_pixels(view: View) -> Tensor:
     return torch.from_numpy(~_grown(subject, GROWN))
 
 
-def without_surroundings(scene: Scene) -> Scene:
-    """The scene with its subject alone: black outside the masks, and points of the subject only.
+def mask_background(scene: Scene) -> Scene:
+    """The scene with black pictures outside the masks, and with the points of the subject only.
 
     Raises:
         PolarguideError: a view has no mask, or no point lies in the masks.
@@ -65,7 +75,7 @@ def without_surroundings(scene: Scene) -> Scene:
                 found=f"none of view {view.name}",
                 remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
             )
-        views.append(view.subject_alone())
+        views.append(view.masked())
     # The masks of test views tell training nothing.
     inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])
     if len(scene.points) and not bool(inside.any()):
@@ -94,9 +104,7 @@ def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
 
 def _black(view: View) -> NDArray[np.bool_]:
     """Where the picture is black, [H, W]; pixels marked as invalid count as black."""
-    picture = view.photograph().cpu().mean(dim=-1).numpy()
-    dark: NDArray[np.bool_] = np.asarray(cv2.blur(picture, (3, 3)) <= DARK)
-    return dark | view.invalid.cpu().numpy()
+    return (black_pixels(view) | view.invalid.cpu()).numpy()
 
 
 def _black_edge(view: View) -> bool:

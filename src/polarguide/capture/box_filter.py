@@ -34,7 +34,11 @@ def maximum(values: NDArray[Any], factor: int) -> NDArray[Any]:
 
 
 def every(values: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
-    """Whether all pixels of each box are True, of [H, W]."""
+    """Whether all pixels of each box are True, of [H, W].
+
+    This is what foreground masks mean at a smaller size: a box that is the subject in part holds background, which is
+    neither to be trained on nor scored as the subject. Invalid and saturated pixels take ``maximum``: one spoils a box.
+    """
     return np.asarray(_boxed(values, factor).all(axis=(1, 3)))
 
 

@@ -9,7 +9,7 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from polarguide.capture.angle_table import TABLE, Listed, read_table
+from polarguide.capture.angle_table import TABLE, Line, read_table
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.view import ANGLES, listed, unknown_view
@@ -206,7 +206,7 @@ def _read_flat(
     for item in lines:
         if item.file not in stored:
             raise PolarguideError(
-                f"{table} (line {item.line})",
+                f"{table} (line {item.number})",
                 expected="a picture in polar/",
                 found=f"none called {item.file}",
                 remedy="Correct the name, or remove the line.",
@@ -230,12 +230,12 @@ def _read_flat(
 
 
 def _take_listed(
-    pictures: dict[str, dict[int, Path]], lines: Sequence[Listed], stored: Mapping[str, Path]
+    pictures: dict[str, dict[int, Path]], lines: Sequence[Line], stored: Mapping[str, Path]
 ) -> dict[str, tuple[tuple[Path, Exposure], ...]]:
     """Add the views of a table: to ``pictures`` where they have one picture at each of the four angles."""
     views: dict[str, list[tuple[Path, Exposure]]] = {}
     for item in lines:
-        views.setdefault(item.view, []).append((stored[item.file], item.exposure))
+        views.setdefault(item.view or Path(item.file).stem, []).append((stored[item.file], item.exposure))
     others = {}
     for view, found in views.items():
         named = pictures.pop(view, {})

@@ -24,10 +24,9 @@ from polarguide.capture.memory import check_memory, stated_size
 from polarguide.capture.metadata import held_out, indices_of, mount_of, refractive_index_of
 from polarguide.capture.objects import objects_of
 from polarguide.capture.split import chosen_views, far_from_training, held_out_band
-from polarguide.capture.stored_view import StoredView, ViewFiles
 from polarguide.capture.unseen_points import unseen_points
 from polarguide.capture.view import GroundTruth, Scene, listed
-from polarguide.capture.view_reader import Files, ViewData, check_materials, read_view
+from polarguide.capture.view_reader import Files, ViewData, ViewFiles, check_materials, read_view
 from polarguide.errors import PolarguideError
 from polarguide.options import Split, check_choice
 from polarguide.progress import SILENT, Reporter
@@ -83,7 +82,7 @@ def load_scene(
         memory: GiB that the pictures may take; None: 80 % of what is free.
         split: which views are held out where there is no ``split.json``, see ``split.chosen_views``.
         test_views: names of the views to hold out, whatever else says so, as far as there are such views.
-        hold: whether pictures stay in memory; otherwise views decode theirs again whenever they are asked for them.
+        hold: whether pictures stay in memory; otherwise views load theirs from the files when they are read.
         reporter: receives the progress.
 
     Returns:
@@ -129,11 +128,9 @@ def load_scene(
             found=f"none in {len(counted)} views",
             remedy="White is invalid there: invert the pictures, or remove them.",
         )
-    pictures = ViewFiles(layout, downscale, transfer, files.digests)
+    stays = None if hold else ViewFiles(layout, downscale, transfer, files.digests)
     posed_views = tuple(
-        item.view(camera, stored.full_scale, mount)
-        if hold
-        else StoredView(item, camera, stored.full_scale, pictures, mount)
+        item.view(camera, stored.full_scale, mount, stays)
         for item, camera in zip(stored.data, stored.cameras, strict=True)
         if camera is not None
     )

@@ -1,76 +1,61 @@
-"""Smaller pictures, made from those that were read: of a whole scene, or of a view whenever they are asked for."""
+"""Downscaled views, made from views that were read."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from polarguide.capture.box_filter import agreed, maximum, mean_codes
-from polarguide.capture.exposures import Exposure
+from polarguide.capture.box_filter import agreed, every, maximum, mean_codes
+from polarguide.capture.loader import Latest, Loader
 from polarguide.capture.view import Scene, View
 
 
-class SmallerView(View):
-    """A view averaged over boxes of pixels; its codes are made from the whole view's whenever they are asked for.
+def smaller_view(view: View, factor: int, latest: Latest) -> View:
+    """A view averaged over boxes of pixels, as if it had been read so; its codes are made when they are read.
 
-    Codes are averaged, which are linear, and with them Stokes vectors, never angles. A pixel is invalid, saturated or
-    of the subject where one of its box is, and of a material where all are. Remainders of a box are cut. Ground truth
-    stays behind.
+    Codes are averaged; they are linear, so Stokes vectors are averaged, and angles never are. A pixel is invalid or
+    saturated where any pixel of its box is; it belongs to the mask or to a material where all are. Incomplete boxes at
+    the right and bottom are dropped. The view has no ground truth.
 
     Args:
-        view: the whole view. factor: side of the boxes in pixels.
+        view: the whole view. factor: side of the boxes in pixels. latest: where the codes of a view in memory stay.
     """
+    whole = view.pictures
 
-    _whole: View
-    _factor: int
+    def averaged(codes: Tensor) -> Tensor:
+        return torch.from_numpy(np.stack([mean_codes(picture, factor) for picture in codes.numpy()]))
 
-    def __init__(self, view: View, factor: int) -> None:
-        invalid, saturated = (
-            torch.from_numpy(maximum(flags.numpy(), factor)) for flags in (view.invalid, view.saturated)
-        )
-        materials = None
-        if view.materials is not None:
-            numbers = agreed(view.materials.numpy().astype(np.int32), factor)
-            materials = torch.from_numpy(numbers.astype(np.uint8))
-        values = {
-            "name": view.name,
-            "camera": view.camera.downscaled(factor),
-            "invalid": invalid,
-            "saturated": saturated,
-            "mask": None if view.mask is None else torch.from_numpy(maximum(view.mask.numpy(), factor)),
-            "ground_truth": None,
-            "exposures": view.exposures,
-            "mount": view.mount,
-            "materials": materials,
-            "_whole": view,
-            "_factor": factor,
-        }
-        vars(self).update(values)
+    def boxed(flags: Tensor, reduce: Callable[[NDArray[Any], int], NDArray[Any]]) -> Tensor:
+        return torch.from_numpy(reduce(flags.numpy(), factor))
 
-    @property
-    def codes(self) -> Tensor:
-        """As in ``View``."""
-        whole = self._whole.codes.numpy()
-        return torch.from_numpy(np.stack([mean_codes(picture, self._factor) for picture in whole]))
-
-    def with_exposures(self, exposures: tuple[Exposure, ...]) -> View:
-        """As in ``View``."""
-        other = object.__new__(SmallerView)
-        vars(other).update({**vars(self), "exposures": exposures})
-        return other
+    return replace(
+        view,
+        camera=view.camera.downscaled(factor),
+        pictures=whole.then(averaged)
+        if isinstance(whole, Loader)
+        else Loader(lambda: averaged(whole), latest),
+        invalid=boxed(view.invalid, maximum),
+        saturated=boxed(view.saturated, maximum),
+        mask=None if view.mask is None else boxed(view.mask, every),
+        truth=None,
+        materials=None if view.materials is None else boxed(view.materials.int(), agreed).to(torch.uint8),
+    )
 
 
 class SmallerViews(Sequence[View]):
-    """Views averaged over boxes of pixels, each made when it is first asked for."""
+    """Views averaged over boxes of pixels, each made at its first use."""
 
     def __init__(self, views: Sequence[View], factor: int) -> None:
         self._views, self._factor = views, factor
         self._made: dict[int, View] = {}
+        self._latest = Latest()
 
     def __len__(self) -> int:
         return len(self._views)
@@ -81,7 +66,7 @@ class SmallerViews(Sequence[View]):
             return [self[k] for k in range(*place.indices(len(self)))]
         place = range(len(self))[place]
         if place not in self._made:
-            self._made[place] = SmallerView(self._views[place], self._factor)
+            self._made[place] = smaller_view(self._views[place], self._factor, self._latest)
         return self._made[place]
 
     def __iter__(self) -> Iterator[View]:
@@ -89,9 +74,9 @@ class SmallerViews(Sequence[View]):
 
 
 def smaller(scene: Scene, longest: int) -> Scene:
-    """The training views averaged until none has a side longer than ``longest`` pixels, see ``SmallerView``.
+    """The training views averaged until none has a side longer than ``longest`` pixels, see ``smaller_view``.
 
-    Masks and ground truth stay behind, and so do the views that are held out.
+    It has neither masks nor ground truth, nor the views that are held out.
 
     Returns:
         The scene itself where its pictures are small enough.
@@ -101,18 +86,6 @@ def smaller(scene: Scene, longest: int) -> Scene:
     factor = math.ceil(size / longest)
     if factor == 1:
         return scene
-    return replace(scene, views=tuple(_made(SmallerView(view, factor)) for view in views), test_names=())
-
-
-def _made(view: SmallerView) -> View:
-    """The view with its codes, and without what it can do without."""
-    return View(
-        view.name,
-        view.camera,
-        view.codes,
-        view.invalid,
-        view.saturated,
-        exposures=view.exposures,
-        mount=view.mount,
-        materials=view.materials,
-    )
+    small = (smaller_view(view, factor, Latest()) for view in views)
+    held = (replace(view, pictures=view.codes, mask=None, subject_only=False) for view in small)
+    return replace(scene, views=tuple(held), test_names=())

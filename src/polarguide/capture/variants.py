@@ -1,4 +1,4 @@
-"""The same scene as if it had been captured with fewer pictures: what ``compare --exposures`` trains on."""
+"""A scene with fewer pictures of each view, computed from four: what ``compare --exposures`` trains on."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from polarguide.polarizer import ANGLES
 
 THREE = (0.0, 60.0, 120.0)
 EVERY = 4
-"""One view in so many has four pictures where the others have none through a filter, or are left out."""
+"""``mixed`` and ``sparse`` keep the four pictures of one view in this number."""
 
 Change = Callable[[View, int], View | None]
-"""A training view as it would have been captured, given its place among them; None: it would not."""
+"""A training view with other pictures, given its place among the training views; None: the view is left out."""
 
 
-def captured_as(scene: Scene, exposures: Exposures) -> Scene:
+def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
     """The scene with other pictures of its training views; those held out stay as they are.
 
     Args:
         scene: with pictures at 0, 45, 90 and 135 degrees of every training view.
-        exposures: ``captured``, as it is; ``four``, all of these; ``three``, at 0, 60 and 120 degrees, computed from
-            the Stokes vectors; ``two``, of every view a pair at right angles, 0 and 90 or 45 and 135 in turn; ``one``,
-            of every view one, 0, 45, 90, 135 in turn; ``unknown``, the same without a word about the angles; ``mixed``,
-            four of every fourth view and S0/2 of the others; ``sparse``, the former alone; ``none``, S0/2.
+        exposures: ``captured``: the scene as it is. ``four``: all four pictures. ``three``: at 0, 60 and 120 degrees,
+            computed from the Stokes vectors. ``two``: a pair at right angles, 0 and 90 or 45 and 135 in turn. ``one``:
+            one picture, at 0, 45, 90, 135 in turn. ``unknown``: the same with unknown angles. ``mixed``: all four of
+            every fourth view, S0/2 of the others. ``sparse``: every fourth view alone. ``none``: S0/2.
 
     Raises:
         PolarguideError: there is no such choice, or the scene has other pictures.
@@ -60,7 +60,7 @@ def pictures_taken(scene: Scene) -> int:
 
 
 def count_of(exposures: Exposures, views: int) -> int:
-    """How many pictures ``captured_as`` leaves of a number of training views with four each."""
+    """How many pictures ``select_exposures`` leaves of a number of training views with four each."""
     each = {"three": 3, "two": 2, "one": 1, "unknown": 1, "none": 1}
     fourth = -(-views // EVERY)
     if exposures == "mixed":
@@ -70,25 +70,31 @@ def count_of(exposures: Exposures, views: int) -> int:
 
 def _some(view: View, *places: int, known: bool = True) -> View:
     chosen = tuple(FOUR[place] if known else Exposure() for place in places)
-    return replace(view, codes=torch.stack([view.codes[place] for place in places]), exposures=chosen)
+    return view.changed(lambda codes: torch.stack([codes[place] for place in places]), chosen)
 
 
-def _computed(view: View, pictures: list[Tensor], exposures: tuple[Exposure, ...]) -> View:
-    codes = (torch.stack(pictures).clamp(0, 1) * FULL_CODE).round().to(torch.int32).to(torch.uint16)
-    return replace(view, codes=codes, exposures=exposures)
+def _computed(view: View, pictures: Callable[[View], list[Tensor]], exposures: tuple[Exposure, ...]) -> View:
+    def change(codes: Tensor) -> Tensor:
+        made = torch.stack(pictures(replace(view, pictures=codes))).clamp(0, 1) * FULL_CODE
+        return made.round().to(torch.int32).to(torch.uint16)
+
+    return view.changed(change, exposures)
 
 
 def _three(view: View, _place: int) -> View:
-    stokes, rays = view.stokes(), view.camera.rays()
-    pictures = []
-    for angle in THREE:
-        cosine, sine = optics.analyzer(math.radians(angle), rays, view.mount)[..., None].unbind(0)
-        pictures.append((stokes[0] + stokes[1] * cosine + stokes[2] * sine) / 2)
+    def pictures(view: View) -> list[Tensor]:
+        stokes, rays = view.stokes(), view.camera.rays()
+        found = []
+        for angle in THREE:
+            cosine, sine = optics.analyzer(math.radians(angle), rays, view.mount)[..., None].unbind(0)
+            found.append((stokes[0] + stokes[1] * cosine + stokes[2] * sine) / 2)
+        return found
+
     return _computed(view, pictures, tuple(Exposure(angle) for angle in THREE))
 
 
 def _plain(view: View, _place: int) -> View:
-    return _computed(view, [view.photograph()], PLAIN)
+    return _computed(view, lambda view: [view.photograph()], PLAIN)
 
 
 def _pair(view: View, place: int) -> View:

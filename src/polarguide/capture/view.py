@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from polarguide.capture.exposures import (
     measure_radiance,
     radiance_places,
 )
+from polarguide.capture.loader import Loader
 from polarguide.capture.objects import SceneObject
 from polarguide.errors import PolarguideError
 from polarguide.optics import Mount
@@ -54,34 +55,64 @@ class GroundTruth:
 class View:
     """One camera pose with its pictures, mostly four behind a polarizer, and masks of their pixels.
 
+    Everything lies on one device. ``dataclasses.replace`` and the methods that give another view load no pictures.
+
     Attributes:
         name: name of the view, unique in its scene.
         camera: pose and intrinsics at the size of the pictures.
-        codes: linear intensities of the exposures, at 0, 45, 90 and 135 degrees unless ``exposures`` says otherwise,
-            coded as round(65535 * intensity), [K, H, W, 3] uint16, RGB. Kept coded because big captures do not fit
-            into memory as floats.
+        pictures: ``codes`` where they are in memory, else what loads them.
         invalid: pixels that the capture marks as unusable (``invalid/<view>.png``), [H, W] bool. Metrics exclude these
             pixels and no others.
         saturated: pixels without polarization information: one angle at full scale in any channel, or all
             black; [H, W] bool. Priors and losses exclude them.
         mask: the user's foreground mask (``masks/<view>.png``), [H, W] bool, or None.
-        ground_truth: or None.
+        truth: ``ground_truth`` where it is in memory, else what loads it.
         exposures: what the K pictures are.
         mount: where the polarizer was.
-        materials: what the user says of surfaces (``materials/<view>.png``): 0 nothing, 1 dielectric, 2 metal, [H, W]
-            uint8, or None.
+        materials: the user's labels of surfaces (``materials/<view>.png``), [H, W] uint8, or None: 0 no label,
+            1 dielectric, 2 metal; from 3 on, a dielectric whose refractive index is ``Scene.indices[number]``.
+        subject_only: whether ``codes`` are 0 outside the mask, which then is needed.
     """
 
     name: str
     camera: Camera
-    codes: Tensor
+    pictures: Tensor | Loader[Tensor]
     invalid: Tensor
     saturated: Tensor
     mask: Tensor | None = None
-    ground_truth: GroundTruth | None = None
+    truth: GroundTruth | Loader[GroundTruth | None] | None = None
     exposures: tuple[Exposure, ...] = FOUR
     mount: Mount = "sensor"
     materials: Tensor | None = None
+    subject_only: bool = False
+
+    @property
+    def codes(self) -> Tensor:
+        """Linear intensities of the exposures, at 0, 45, 90 and 135 degrees unless ``exposures`` differ, coded as
+        round(65535 * intensity), [K, H, W, 3] uint16, RGB. Coded because large captures do not fit into memory as
+        floats.
+
+        Raises:
+            PolarguideError: they are loaded from files, and a file has changed or is gone.
+        """
+        codes = self.pictures() if isinstance(self.pictures, Loader) else self.pictures
+        if not self.subject_only or self.mask is None:
+            return codes
+        return codes * self.mask.to(codes)[None, ..., None]
+
+    @property
+    def ground_truth(self) -> GroundTruth | None:
+        """Ground truth of the view, or None.
+
+        Raises:
+            PolarguideError: it is loaded from a file, which has changed or is gone.
+        """
+        return self.truth() if isinstance(self.truth, Loader) else self.truth
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.invalid.device
 
     @property
     def is_four(self) -> bool:
@@ -100,30 +131,38 @@ class View:
 
     def to(self, device: torch.device) -> View:
         """The view on a device, without its ground truth; the view itself if it is already there."""
-        if self.codes.device == device:
+        if self.device == device:
             return self
-        codes, invalid, saturated = (t.to(device) for t in (self.codes, self.invalid, self.saturated))
-        mask = None if self.mask is None else self.mask.to(device)
-        return View(
-            self.name,
-            self.camera,
-            codes,
-            invalid,
-            saturated,
-            mask,
-            exposures=self.exposures,
-            mount=self.mount,
+        moved = self.changed(lambda codes: codes.to(device))
+        return replace(
+            moved,
+            invalid=self.invalid.to(device),
+            saturated=self.saturated.to(device),
+            mask=None if self.mask is None else self.mask.to(device),
+            truth=None,
             materials=None if self.materials is None else self.materials.to(device),
         )
+
+    def changed(
+        self, change: Callable[[Tensor], Tensor], exposures: tuple[Exposure, ...] | None = None
+    ) -> View:
+        """The view with other pictures: made now where its own are in memory, else when they are read.
+
+        Args:
+            change: makes new codes of the view's. exposures: of the new pictures; None: they stay.
+        """
+        pictures = self.pictures
+        made = pictures.then(change) if isinstance(pictures, Loader) else change(pictures)
+        return replace(self, pictures=made, exposures=self.exposures if exposures is None else exposures)
 
     def with_exposures(self, exposures: tuple[Exposure, ...]) -> View:
         """The view with other knowledge of its pictures."""
         return replace(self, exposures=exposures)
 
-    def subject_alone(self) -> View:
-        """The view with black outside its mask, which it has to have."""
+    def masked(self) -> View:
+        """The view with black pixels outside its mask, which it has to have."""
         assert self.mask is not None
-        return replace(self, codes=self.codes * self.mask.to(self.codes)[None, ..., None])
+        return replace(self, subject_only=True)
 
     def intensities(self) -> Tensor:
         """Linear intensities of the exposures (0, 45, 90, 135 degrees mostly) on one scale, in [0, 1] unless their
@@ -146,7 +185,7 @@ class View:
         if not self.is_determined:
             raise self.undetermined("a Stokes vector")
         places = [k for k, exposure in enumerate(self.exposures) if exposure.known]
-        rays = self.camera.rays(device=self.codes.device)
+        rays = self.camera.rays(device=self.device)
         found = analyzers([self.exposures[k] for k in places], rays, self.mount)
         return optics.fitted_stokes(self.intensities()[places], found)
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import box_filter as boxes
@@ -30,6 +31,7 @@ from polarguide.capture.formats.pictures import (
 )
 from polarguide.capture.ground_truth import read_ground_truth
 from polarguide.capture.layout import Layout
+from polarguide.capture.loader import Latest, Loader
 from polarguide.capture.view import GroundTruth, View
 from polarguide.errors import PolarguideError
 from polarguide.files import LARGEST_FILE
@@ -93,20 +95,80 @@ class ViewData:
         """``View.saturated``, given the stored value at which the capture saturates (None: it does not)."""
         return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
 
-    def view(self, camera: Camera, scale: int | None, mount: Mount = "sensor") -> View:
-        """The view with its camera and its saturated pixels."""
+    def view(
+        self, camera: Camera, scale: int | None, mount: Mount = "sensor", files: ViewFiles | None = None
+    ) -> View:
+        """The view with its camera and its saturated pixels.
+
+        Args:
+            camera: of the view. scale: as for ``saturated``. mount: where the polarizer was.
+            files: load codes and ground truth when they are read; None: those that are here stay in memory.
+        """
+        invalid, saturated = torch.from_numpy(self.invalid), torch.from_numpy(self.saturated(scale))
         return View(
             name=self.name,
             camera=camera,
-            codes=torch.from_numpy(self.codes),
-            invalid=torch.from_numpy(self.invalid),
-            saturated=torch.from_numpy(self.saturated(scale)),
+            pictures=torch.from_numpy(self.codes) if files is None else files.codes(self.name),
+            invalid=invalid if files is None else _compact(invalid),
+            saturated=saturated if files is None else _compact(saturated),
             mask=None if self.mask is None else torch.from_numpy(self.mask),
-            ground_truth=self.ground_truth,
+            truth=self.ground_truth if files is None else files.ground_truth(self.name, self.size),
             exposures=self.exposures,
             mount=mount,
             materials=None if self.materials is None else torch.from_numpy(self.materials),
         )
+
+
+class ViewFiles:
+    """Loaders of what the files of views hold.
+
+    Args:
+        layout: the files. factor, transfer: as for ``read_view``. digests: SHA-256 of the files as they were read.
+    """
+
+    def __init__(self, layout: Layout, factor: int, transfer: str, digests: Mapping[Path, str]) -> None:
+        self._layout, self._factor, self._transfer, self._digests = layout, factor, transfer, digests
+        self._pictures, self._truths = Latest(), Latest()
+
+    def codes(self, name: str) -> Loader[Tensor]:
+        """Loads ``View.codes``; an error where a file has changed, or is gone."""
+        return Loader(functools.partial(self._read_codes, name), self._pictures)
+
+    def ground_truth(self, name: str, size: tuple[int, int]) -> Loader[GroundTruth | None] | None:
+        """Loads ``View.ground_truth``; an error where the file has changed, or is gone. None: there is no such file.
+
+        Args:
+            name: of the view. size: width and height of the pictures as stored.
+        """
+        path = self._layout.ground_truth.get(name)
+        return None if path is None else Loader(functools.partial(self._read_truth, path, size), self._truths)
+
+    def _read_codes(self, name: str) -> Tensor:
+        files = Files()
+        raw = _read_pictures(files, self._layout.files(name))
+        self._check(files)
+        return torch.from_numpy(_codes(raw, self._transfer, self._factor))
+
+    def _read_truth(self, path: Path, size: tuple[int, int]) -> GroundTruth | None:
+        files = Files()
+        data = files.read(path)
+        self._check(files)
+        return read_ground_truth(path, data, size=(size[1], size[0]), factor=self._factor)
+
+    def _check(self, files: Files) -> None:
+        for path, digest in files.digests.items():
+            if self._digests[path] != digest:
+                raise PolarguideError(
+                    path,
+                    expected="the file that was there as the scene was read",
+                    found="other contents",
+                    remedy="Leave a scene alone while it is worked on; then start again.",
+                )
+
+
+def _compact(mask: Tensor) -> Tensor:
+    """The mask, without memory where nothing is set."""
+    return mask if bool(mask.any()) else torch.zeros((), dtype=torch.bool).expand(mask.shape)
 
 
 def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewData:
@@ -175,32 +237,6 @@ def check_materials(layout: Layout, views: Iterable[ViewData], indices: Mapping[
                 found=str(min(unknown)),
                 remedy=MATERIAL_REMEDY,
             )
-
-
-def read_codes(
-    layout: Layout, name: str, *, factor: int, transfer: str, digests: Mapping[Path, str]
-) -> NDArray[np.uint16]:
-    """The codes of a view that was read before, as ``read_view`` gives them.
-
-    Raises:
-        PolarguideError: a file has changed since: its SHA-256 is not that of ``digests``.
-    """
-    files = Files()
-    raw = _read_pictures(files, layout.files(name))
-    for path, digest in files.digests.items():
-        if digests[path] != digest:
-            raise changed(path)
-    return _codes(raw, transfer, factor)
-
-
-def changed(path: Path) -> PolarguideError:
-    """The error that a file is not what it was when the scene was read."""
-    return PolarguideError(
-        path,
-        expected="the file that was there as the scene was read",
-        found="other contents",
-        remedy="Leave a scene alone while it is worked on; then start again.",
-    )
 
 
 def _codes(raw: Sequence[NDArray[Any]], transfer: str, factor: int) -> NDArray[np.uint16]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions, ThreadOptions
 from polarguide.preparation.settings import CalibrationOptions
+from polarguide.records import option_name
 from polarguide.shots.options import ShotOptions
 
 
@@ -61,23 +63,45 @@ def priors(
         raise PolarguideError(
             "PATH", expected="at least one shot or scene", found="none", remedy="Name files or folders."
         )
-    opened = None if run is None else polarguide.open_run(run, reporter=reporter)
-    found = polarguide.priors(
-        paths[0] if len(paths) == 1 else paths,
-        out,
-        run=opened,
-        views=views,
-        refractive_index=refractive_index,
+    options = replace(shots, calibration=angles.read(), analyzers=angles.analyzers())
+    some = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
+    if len(paths) == 1 and os.path.lexists(paths[0] / "sparse"):
+        _refuse("shots", "a scene with poses", intrinsics=intrinsics)
+        sheet = polarguide.priors(
+            paths[0],
+            out,
+            run=None if run is None else polarguide.open_run(run, reporter=reporter),
+            views=views,
+            threshold=0.05 if threshold is None else threshold,
+            reading=SceneOptions(downscale, "srgb" if shots.transfer == "srgb" else "linear", memory),
+            formats=some or (),
+            shots=replace(options, transfer="auto"),
+            refractive_index=refractive_index,
+            reporter=reporter,
+        )
+        say(f"pictures: {out}   contact sheet: {sheet}")
+        return
+    _refuse(
+        "a scene with poses",
+        "shots",
+        run=run,
+        views=None if views == "test" else views,
         threshold=threshold,
-        reading=SceneOptions(downscale, "srgb" if shots.transfer == "srgb" else "linear", memory),
-        shots=replace(shots, calibration=angles.read(), analyzers=angles.analyzers()),
-        formats=None if formats is None else [name.strip() for name in formats.split(",") if name.strip()],
+        memory=memory or None,
+    )
+    if downscale != 1:
+        raise PolarguideError(
+            "downscale", expected="1 for shots", found=str(downscale), remedy="Use --demosaic quarter."
+        )
+    found = polarguide.shot_priors(
+        paths,
+        out,
+        shots=options,
+        formats=some,
         intrinsics=intrinsics,
+        refractive_index=refractive_index,
         reporter=reporter,
     )
-    if isinstance(found, Path):
-        say(f"pictures: {out}   contact sheet: {found}")
-        return
     for name, folder in list(found.folders.items())[:4]:
         page = folder / "shot.html"
         say(f"{name}: {page if page.exists() else folder}")
@@ -91,3 +115,12 @@ def priors(
             found=f"{len(found.faults)} that failed ({', '.join(list(found.faults)[:4])})",
             remedy="The warnings above say why; the others are written.",
         )
+
+
+def _refuse(expected: str, found: str, **options: object) -> None:
+    """Refuse options that are given and mean something for others alone."""
+    for name, value in options.items():
+        if value is not None:
+            raise PolarguideError(
+                option_name(name), expected=expected, found=found, remedy=f"Leave it out, or name {expected}."
+            )

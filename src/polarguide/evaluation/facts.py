@@ -11,14 +11,14 @@ from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from polarguide.capture import Scene, View
+from polarguide.capture.background import black_pixels
 from polarguide.capture.objects import SceneObject
 from polarguide.capture.view import listed
 
 EXTENT = 1.1
 """The extent of a scene, in units of the largest distance between two of its cameras."""
-BLACK = 1 / 255
-"""A photograph is black where no channel of S0/2 exceeds this."""
 BLACK_SHARE = 0.99
+"""Share of the pixels outside the masks that are black where nothing but the foreground is in the pictures."""
 MARGIN = 3
 """Pixels by which a mask is grown before what lies outside it is looked at."""
 KNOWN = {
@@ -99,7 +99,7 @@ def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
     black = total = 0
     for view in views:
         beyond = outside(masks[view.name]) & ~view.invalid
-        black += int((view.photograph().amax(dim=-1) <= BLACK)[beyond].sum())
+        black += int(black_pixels(view)[beyond].sum())
         total += int(beyond.sum())
     return total > 0 and black > BLACK_SHARE * total
 

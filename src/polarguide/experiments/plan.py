@@ -16,8 +16,7 @@ from typing import Any, Literal
 
 from polarguide import __version__
 from polarguide.capture import View
-from polarguide.capture.background import without_surroundings
-from polarguide.capture.view import FULL_CODE
+from polarguide.capture.background import black_pixels, mask_background
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.record import read_metrics
@@ -35,8 +34,6 @@ from polarguide.training.settings import TrainSettings
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
-BLACK = 0.002
-"""Share of full scale under which a pixel is black."""
 KEY_DIGITS = 10
 
 
@@ -230,7 +227,7 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
     for path in comparison.scenes:
         scene = read_scene(path, comparison.options, reporter)
         if comparison.settings.background == "masked":
-            scene = without_surroundings(scene)
+            scene = mask_background(scene)
         if scene.name in [entry.name for entry in entries]:
             raise PolarguideError(
                 path,
@@ -258,9 +255,8 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
 
 
 def black_share(view: View) -> float:
-    """The share of a view's pixels that are black, as it is scored."""
-    brightest = view.codes[0].float().amax(dim=-1)
-    return float((brightest < BLACK * FULL_CODE).float().mean())
+    """The share of a view's pixels that are black."""
+    return float(black_pixels(view).float().mean())
 
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:

@@ -12,8 +12,8 @@ from polarguide import optics
 from polarguide.capture.exposures import FOUR
 from polarguide.inspection.capture import InspectedView
 
-DARK = 1.0 / 256.0
-"""Mean intensity below which a pixel is too dark to be used."""
+MEASURABLE = 1.0 / 256.0
+"""Mean intensity from which on a pixel is bright enough for its polarization to be measured: a step of 8 bits."""
 POLARIZED = 0.05
 """DoLP from which a pixel counts as polarized."""
 OF_FOUR = ("noise", "noise_share", "pair_ratio", "sum_error", "dolp", "polarized", "above_limit")
@@ -71,7 +71,7 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
         index: refractive index.
     """
     gray = view.intensities().mean(dim=-1)
-    dark = gray.mean(dim=0) < DARK
+    dark = gray.mean(dim=0) < MEASURABLE
     good = view.usable & ~dark
     share = float(good.float().mean())
     bright = quantile(view.intensities().amax(dim=-1).flatten(), 0.99)

@@ -27,8 +27,8 @@ LITTLE, ALMOST_NONE = 0.05, 0.005
 NOISY = 0.03
 """Noise of one intensity as a share of S0 / 2: three times its DoLP noise is then 0.13."""
 
-DARK = 0.01
-"""99th percentile of the values below which a view is dark."""
+UNDEREXPOSED = 0.01
+"""99th percentile of the values below which the exposure of a view was too short."""
 
 
 def find_pairing(capture: Capture) -> int | None:
@@ -166,7 +166,7 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
     share, bright = (
         float(np.median([getattr(r, k) for r in measurements])) for k in ("noise_share", "bright")
     )
-    off = tuple(r.view for r in measurements if r.noise_share > NOISY or r.bright < DARK)
+    off = tuple(r.view for r in measurements if r.noise_share > NOISY or r.bright < UNDEREXPOSED)
     said = (
         f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), so that a DoLP "
         f"of {3 * 2**0.5 * share / 2:.3f} is three times its noise; "
@@ -175,7 +175,7 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
     figures = {"noise_share": share, "bright": bright}
     if not off:
         return Check(key, title, "ok", said, figures=figures)
-    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < DARK else "warning"
+    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < UNDEREXPOSED else "warning"
     return Check(
         key, title, verdict, f"{said} Dark or noisy: {len(off)} views ({listed(list(off))}).",
         "Use a longer exposure at the lowest gain, or average several shots.", off, figures,
@@ -186,7 +186,7 @@ def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:
     key, title = "brightness", "Brightness"
     bright = float(np.median([r.bright for r in measurements]))
     said = f"The 99th percentile of the values is {bright:.0%} of full scale (median view)."
-    off = tuple(r.view for r in measurements if r.bright < DARK)
+    off = tuple(r.view for r in measurements if r.bright < UNDEREXPOSED)
     if not off:
         return Check(key, title, "ok", said, figures={"bright": bright})
     return Check(

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera
+from polarguide.capture.angle_table import TABLE
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.filter.angle_table import TABLE
 from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes
 from polarguide.capture.polarizer_angles import angle_text

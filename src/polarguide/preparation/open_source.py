@@ -7,10 +7,10 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
+from polarguide.capture.angle_table import TABLE
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets import detect_dataset, open_dataset
 from polarguide.capture.datasets.pisr import SENSOR as PISR_SENSOR
-from polarguide.capture.filter.angle_table import TABLE
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.filter.single_shots import folders_of_angles, split_name
 from polarguide.capture.formats.headers import stated_size

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from polarguide.capture import View
-from polarguide.capture.background import DARK
+from polarguide.capture.background import black_pixels
 from polarguide.capture.exposures import analyzers
 from polarguide.capture.view import listed
 from polarguide.color import srgb_encode
@@ -220,7 +220,8 @@ def _look(
     psnr = None if bool(error.isnan()) else min(float(-10 * torch.log10(error)), HIGHEST_PSNR)
     burned = ~(result.final <= limit).all(dim=-1) & counted
     shown, light = local.photograph().mean(dim=-1), result.final.mean(dim=-1)
-    bare = _inner((shown > DARK) & counted) & (result.alpha < 0.5) & (light < shown / 2)
+    lit = ~black_pixels(view).to(model.device)
+    bare = _inner(lit & counted) & (result.alpha < 0.5) & (light < shown / 2)
     fog = None
     if near > 0:
         depth = torch.full_like(result.alpha, near)

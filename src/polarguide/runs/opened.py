@@ -13,9 +13,9 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene, read_model
-from polarguide.capture.background import without_surroundings
+from polarguide.capture.background import mask_background
 from polarguide.capture.layout import find_layout
-from polarguide.capture.variants import captured_as
+from polarguide.capture.variants import select_exposures
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
 from polarguide.presentation import Presentation, read_presentation
@@ -182,8 +182,8 @@ class OpenedRun:
         if recorded is not None and recorded != found.test_names:
             names = {view.name for view in found.views}
             found = replace(found, test_names=tuple(name for name in recorded if name in names))
-        found = captured_as(found, configuration.settings.exposures)
-        return without_surroundings(found) if configuration.settings.background == "masked" else found
+        found = select_exposures(found, configuration.settings.exposures)
+        return mask_background(found) if configuration.settings.background == "masked" else found
 
     @property
     def scene_folder(self) -> Path:

@@ -14,9 +14,9 @@ from pathlib import Path
 import torch
 
 from polarguide.capture import Scene
-from polarguide.capture.background import without_surroundings
+from polarguide.capture.background import mask_background
 from polarguide.capture.layout import refuse_scene
-from polarguide.capture.variants import captured_as
+from polarguide.capture.variants import select_exposures
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.files import check_out, make_folder
 from polarguide.options import PathLike, SceneOptions, SessionOptions
@@ -108,12 +108,10 @@ def train(
         backend = backend_of(ranks, session.device, reporter)
         earlier = RunConfiguration.load(out).settings if resume else None
         plan = _planned(family, scene, chosen, settings, earlier, reading)
-        # Other pictures are made of those that are held.
-        hold = plan.hold or settings.exposures != "captured"
-        whole = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=hold)
-        loaded = captured_as(whole, settings.exposures)
+        whole = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=plan.hold)
+        loaded = select_exposures(whole, settings.exposures)
         if settings.background == "masked":
-            loaded = without_surroundings(loaded)
+            loaded = mask_background(loaded)
         _check_scene(loaded)
         if settings.refractive_index is None and not resume and loaded.refractive_index is not None:
             reporter.say(f"refractive index {loaded.refractive_index:g}, as scene.json says")

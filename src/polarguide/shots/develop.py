@@ -7,10 +7,12 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, balancing_gains, oriented, pair_ratio
+from polarguide.capture.exposures import FOUR, analyzers
 from polarguide.capture.filter.align import align_shots, estimate_shifts
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import read_shots, require_four_shots
@@ -23,7 +25,7 @@ from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import demosaic
 from polarguide.capture.sensor.pattern import SENSOR_SIZE, tiled
 from polarguide.capture.sensor.radiometry import estimate_levels, unusable_samples
-from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.view import ANGLES, FULL_CODE, View
 from polarguide.capture.view_reader import read_view
 from polarguide.errors import PolarguideError
 from polarguide.files import require_file
@@ -288,21 +290,64 @@ def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
         remedy="Free memory, or prepare the scene in a smaller size.",
     )
     transfer = "srgb" if options.transfer == "srgb" else "linear"
-    data = read_view(layout, shot.view, factor=shot.downscale, transfer=transfer)
+    data = read_view(layout, shot.view, factor=1, transfer=transfer)
     largest = int(np.iinfo(data.peak.dtype).max)
     scale = checks.full_scale(data.histogram, largest)
     intensities = oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration)
     saturated = np.zeros(data.black.shape, bool) if scale is None else np.asarray(data.peak >= scale)
-    masked = data.invalid if data.mask is None else data.invalid | ~data.mask
+    masks = data.black, saturated, data.invalid, data.mask
+    return _undistorted(intensities, masks, 1 / largest, options)
+
+
+def develop_view(view: View, options: ShotOptions) -> Developed:
+    """The intensities of a view of a scene, as its ``codes``, masks and exposures are.
+
+    Raises:
+        PolarguideError: its pictures are not four, at 0, 45, 90 and 135 degrees.
+    """
+    require_four_pictures(view)
+    intensities, codes = view.intensities(), view.codes.numpy()
+    if view.mount == "filter":  # what a sensor with analyzers behind the lens would have measured
+        rays, stokes = view.camera.rays(), view.stokes()
+        turned = analyzers(FOUR, rays, "sensor")[..., None, None] - analyzers(FOUR, rays, "filter")
+        intensities = intensities + torch.einsum("ksyx,syxc->kyxc", turned, stokes[1:]) / 2
+    peak, lost = codes.max(axis=(0, 3)), view.saturated.numpy()
+    # Of pixels without polarization information, those nearer to black than to the brightest of the view are dark.
+    dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
+    masks = dark, lost & ~dark, view.invalid.numpy(), None if view.mask is None else view.mask.numpy()
+    # Codes are multiples of what one stored value is, unless they were decoded or averaged.
+    step = int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
+    return _undistorted(intensities.numpy(), masks, max(step, 1) / FULL_CODE, options)
+
+
+def require_four_pictures(view: View) -> None:
+    """Refuse a view whose pictures are not those that maps are made of.
+
+    Raises:
+        PolarguideError: they are not four, at 0, 45, 90 and 135 degrees.
+    """
+    if view.exposures != FOUR:
+        raise PolarguideError(
+            f"view {view.name}",
+            expected="pictures at 0, 45, 90 and 135 degrees, of which maps are made",
+            found=", ".join(exposure.words for exposure in view.exposures),
+            remedy="Choose other views, or leave out the formats of maps.",
+        )
+
+
+def _undistorted(
+    intensities: Map, masks: tuple[Mask, Mask, Mask, Mask | None], lsb: float, options: ShotOptions
+) -> Developed:
+    """A picture of a scene, whose samples are its pixels. masks: dark, saturated, invalid, foreground."""
+    dark, saturated, invalid, foreground = masks
     gray = intensities.mean(axis=3)
-    good = ~(saturated | data.black | data.invalid)
-    lsb = 1 / largest
+    good = ~(saturated | dark | invalid)
     noise = given_noise(options, lsb) or estimated_noise(gray, good, lsb)
     return Developed(
         intensities=intensities,
-        dark=data.black,
+        dark=dark,
         saturated=saturated,
-        masked=np.asarray(masked),
+        masked=invalid if foreground is None else invalid | ~foreground,
         noise=noise,
         factors=np.ones((4, 1, 1), np.float32),
         pair_ratio=pair_ratio(gray, good),

@@ -38,7 +38,7 @@ class ExposureSet:
         kind: mosaic (one file), filter (one file an angle) or scene (a view of a scene folder).
         files: by angle; a mosaic's under 0. Angles may be missing: ``read_shot`` says so.
         root: folder of the scene; else None.
-        view: its name in the scene. downscale: side of the boxes over which its pictures are averaged.
+        view: its name in the scene.
         fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
         others: where there is a fault, files that ``files`` has no place for; or the folder that it is in.
     """
@@ -48,7 +48,6 @@ class ExposureSet:
     files: dict[int, Path]
     root: Path | None = None
     view: str = ""
-    downscale: int = 1
     fault: PolarguideError | None = None
     others: tuple[Path, ...] = ()
 

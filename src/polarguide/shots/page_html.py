@@ -142,7 +142,7 @@ def _facts(maps: ShotMaps, surface: SurfaceMaps) -> str:
         "rays": "of a pinhole camera"
         if surface.perspective
         else "parallel to the axis (--intrinsics gives others)",
-        "files": ", ".join(path.name for path in maps.files),
+        "files": ", ".join(path.name for path in maps.files) or "a view of a scene",
         **({"notes": " ".join(maps.notes)} if maps.notes else {}),
     }
     return "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from polarguide import optics
+from polarguide.capture.view import View
 from polarguide.errors import PolarguideError
-from polarguide.shots.develop import Developed, develop
+from polarguide.shots.develop import Developed, develop, develop_view
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
@@ -24,20 +25,22 @@ _DARK_SNR = 3.0
 
 
 def read_shot(
-    shot: ExposureSet | str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    shot: ExposureSet | View | str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     options: ShotOptions | None = None,
 ) -> ShotMaps:
     """Read one exposure set: S0, DoLP, AoLP, their standard deviations, and which pixels say nothing.
 
     Args:
-        shot: of ``find_shots``; or the path of a mosaic, the four paths of shots through a filter, or a folder with one
-            shot.
+        shot: of ``find_shots``; a view of a scene; or the path of a mosaic, the four paths of shots through a filter,
+            or a folder with one shot.
         options: how to read it.
 
     Raises:
         PolarguideError: it is not one shot, or a file is missing, cannot be read, or does not fit.
     """
     options = (options or ShotOptions()).checked()
+    if isinstance(shot, View):
+        return maps_of(ExposureSet(shot.name, "scene", {}), develop_view(shot, options), options)
     if not isinstance(shot, ExposureSet):
         paths = [shot] if isinstance(shot, str | os.PathLike) else list(shot)
         found = find_shots(paths, options)

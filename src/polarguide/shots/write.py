@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.view import View
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.files import atomic, in_utf8, make_folder, require_inside, write_text, write_whole
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
 from polarguide.shots.catalog import KINDS
-from polarguide.shots.develop import check_files
+from polarguide.shots.develop import check_files, require_four_pictures
 from polarguide.shots.exposures import (
     ExposureSet,
     find_shots,
@@ -78,16 +79,7 @@ def write_shots(
         PolarguideError: there are no shots, an option is wrong, or every shot failed: then the error of the first.
     """
     options = (options or ShotOptions()).checked()
-    unknown = sorted(set(formats) - set(FORMATS))
-    if unknown or not formats:
-        raise PolarguideError(
-            "formats",
-            expected=f"some of {', '.join(FORMATS)}",
-            found=", ".join(unknown) or "none",
-            remedy="Correct the name.",
-        )
-    if "exr" in formats:
-        optional_import("OpenEXR", "EXR files")
+    check_formats(formats)
     found = [s for s in paths if isinstance(s, ExposureSet)]
     if len(found) < len(paths) or not paths:
         found += find_shots([p for p in paths if not isinstance(p, ExposureSet)], options)
@@ -119,6 +111,58 @@ def write_shots(
     if not folders:
         raise next(iter(faults.values()))
     return WrittenShots(folders, faults)
+
+
+def write_view_maps(
+    views: Sequence[View],
+    out: str | os.PathLike[str],
+    options: ShotOptions | None = None,
+    *,
+    formats: Collection[str] = FORMATS,
+    refractive_index: float = 1.5,
+    reporter: Reporter = SILENT,
+) -> dict[str, Path]:
+    """Write all maps of views of a scene, a folder for each; returns the folders by name.
+
+    Args:
+        views: with pictures at 0, 45, 90 and 135 degrees; what is written is of these, as they are.
+        out, options, formats, refractive_index, reporter: as for ``write_shots``; of the options ``full_well``,
+            ``read_noise`` and ``snr`` apply.
+
+    Raises:
+        PolarguideError: a view has other pictures, or an option is wrong.
+    """
+    options = (options or ShotOptions()).checked()
+    check_formats(formats)
+    for view in views:
+        require_four_pictures(view)
+    folders: dict[str, Path] = {}
+    with reporter.track("maps", len(views)) as advance:
+        for number, view in enumerate(views, 1):
+            require_inside(Path(out), folder := Path(out) / view.name)
+            maps = read_shot(view, options)
+            surface = surface_maps(maps, view.camera, refractive_index)
+            folders[view.name] = write_maps(maps, surface, folder, formats)
+            advance(number)
+    return folders
+
+
+def check_formats(formats: Collection[str]) -> None:
+    """Check the names of formats of maps.
+
+    Raises:
+        PolarguideError: there is none, one is unknown, or its package is not there.
+    """
+    unknown = sorted(set(formats) - set(FORMATS))
+    if unknown or not formats:
+        raise PolarguideError(
+            "formats",
+            expected=f"some of {', '.join(FORMATS)}",
+            found=", ".join(unknown) or "none",
+            remedy="Correct the name.",
+        )
+    if "exr" in formats:
+        optional_import("OpenEXR", "EXR files")
 
 
 def write_maps(

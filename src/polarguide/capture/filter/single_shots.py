@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from polarguide.capture.filter.angle_table import TABLE, Line, read_angle_table
+from polarguide.capture.angle_table import TABLE, Line, read_table
 from polarguide.capture.filter.shots import SHOT_SUFFIXES
 from polarguide.capture.layout import ambiguous, index_files, list_files
 from polarguide.capture.polarizer_angles import Angle, angle_text, parse_angle
@@ -72,7 +72,7 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
         return _checked(root, shots), []
     if angles is not None or table.exists():
         table = Path(angles) if angles is not None else table
-        return _checked(root, _by_table(root, table, read_angle_table(table))), [table]
+        return _checked(root, _by_table(root, table, read_table(table))), [table]
     files = list_files(root, SHOT_SUFFIXES)
     folders = {} if files else folders_of_angles(root)
     if folders:
