@@ -16,8 +16,11 @@ from polarguide.shading.visibility import outward_directions
 from polarguide.system import MemoryBound
 from polarguide.training import flat
 from polarguide.training.metals.evidence import evidence
+from polarguide.training.metals.rules import MetalRules
 from polarguide.training.metals.words import contradicted, said_by
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
+
+RULES = MetalRules()
 
 CLEAR, WORK = "clear", "work"
 GAUSSIANS = gaussians_of_the_ball()
@@ -45,7 +48,7 @@ class Logged(MemoryBound):
 
 def of_metals(views: list[View], memory: Logged) -> None:
     without = [dataclasses.replace(view, materials=None) for view in views]
-    evidence(GAUSSIANS, without, memory.works(rasterize_cpu), 1.5, memory)
+    evidence(GAUSSIANS, without, memory.works(rasterize_cpu), 1.5, RULES, memory)
 
 
 def of_words(views: list[View], memory: Logged) -> None:
@@ -53,7 +56,7 @@ def of_words(views: list[View], memory: Logged) -> None:
 
 
 def of_contradictions(views: list[View], memory: Logged) -> None:
-    contradicted(GAUSSIANS, views, memory.works(rasterize_cpu), torch.zeros(900, 2), memory)
+    contradicted(GAUSSIANS, views, memory.works(rasterize_cpu), torch.zeros(900, 2), RULES, memory)
 
 
 def of_sides(views: list[View], memory: Logged) -> None:
@@ -61,7 +64,7 @@ def of_sides(views: list[View], memory: Logged) -> None:
 
 
 def of_flat_surfaces(views: list[View], memory: Logged) -> None:
-    flat.flat_surfaces(memory.between(views), 1.5)
+    flat.flat_surfaces(memory.between(views), 1.5, FlatRules())
 
 
 @pytest.mark.parametrize("look", [of_metals, of_words, of_contradictions, of_sides, of_flat_surfaces])
