@@ -64,7 +64,7 @@ def of_sides(views: list[View], memory: Logged) -> None:
 
 
 def of_flat_surfaces(views: list[View], memory: Logged) -> None:
-    flat.flat_surfaces(memory.between(views), 1.5, FlatRules())
+    flat.flat_surfaces(memory.between(views), 1.5, flat.FlatRules())
 
 
 @pytest.mark.parametrize("look", [of_metals, of_words, of_contradictions, of_sides, of_flat_surfaces])
