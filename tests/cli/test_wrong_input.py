@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import json
 import shutil
@@ -114,17 +115,21 @@ def test_resume_with_another_scene(refused, tmp_path: Path, demo_scene: Path, tr
     assert "(scene_digest)" in refused("train", other, "--out", trained, "--resume", *short)
 
 
-def test_resume_after_the_recipe_changed_says_what_changed(
-    refused, tmp_path: Path, demo_scene: Path, trained: Path, short
+@pytest.mark.parametrize(
+    "place", ["ssim_weight", "metal_rules.begin", "priors.flat_rules.least", "propagation.rest"]
+)
+def test_resume_after_a_constant_of_the_recipe_changed_names_it(
+    refused, tmp_path: Path, demo_scene: Path, trained: Path, short, place: str
 ) -> None:
     shutil.copytree(trained, tmp_path / "run")
     path = tmp_path / "run" / CONFIGURATION
     data = json.loads(path.read_text())
-    data["recipe_data"]["ssim_weight"] = 0.875
+    *rooms, name = place.split(".")
+    inner = functools.reduce(dict.__getitem__, rooms, data["recipe_data"])
+    value, inner[name] = inner[name], 0.875
     path.write_text(json.dumps(data))
     line = refused("train", demo_scene, "--out", tmp_path / "run", "--resume", *short)
-    assert "(recipe_data)" in line
-    assert '{"ssim_weight": 0.875}' in line
+    assert f"(recipe_data.{place}): expected 0.875, found {json.dumps(value)}" in line
 
 
 @pytest.mark.parametrize("verb", ["eval", "render"])

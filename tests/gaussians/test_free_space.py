@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from polarguide.camera import Camera
-from polarguide.gaussians.free_space import FREE_SHARE, free_space
+from polarguide.gaussians.free_space import free_space
 
 
 def camera(z: float) -> Camera:
@@ -17,19 +17,19 @@ def camera(z: float) -> Camera:
 
 def test_the_radius_is_a_share_of_the_depth_of_the_nearest_points() -> None:
     points = torch.tensor([[0.1, 0.0, 4.0]] * 50 + [[0.0, 0.2, 9.0]] * 50)
-    empty = free_space(points, [camera(0.0), camera(2.0)])
-    assert empty.radii.tolist() == pytest.approx([4 * FREE_SHARE, 2 * FREE_SHARE])
+    empty = free_space(points, [camera(0.0), camera(2.0)], 0.4, 0.02)
+    assert empty.radii.tolist() == pytest.approx([4 * 0.4, 2 * 0.4])
     inside = torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, 2.7], [0.0, 0.0, 3.5], [1.7, 0.0, 0.0]])
     assert empty.contains(inside).tolist() == [True, True, False, False]
 
 
 def test_one_gross_outlier_among_many_points_does_not_shrink_it() -> None:
     points = torch.tensor([[0.0, 0.0, 4.0]] * 99 + [[0.0, 0.0, 0.01]])
-    assert free_space(points, [camera(0.0)]).radii.item() == pytest.approx(4 * FREE_SHARE)
+    assert free_space(points, [camera(0.0)], 0.4, 0.02).radii.item() == pytest.approx(4 * 0.4)
 
 
 def test_a_camera_that_sees_no_point_leaves_nothing_empty() -> None:
     behind_and_beside = torch.tensor([[0.0, 0.0, -1.0], [50.0, 0.0, 1.0]])
-    empty = free_space(behind_and_beside, [camera(0.0)])
+    empty = free_space(behind_and_beside, [camera(0.0)], 0.4, 0.02)
     assert empty.radii.tolist() == [0.0]
     assert not empty.contains(torch.zeros(1, 3)).any()

@@ -145,7 +145,7 @@ def test_a_reset_of_the_opacities_keeps_the_models_minimum(trained: Trainer) -> 
     gaussians = trained.state.gaussians
     gaussians.overwrite("gloss_logits", torch.linspace(-9, 2, len(gaussians)))
     tint = gaussians["tint"].detach().clone()
-    reset_opacity(trained.state, trained.shading)
+    reset_opacity(trained.state, trained.shading, 0.01)
     gloss = gaussians["gloss_logits"].detach()
     assert (float(gloss.min()), float(gloss.max())) == (-5.0, 2.0)
     assert torch.equal(gaussians["tint"], tint)

@@ -14,7 +14,7 @@ from polarguide.camera import Camera, look_at
 from polarguide.capture import View
 from polarguide.capture.view import FULL_CODE
 from polarguide.polarizer import ANGLES
-from polarguide.training.flat import flat_surface, flat_surfaces
+from polarguide.training.flat import FlatRules, flat_surface, flat_surfaces
 from polarguide.training.priors import view_priors
 from polarguide.training.recipe import Priors
 from polarguide.vectors import dot, unit
@@ -59,7 +59,7 @@ def degrees(one: Tensor, other: Tensor) -> float:
 def test_a_plane_has_one_normal_on_its_true_side(tilt: float, mirrors: float) -> None:
     normal = torch.tensor([math.sin(tilt), 0.0, math.cos(tilt)])
     view, where = floor(camera(), normal, mirrors=mirrors)
-    found = flat_surface(view, INDEX)
+    found = flat_surface(view, INDEX, FlatRules())
     assert found is not None
     assert degrees(found.normal, normal) < 0.2
     assert float((found.where & where).sum() / where.sum()) > 0.85
@@ -75,7 +75,7 @@ def test_a_ball_is_not_flat() -> None:
     hit = square > 0
     normals = unit((along - square.clamp(min=0).sqrt())[..., None] * rays - center)
     assert float(hit.float().mean()) > 0.4
-    assert flat_surface(photographed(of, normals, hit), INDEX) is None
+    assert flat_surface(photographed(of, normals, hit), INDEX, FlatRules()) is None
 
 
 def test_what_is_not_polarized_and_what_is_noise_is_not_flat() -> None:
@@ -83,32 +83,35 @@ def test_what_is_not_polarized_and_what_is_noise_is_not_flat() -> None:
     nothing = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     normals = of.to_camera(UP.expand(HEIGHT, WIDTH, 3))
     view = photographed(of, normals, nothing)
-    assert flat_surface(view, INDEX) is None
+    assert flat_surface(view, INDEX, FlatRules()) is None
     noise = torch.rand(view.codes.shape, generator=torch.Generator().manual_seed(2)) * FULL_CODE
-    assert flat_surface(replace(view, pictures=noise.to(torch.int32).to(torch.uint16)), INDEX) is None
-    assert flat_surface(replace(floor(of)[0], invalid=~nothing), INDEX) is None
+    assert (
+        flat_surface(replace(view, pictures=noise.to(torch.int32).to(torch.uint16)), INDEX, FlatRules())
+        is None
+    )
+    assert flat_surface(replace(floor(of)[0], invalid=~nothing), INDEX, FlatRules()) is None
 
 
 def test_views_have_to_agree_and_then_have_their_mean() -> None:
     views = [replace(floor(camera(0.5 * k))[0], name=f"v{k}") for k in range(5)]
     aside = torch.tensor([math.sin(0.3), 0.0, math.cos(0.3)])
     views.append(replace(floor(camera(0.2), aside)[0], name="v5"))
-    found = flat_surfaces(views, INDEX)
+    found = flat_surfaces(views, INDEX, FlatRules())
     assert sorted(found) == [f"v{k}" for k in range(5)]
     assert all(degrees(flat.normal, UP) < 0.1 for flat in found.values())
-    assert flat_surfaces(views[:2], INDEX) == {}
+    assert flat_surfaces(views[:2], INDEX, FlatRules()) == {}
     # Two thirds of the views see nothing of it.
     blank = photographed(
         camera(), torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     )
     others = [replace(blank, name=f"w{k}") for k in range(11)]
-    assert flat_surfaces([*views[:5], *others], INDEX) == {}
+    assert flat_surfaces([*views[:5], *others], INDEX, FlatRules()) == {}
 
 
 def test_it_takes_the_place_of_a_guide_that_is_the_mirror_image() -> None:
     of = camera()
     view, _ = floor(of)
-    flat = flat_surface(view, INDEX)
+    flat = flat_surface(view, INDEX, FlatRules())
     assert flat is not None
     rays = of.rays()
     true = of.to_camera(UP.expand_as(rays))

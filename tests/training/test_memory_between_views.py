@@ -15,9 +15,11 @@ from polarguide.shading.visibility import outward_directions
 from polarguide.system import MemoryBound
 from polarguide.training import flat
 from polarguide.training.metals.evidence import evidence
+from polarguide.training.metals.rules import MetalRules
 from polarguide.training.metals.words import contradicted, said_by
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
 
+RULES = MetalRules()
 GAUSSIANS = gaussians_of_the_ball()
 VIEWS = [
     dataclasses.replace(view, materials=torch.where(view.invalid, 0, 2).to(torch.uint8))
@@ -46,7 +48,7 @@ class Held(MemoryBound):
 
 def of_metals(views: list[View], memory: Held) -> None:
     without = [dataclasses.replace(view, materials=None) for view in views]
-    evidence(GAUSSIANS, without, memory.works(rasterize_cpu), 1.5, memory)
+    evidence(GAUSSIANS, without, memory.works(rasterize_cpu), 1.5, RULES, memory)
 
 
 def of_words(views: list[View], memory: Held) -> None:
@@ -54,7 +56,7 @@ def of_words(views: list[View], memory: Held) -> None:
 
 
 def of_contradictions(views: list[View], memory: Held) -> None:
-    contradicted(GAUSSIANS, views, memory.works(rasterize_cpu), torch.zeros(900, 2), memory)
+    contradicted(GAUSSIANS, views, memory.works(rasterize_cpu), torch.zeros(900, 2), RULES, memory)
 
 
 def of_sides(views: list[View], memory: Held) -> None:
@@ -62,7 +64,7 @@ def of_sides(views: list[View], memory: Held) -> None:
 
 
 def of_flat_surfaces(views: list[View], memory: Held) -> None:
-    flat.flat_surfaces(memory.between(views), 1.5)
+    flat.flat_surfaces(memory.between(views), 1.5, flat.FlatRules())
 
 
 @pytest.mark.parametrize("look", [of_metals, of_words, of_contradictions, of_sides, of_flat_surfaces])

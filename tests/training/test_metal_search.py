@@ -17,10 +17,13 @@ from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.shading.metal import any_nonzero
 from polarguide.training.metals.decision import decide
 from polarguide.training.metals.evidence import evidence
+from polarguide.training.metals.rules import MetalRules
 from polarguide.training.metals.words import contradicted, said_by
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
+
+RULES = MetalRules()
 
 RECIPE = RECIPES["polarguide-stokes"]
 
@@ -121,7 +124,7 @@ def test_who_contradicts_whom() -> None:
     half[:, half.shape[1] // 2 :][half[:, half.shape[1] // 2 :] == 2] = 1
     views[4] = dataclasses.replace(views[4], materials=None)
     of_the_ball = gaussians_of_the_ball()
-    found = contradicted(of_the_ball, views, rasterize_cpu, said_by(of_the_ball, views, rasterize_cpu))
+    found = contradicted(of_the_ball, views, rasterize_cpu, said_by(of_the_ball, views, rasterize_cpu), RULES)
     assert list(found) == ["v03"]
     assert 0.35 < found["v03"] < 0.65
     # Of two that say opposite things, each is contradicted by the other wherever both see the ball.
@@ -129,7 +132,9 @@ def test_who_contradicts_whom() -> None:
         dataclasses.replace(views[k], materials=torch.where(views[k].invalid, 0, kind).to(torch.uint8))
         for k, kind in ((0, 1), (1, 2))
     ]
-    found = contradicted(of_the_ball, opposed, rasterize_cpu, said_by(of_the_ball, opposed, rasterize_cpu))
+    found = contradicted(
+        of_the_ball, opposed, rasterize_cpu, said_by(of_the_ball, opposed, rasterize_cpu), RULES
+    )
     assert min(found["v00"], found["v01"]) > 0.99
 
 
@@ -145,11 +150,13 @@ def test_the_users_words_need_no_polarization(tiny_scene: Scene) -> None:
         for view in views_of("gold")[:6]
     ]
     assert not any(view.is_determined for view in views)
-    found = evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5)
+    found = evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5, RULES)
     nothing = torch.zeros(900, dtype=torch.bool)
-    metal = decide(found, nothing, ~nothing)
+    metal = decide(found, nothing, ~nothing, RULES)
     assert float(metal[gaussians_of_the_ball()["means"][:, 2] > 0.3].float().mean()) > 0.9
     views = [dataclasses.replace(view, materials=None) for view in views]
     assert not bool(
-        decide(evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5), nothing, ~nothing).any()
+        decide(
+            evidence(gaussians_of_the_ball(), views, rasterize_cpu, 1.5, RULES), nothing, ~nothing, RULES
+        ).any()
     )

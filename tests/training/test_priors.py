@@ -164,7 +164,7 @@ def test_where_the_guide_knows_nothing_the_weights_are_zero(view: View) -> None:
 def test_guide_normals_face_the_camera_and_mixed_ones_are_not_known(view: View) -> None:
     rays = view.camera.rays()
     raw = torch.randn(rays.shape, generator=torch.Generator().manual_seed(0))
-    unit, known = guide_normals(raw, rays)
+    unit, known = guide_normals(raw, rays, Priors.minimum_normal)
     assert float((unit * rays).sum(-1).max()) <= 1e-4
     torch.testing.assert_close(unit.norm(dim=-1), torch.ones(rays.shape[:2]))
     assert torch.equal(known, raw.norm(dim=-1) > 0.3)

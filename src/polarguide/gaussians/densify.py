@@ -31,6 +31,11 @@ class Densification:
             parameters and a pixel three values: with fewer than twenty pixels each, unknowns outnumber data.
         faint_pixels: Gaussians go, once, when the density control ends, whose blending weights add up to less than this
             in every training picture: three in ten, which cost time and show nothing. 0: none goes.
+        enough_views: number of training views from which on, before an empty background, Gaussians go that only one
+            of them sees.
+        reset_opacity: what a reset lowers opacities to (Kerbl et al. 2023).
+        free_share: no Gaussian stays within this share of the depth of a view's nearest points
+            (``gaussians.free_space``). free_quantile: of the points' depths, which counts as the nearest.
     """
 
     every: int = 100
@@ -43,6 +48,10 @@ class Densification:
     large_minimum: int = 700
     pixels_each: float = 20.0
     faint_pixels: float = 0.0
+    enough_views: int = 12
+    reset_opacity: float = 0.01
+    free_share: float = 0.4
+    free_quantile: float = 0.02
 
     def prunes_large(self, step: int, steps: int) -> bool:
         """Whether a round after a number of steps, of ``steps`` in all, prunes huge Gaussians."""

@@ -14,10 +14,6 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 
-# Share of the depth of a view's nearest points that counts as free, and the quantile of depth that is the nearest.
-FREE_SHARE = 0.4
-NEAREST = 0.02
-
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
@@ -39,14 +35,18 @@ class FreeSpace:
         return (torch.cdist(means, self.centers) < self.radii).any(dim=1)
 
 
-def free_space(points: Tensor, cameras: Sequence[Camera]) -> FreeSpace:
-    """The free space in front of cameras that see SfM points [M, 3]; see ``FREE_SHARE`` and ``NEAREST``."""
+def free_space(points: Tensor, cameras: Sequence[Camera], share: float, quantile: float) -> FreeSpace:
+    """The free space in front of cameras that see SfM points [M, 3].
+
+    Args:
+        share: of the depth of a view's nearest points, which is free. quantile: of depths, which is the nearest.
+    """
     radii = []
     for camera in cameras:
         x, y, z = camera.to_camera(points.double() - camera.center).unbind(-1)
         column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         depths = z[inside]
-        radii.append(FREE_SHARE * float(torch.quantile(depths, NEAREST)) if len(depths) else 0.0)
+        radii.append(share * float(torch.quantile(depths, quantile)) if len(depths) else 0.0)
     centers = torch.stack([camera.center for camera in cameras]).float()
     return FreeSpace(centers, torch.tensor(radii))

@@ -28,7 +28,7 @@ from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.shading.gbuffer import render
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Priors, Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer
@@ -130,7 +130,7 @@ def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
             view.name, expected="normals and depth", found="none", remedy="Report this: it is a fault here."
         )
     rays = view.camera.rays()
-    normal, known = guide_normals(view.camera.to_camera(result.normal), rays)
+    normal, known = guide_normals(view.camera.to_camera(result.normal), rays, Priors.minimum_normal)
     by_depth = unit(view.camera.to_camera(depth_normals(result.depth, view.camera)))
     known = known & (result.alpha > _OPAQUE) & (dot(normal, by_depth) > _AGREEMENT)
     return Surface(view.camera, normal, result.depth, known)

@@ -16,6 +16,7 @@ from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.priors import facing_chromatic, guide_normals
+from polarguide.training.recipe import Priors
 from polarguide.visualization import figures
 from polarguide.visualization.sheet import Picture, contact_sheet
 
@@ -102,7 +103,7 @@ def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: f
     candidates = optics.physical_candidates(luminance, rays, index)
     normal = optics.disambiguate(candidates, guide, rays, azimuth_weight=0.5).normal
     good = ~(view.invalid | view.saturated)
-    chromatic, certain = facing_chromatic(stokes, guide, rays, index, good)
+    chromatic, certain = facing_chromatic(stokes, guide, rays, index, good, Priors())
     paper = optics.paper_separation(stokes, zenith, index)
     exact = optics.exact_separation(stokes, guide, rays, index)
     degrees = torch.rad2deg(zenith)
@@ -132,7 +133,7 @@ def _guide(
     if run is not None:
         normal = run.result(view.name, depth=False).to("cpu").normal
         assert normal is not None
-        return guide_normals(view.camera.to_camera(normal), rays)[0], "by_run"
+        return guide_normals(view.camera.to_camera(normal), rays, Priors.minimum_normal)[0], "by_run"
     upward = torch.tensor([0.0, -0.5, -1.0]).expand_as(rays)
     guess = torch.nn.functional.normalize(upward, dim=-1)
     chosen = optics.disambiguate(

@@ -26,6 +26,7 @@ from polarguide.capture.exposures import analyzers
 from polarguide.capture.view import listed
 from polarguide.color import srgb_encode
 from polarguide.files import write_text
+from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.free_space import free_space
 from polarguide.progress import Reporter
 from polarguide.records import read_record
@@ -174,7 +175,9 @@ def examine(model: Model, evidence: Evidence, points: Tensor, steps: int, report
     if not views:
         return Health(evidence.polarization)
     brightest = max(map(_brightest, views))
-    nearest = free_space(points, [view.camera for view in views]).radii.tolist()
+    cameras = [view.camera for view in views]
+    free = free_space(points, cameras, Densification.free_share, Densification.free_quantile)
+    nearest = free.radii.tolist()
     found, seen = {}, None
     with reporter.track("checking the result", len(views)) as advance:
         for view, near in zip(views, nearest, strict=True):

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -364,6 +365,14 @@ def _check_scene(scene: Scene) -> None:
         warnings.warn(said, PolarguideWarning, stacklevel=2)
 
 
+def _first_difference(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
+    """Where two records differ first, as ``recipe_data.metal_rules.begin``, and both values (None: not recorded)."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        key = next(key for key in {**a, **b} if a.get(key) != b.get(key))
+        return _first_difference(f"{name}.{key}", a.get(key), b.get(key))
+    return name, a, b
+
+
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
     if old.settings.background == "auto":  # as the first versions recorded it
         old = replace(old, settings=replace(old.settings, background=new.settings.background))
@@ -378,11 +387,9 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
     for field in ("scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer", "test_views"):
         a, b = getattr(old, field), getattr(new, field)
         if a != b and a is not None:
-            if isinstance(a, dict):  # a recipe: show what differs
-                keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
-                a, b = ({key: values.get(key) for key in keys} for values in (a, b))
+            name, a, b = _first_difference(field, a, b)
             raise PolarguideError(
-                f"{out}/{CONFIGURATION} ({field})",
+                f"{out}/{CONFIGURATION} ({name})",
                 expected=json.dumps(a, default=str)[:120],
                 found=json.dumps(b, default=str)[:120],
                 remedy="Resume with the same scene, options and program version, or train into a new folder.",

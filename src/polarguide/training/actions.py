@@ -8,23 +8,19 @@ from polarguide.shading.model import ShadingModel
 from polarguide.training.recipe import Propagation
 from polarguide.training.state import TrainingState
 
-RESET_OPACITY = 0.01
-# Steps for which opacities do not train after a propagation (Ye et al. 2024, release).
-OPACITY_REST = 200
-
 
 def _logit(value: float) -> float:
     return float(torch.logit(torch.tensor(value, dtype=torch.float64)))
 
 
 @torch.no_grad()
-def reset_opacity(state: TrainingState, shading: ShadingModel) -> None:
-    """Opacities down to at most 0.01, so that what is not needed stays transparent (Kerbl et al. 2023).
+def reset_opacity(state: TrainingState, shading: ShadingModel, most: float) -> None:
+    """Lower opacities to ``most``, so that what is not needed stays transparent (Kerbl et al. 2023).
 
     Parameters of the shading model rise to their minimum after a reset, where they have one.
     """
     gaussians = state.gaussians
-    gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(max=_logit(RESET_OPACITY)))
+    gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(max=_logit(most)))
     for name, parameter in shading.parameters.items():
         if parameter.reset_minimum is not None:
             gaussians.overwrite(name, gaussians[name].clamp(min=parameter.reset_minimum))
@@ -36,7 +32,7 @@ def propagate_normals(
     shading: ShadingModel,
     settings: Propagation,
     generator: torch.Generator,
-    rest: int,
+    steps: int,
 ) -> None:
     """Let Gaussians with a right normal take over their neighborhood (Ye et al. 2024, Sec. 3.3).
 
@@ -56,4 +52,4 @@ def propagate_normals(
     longer = torch.ones_like(scales).scatter(1, scales.argmin(dim=1, keepdim=True), 0.0)
     grow = (strength >= settings.glossy)[:, None] * longer * torch.log(torch.tensor(settings.widen))
     gaussians.overwrite("log_scales", scales + grow)
-    state.opacity_frozen_until = state.step + rest
+    state.opacity_frozen_until = state.step + min(settings.rest, steps // settings.rest_part)

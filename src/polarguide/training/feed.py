@@ -155,6 +155,6 @@ class Feed:
         if self._flat is None:
             views = self._views if self._settings.flat else ()
             # On the CPU, so that it is the same wherever one trains.
-            found = flat_surfaces(self._memory.between(views), self._index)
+            found = flat_surfaces(self._memory.between(views), self._index, self._settings.flat_rules)
             self._flat = {name: flat.to(self._backend.device) for name, flat in found.items()}
         return self._flat

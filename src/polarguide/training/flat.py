@@ -21,28 +21,38 @@ from polarguide import optics
 from polarguide.capture import View
 from polarguide.vectors import dot, unit
 
-TRIES = 400
-"""Pairs of pixels that propose a normal."""
-SAMPLES = 12_000
-"""Pixels that judge them, about."""
-CLOSE = 0.03
-"""Sine of the angle between a pixel's plane of incidence and the normal, up to which they agree."""
-APART = 0.03
-"""Sine of the angle between the directions of two pixels under which they propose nothing."""
-LEAST = 0.25
-"""Share of a view that a flat surface covers at least: of curved things one normal explains up to a sixth by chance."""
-FAINT = 0.05
-"""DoLP from which on a pixel has a say."""
-SLACK = 1.1, 0.02
-"""DoLP over Fresnel's, as a factor and beyond it, that is still no contradiction."""
-GRAZING = 0.05
-"""Cosine between normal and ray under which a surface is not seen."""
-NEAR, MOST = 9, 0.7
-"""Side of a square of pixels, and the share of it that has to agree around a pixel that counts."""
-ALIKE, FEWEST, SHARE = 5.0, 3, 1 / 3
-"""Degrees within which flat surfaces of different views are one, and how many views and which share of them have to
-show it.
-"""
+
+@dataclass(frozen=True)
+class FlatRules:
+    """Constants of the search for flat surfaces.
+
+    Attributes:
+        tries: pairs of pixels that propose a normal. samples: pixels that judge them, about.
+        close: sine of the angle between a pixel's plane of incidence and the normal, up to which they agree.
+        apart: sine of the angle between the directions of two pixels under which they propose nothing.
+        least: share of a view that a flat surface covers at least: one normal explains up to a sixth of a curved one by
+            chance.
+        faint: DoLP from which on a pixel counts.
+        slack: factor on Fresnel's DoLP, and what is added to it, beyond which a pixel contradicts.
+        grazing: cosine between normal and ray under which a surface is not seen.
+        window, most: side in pixels of the square around a pixel, and the share of it that has to agree.
+        alike: degrees within which flat surfaces of different views are one.
+        fewest, share: views, and share of the views, that have to show it.
+    """
+
+    tries: int = 400
+    samples: int = 12_000
+    close: float = 0.03
+    apart: float = 0.03
+    least: float = 0.25
+    faint: float = 0.05
+    slack: tuple[float, float] = (1.1, 0.02)
+    grazing: float = 0.05
+    window: int = 9
+    most: float = 0.7
+    alike: float = 5.0
+    fewest: int = 3
+    share: float = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,54 +73,56 @@ class Flat:
 
 
 @torch.no_grad()
-def flat_surface(view: View, refractive_index: float) -> Flat | None:
+def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat | None:
     """The flat surface that explains most of a view whose pictures determine the Stokes vector; None: there is none.
 
     Random pairs of pixels propose normals, the one that most pixels agree with is refined on them by least squares.
     """
     luminance, rays = optics.luminance(view.stokes()), view.camera.rays()
     degree = optics.dolp(luminance)
-    good = (degree > FAINT) & ~view.invalid & ~view.saturated
+    good = (degree > rules.faint) & ~view.invalid & ~view.saturated
     x_ref, up_ref = optics.lens_frame(rays)
     angle = 0.5 * torch.atan2(luminance[2], luminance[1])[..., None]
     across = x_ref * angle.cos() + up_ref * angle.sin()
 
     pixels = good.numel()
-    step = max(1, round((pixels / SAMPLES) ** 0.5))
+    step = max(1, round((pixels / rules.samples) ** 0.5))
     some = torch.zeros_like(good)
     some[::step, ::step] = good[::step, ::step]
     e, d, dolp = across[some], rays[some], degree[some]
-    least = LEAST * pixels / step**2
+    least = rules.least * pixels / step**2
     if len(e) < max(2.0, least):
         return None
-    pairs = torch.randint(len(e), (2, TRIES), generator=torch.Generator().manual_seed(0))
+    pairs = torch.randint(len(e), (2, rules.tries), generator=torch.Generator().manual_seed(0))
     proposed = torch.linalg.cross(e[pairs[0]], e[pairs[1]])
-    proposed = unit(proposed[proposed.norm(dim=-1) > APART])
+    proposed = unit(proposed[proposed.norm(dim=-1) > rules.apart])
     if not len(proposed):
         return None
     proposed = torch.cat((proposed, -proposed))
-    fits = _agrees(proposed @ e.T, -(proposed @ d.T), dolp, refractive_index)
+    fits = _agrees(proposed @ e.T, -(proposed @ d.T), dolp, refractive_index, rules)
     best = fits.sum(dim=1).argmax()
     normal, inside = proposed[best], fits[best]
     for _ in range(3):
         _, vectors = torch.linalg.eigh(e[inside].T @ e[inside])
         normal = vectors[:, 0] * torch.sign(vectors[:, 0] @ normal)
-        inside = _agrees(e @ normal, -(d @ normal), dolp, refractive_index)
+        inside = _agrees(e @ normal, -(d @ normal), dolp, refractive_index, rules)
     if float(inside.sum()) < least:
         return None
     everywhere = normal.expand_as(rays)
-    where = good & _agrees(dot(across, everywhere), -dot(rays, everywhere), degree, refractive_index)
-    around = torch.nn.functional.avg_pool2d(where[None].float(), NEAR, 1, NEAR // 2)[0]
-    return Flat(view.camera.to_world(normal), where & (around > MOST))
+    where = good & _agrees(dot(across, everywhere), -dot(rays, everywhere), degree, refractive_index, rules)
+    around = torch.nn.functional.avg_pool2d(where[None].float(), rules.window, 1, rules.window // 2)[0]
+    return Flat(view.camera.to_world(normal), where & (around > rules.most))
 
 
-def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float) -> Tensor:
+def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float, rules: FlatRules) -> Tensor:
     """Whether pixels agree with normals: ``off`` the cosine to their directions, ``cosine`` that to their rays."""
-    allowed = optics.specular_dolp(cosine.clamp(0, 1).acos(), refractive_index) * SLACK[0] + SLACK[1]
-    return (off.abs() < CLOSE) & (cosine > GRAZING) & (dolp < allowed)
+    allowed = (
+        optics.specular_dolp(cosine.clamp(0, 1).acos(), refractive_index) * rules.slack[0] + rules.slack[1]
+    )
+    return (off.abs() < rules.close) & (cosine > rules.grazing) & (dolp < allowed)
 
 
-def flat_surfaces(views: Iterable[View], refractive_index: float) -> dict[str, Flat]:
+def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRules) -> dict[str, Flat]:
     """Flat surfaces by the name of the view, where enough views have one that is turned alike; each has their mean.
 
     Views that do not determine the Stokes vector are left out.
@@ -119,14 +131,14 @@ def flat_surfaces(views: Iterable[View], refractive_index: float) -> dict[str, F
     for view in views:  # one by one, as they come
         if view.is_determined:
             determined += 1
-            if (flat := flat_surface(view, refractive_index)) is not None:
+            if (flat := flat_surface(view, refractive_index, rules)) is not None:
                 found[view.name] = flat
     if not found:
         return {}
     normals = torch.stack([flat.normal for flat in found.values()])
     sizes = torch.stack([flat.where.sum() for flat in found.values()]).to(normals)
-    alike = normals @ normals.T > torch.cos(torch.deg2rad(normals.new_tensor(ALIKE)))
-    enough, agreed = max(FEWEST, SHARE * determined), {}
+    alike = normals @ normals.T > torch.cos(torch.deg2rad(normals.new_tensor(rules.alike)))
+    enough, agreed = max(rules.fewest, rules.share * determined), {}
     for (name, flat), others in zip(found.items(), alike, strict=True):
         if int(others.sum()) >= enough:
             agreed[name] = replace(flat, normal=unit((normals * (others * sizes)[:, None]).sum(dim=0)))

@@ -23,19 +23,6 @@ from polarguide.training.flat import Flat
 from polarguide.training.recipe import Candidates, Priors
 from polarguide.vectors import dot, unit
 
-# Rendered normals shorter than this are too mixed to be trusted.
-MINIMUM_NORMAL = 0.3
-# Color differences that explain their polarization this much better than not count fully.
-FULL_CERTAINTY = 3.0
-# Below this degree of polarization their plane takes the place of the AoLP's.
-CHROMATIC_PLANE_DOLP = 0.03
-# Contrasts among the colors between which a body goes over from gray to colorful.
-GRAY = (0.2, 0.3)
-# Cosine between a guide and the normal of a flat surface, under which the guide is wrong; it may know of ripples.
-ASTRAY = math.cos(math.radians(10))
-# Shares of metals between which a pixel goes over from a dielectric to a metal.
-METAL = (0.25, 0.75)
-
 
 @dataclass(frozen=True, eq=False)
 class ViewPriors:
@@ -140,9 +127,8 @@ def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
     degree = debiased_dolp(luminance, noise)
     if not settings.chromatic:
         return Unguided(usable, degree)
-    return Unguided(
-        usable, degree, *_chromatic_angles(stokes, refractive_index, ~(view.invalid | view.saturated))
-    )
+    good = ~(view.invalid | view.saturated)
+    return Unguided(usable, degree, *_chromatic_angles(stokes, refractive_index, good, settings))
 
 
 def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
@@ -156,12 +142,12 @@ def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
     return optics.polarization_uncertainty(luminance, (noise * noise).expand(4, *noise.shape)).debiased
 
 
-def guide_normals(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit normals facing the camera from blended ones [H, W, 3], and where they are trustworthy [H, W].
+def guide_normals(normal: Tensor, rays: Tensor, least: float) -> tuple[Tensor, Tensor]:
+    """Unit normals facing the camera from blended ones [H, W, 3], and where they are longer than ``least`` [H, W].
 
     A blended normal that faces away (by up to a pixel's slant) is brought to grazing.
     """
-    known = dot(normal, normal) > MINIMUM_NORMAL**2
+    known = dot(normal, normal) > least**2
     facing = unit(normal)
     away = dot(facing, rays)[..., None].clamp(min=0)
     return unit(facing - away * 1.001 * rays), known
@@ -198,11 +184,11 @@ def view_priors(
     usable, degree, *found = known
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
-    guide, shown = guide_normals(view.camera.to_camera(normal), rays)
+    guide, shown = guide_normals(view.camera.to_camera(normal), rays, settings.minimum_normal)
     on_plane, astray = guide, torch.zeros_like(shown)
     if flat is not None:
         on_plane = view.camera.to_camera(flat.normal).expand_as(guide)
-        astray = flat.where & ~(shown & (dot(guide, on_plane) > ASTRAY))
+        astray = flat.where & ~(shown & (dot(guide, on_plane) > math.cos(math.radians(settings.astray))))
         guide, shown = torch.where(astray[..., None], on_plane, guide), shown | flat.where
     nearest_to = guide
     zenith, azimuth, certainty, colorful = found
@@ -227,14 +213,15 @@ def view_priors(
     weight = (degree / settings.full_dolp).clamp(max=1) * (usable if settings.live else usable & shown)
     if certainty is not None:
         # Nearly unpolarized light has no reliable AoLP; the slope among its colors may still have one.
-        better = (chromatic_weight > 0) & (degree < CHROMATIC_PLANE_DOLP)
+        better = (chromatic_weight > 0) & (degree < settings.chromatic_plane_dolp)
         plane = torch.where(better[..., None], unit(torch.linalg.cross(rays, chromatic)), plane)
         weight = torch.maximum(weight, chromatic_weight)
     else:
         chromatic, chromatic_weight = chosen, torch.zeros_like(weight)
     reliable = (~(view.invalid | view.saturated)).float()
     if metal is not None:
-        body = 1 - ((metal - METAL[0]) / (METAL[1] - METAL[0])).clamp(0, 1)
+        none, whole = settings.metal_share
+        body = 1 - ((metal - none) / (whole - none)).clamp(0, 1)
         conditioned, chromatic_weight = conditioned * body, chromatic_weight * body
         # Light that is polarized in the plane of incidence was so before it fell on a metal: nothing here predicts it.
         fit = 1 - (1 - body) * (_across(luminance, guide, rays) < 0)
@@ -316,7 +303,12 @@ def facing(zenith: Tensor, azimuth: Tensor, guide: Tensor, rays: Tensor) -> Tens
 
 
 def facing_chromatic(
-    stokes: Tensor, guide: Tensor, rays: Tensor, refractive_index: float, good: Tensor
+    stokes: Tensor,
+    guide: Tensor,
+    rays: Tensor,
+    refractive_index: float,
+    good: Tensor,
+    settings: Priors,
 ) -> tuple[Tensor, Tensor]:
     """Normals of the color differences on the guide's side of each ray, and their weights.
 
@@ -327,21 +319,21 @@ def facing_chromatic(
     Returns:
         [H, W, 3] unit, camera axes; [H, W] in [0, 1], 0 where color decides nothing.
     """
-    zenith, azimuth, weight, _ = _chromatic_angles(stokes, refractive_index, good)
+    zenith, azimuth, weight, _ = _chromatic_angles(stokes, refractive_index, good, settings)
     return facing(zenith, azimuth, guide, rays), weight
 
 
 def _chromatic_angles(
-    stokes: Tensor, refractive_index: float, good: Tensor
+    stokes: Tensor, refractive_index: float, good: Tensor, settings: Priors
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Zenith, azimuth and weight in [0, 1] of the normals of the color differences, and how colorful the body is, each
     [H, W].
     """
     found = optics.chromatic_normals(stokes, refractive_index)
-    gray, color = GRAY
+    gray, color = settings.gray
     return (
         found.zenith,
         found.azimuth,
-        (found.certainty / FULL_CERTAINTY).clamp(max=1) * (found.decided & good),
+        (found.certainty / settings.full_certainty).clamp(max=1) * (found.decided & good),
         ((found.contrast - gray) / (color - gray)).clamp(0, 1),
     )

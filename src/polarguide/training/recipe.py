@@ -16,6 +16,8 @@ from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization
 from polarguide.shading.model import PLAIN, ShadingModel
+from polarguide.training.flat import FlatRules
+from polarguide.training.metals.rules import MetalRules
 
 Action = Literal["reset_opacity", "propagate_normals", "refresh_priors", "orient_normals"]
 Candidates = Literal["paper", "azimuths", "physical"]
@@ -167,7 +169,15 @@ class Priors:
             a view whose few pixels are polarized does not pull as hard as one that is polarized all over.
         bright: S0/2 from which on consistency counts fully whatever the DoLP, and below in proportion: where a surface
             shows something, its depth is known. 0: by the DoLP alone.
-        flat: whether large flat surfaces are looked for, whose normal one view tells.
+        flat: whether large flat surfaces are looked for, whose normal one view tells. flat_rules: how.
+        astray: degrees between the Gaussians' normal and that of a flat surface from which on the latter replaces the
+            former, which may know of ripples below.
+        minimum_normal: length of a blended normal above which it guides: shorter ones mix surfaces.
+        chromatic_plane_dolp: DoLP under which the plane of incidence of the color differences replaces the AoLP's.
+        full_certainty: certainty (``optics.chromatic_normals``) from which on the normal of the color differences
+            counts fully.
+        gray: contrasts among the colors between which a body goes over from gray to colorful.
+        metal_share: shares of metals between which a pixel goes over from a dielectric to a metal.
     """
 
     candidates: Candidates = "physical"
@@ -183,6 +193,13 @@ class Priors:
     chromatic_share: float = 0.0
     bright: float = 0.0
     flat: bool = False
+    flat_rules: FlatRules = field(default_factory=FlatRules)
+    astray: float = 10.0
+    minimum_normal: float = 0.3
+    chromatic_plane_dolp: float = 0.03
+    full_certainty: float = 3.0
+    gray: tuple[float, float] = (0.2, 0.3)
+    metal_share: tuple[float, float] = (0.25, 0.75)
 
 
 @dataclass(frozen=True)
@@ -194,6 +211,7 @@ class Propagation:
         color_noise: half-width of the noise on the base color where strength is at most ``matte``.
         matte, glossy: strengths that bound the two kinds of Gaussian.
         widen: factor on the two longer scales where strength is at least ``glossy``.
+        rest: steps for which opacities do not train afterwards (release); at most all steps over ``rest_part``.
     """
 
     opacity: float = 0.9
@@ -201,6 +219,8 @@ class Propagation:
     matte: float = 0.05
     glossy: float = 0.02
     widen: float = 1.5
+    rest: int = 200
+    rest_part: int = 50
 
 
 class Method(ABC):
@@ -253,6 +273,7 @@ class Recipe(Method):
         means_decay: factor on the means' rate at the last step (exponential in between).
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         metals: share of all steps between which refreshes look for metals, where the shading knows them.
+        metal_rules: how.
         coarse: which steps look at smaller pictures.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
@@ -269,6 +290,7 @@ class Recipe(Method):
     means_decay: float = 0.1
     oriented: bool = False
     metals: tuple[float, float] = (0.4, 0.72)
+    metal_rules: MetalRules = field(default_factory=MetalRules)
     coarse: Coarse = field(default_factory=Coarse)
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
     ssim_weight: float = 0.2

@@ -22,7 +22,7 @@ from polarguide.shading.gbuffer import COLOR_CHANNELS, render
 from polarguide.shading.model import PLAIN
 from polarguide.shading.visibility import outward_directions, touched_pixels
 from polarguide.system import UNBOUNDED, MemoryBound
-from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_opacity
+from polarguide.training.actions import propagate_normals, reset_opacity
 from polarguide.training.behind import turned_behind
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.indices import index_offsets, numbers_in
@@ -36,9 +36,6 @@ from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.sizes import Sizes
 from polarguide.training.state import TrainingState, first_state, seeded
 from polarguide.training.view_store import ViewStore
-
-# From so many training views on, what only one of them sees goes where nothing is behind the subject.
-ENOUGH_VIEWS = 12
 
 
 class Trainer:
@@ -85,7 +82,9 @@ class Trainer:
         self._extent = scene_extent(centers)
         self._reach = orbit(scene.points.double().numpy(), centers.double().numpy())[1]
         self._middle = centers.mean(dim=0).float().to(self._device)
-        empty = free_space(scene.points, [view.camera for view in scene.train_views])
+        cameras = [view.camera for view in scene.train_views]
+        density = recipe.densification
+        empty = free_space(scene.points, cameras, density.free_share, density.free_quantile)
         self._empty = empty.to(self._device)
         self._store = store or ViewStore()
         self._set_up()
@@ -198,7 +197,8 @@ class Trainer:
             self.ranks.broadcast(values)
         kept = touched.most >= faint
         if self.black:
-            kept &= touched.views >= (2 if len(views) >= ENOUGH_VIEWS else 1)
+            enough = len(views) >= self.recipe.densification.enough_views
+            kept &= touched.views >= (2 if enough else 1)
         if bool(kept.any()):
             state.gaussians.keep(kept)
             state.statistics.clear(len(state.gaussians))
@@ -322,11 +322,11 @@ class Trainer:
 
     def _act(self, action: Action) -> None:
         if action == "reset_opacity":
-            reset_opacity(self.state, self.shading)
+            reset_opacity(self.state, self.shading, self.recipe.densification.reset_opacity)
         elif action == "propagate_normals":
             generator = seeded(self.settings.seed, 3, self.state.step)
-            rest = min(OPACITY_REST, self._steps // 50)
-            propagate_normals(self.state, self.shading, self.recipe.propagation, generator, rest)
+            settings = self.recipe.propagation
+            propagate_normals(self.state, self.shading, settings, generator, self._steps)
         elif action == "orient_normals":
             gaussians, rasterize = self.state.gaussians, self.backend.rasterize
             outward = outward_directions(gaussians, self._memory.between(self._views), rasterize)

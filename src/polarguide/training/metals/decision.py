@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from scipy.sparse import coo_matrix
@@ -11,74 +9,33 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from polarguide.training.metals.evidence import Evidence
-from polarguide.training.metals.words import LEAST_SEEN
-
-# Share of the cameras' distance from the middle of the points within which metals are looked for: what is farther away
-# is behind the subject in all views from the other side.
-REACH = 0.5
-NEAREST = 16
-# Share of the neighbors that has to be known.
-LEAST_SUPPORT = 0.35
-# Evidence from which on a neighborhood begins to be metal, and goes on where enough of the nearest are.
-BEGIN, CONTINUE, STAY = 2.2, 0.4, 1.3
-BEGIN_MISFIT, CONTINUE_MISFIT = 0.05, 0.02
-CROWD, ALONE = 0.12, 0.2
-# Evidence down to which what lies among metal joins it, and from which share of its nearest on: what mirrors something
-# even could be either.
-AMONG, MAJORITY = -0.7, 0.4
-# Of a piece that hangs together, the share, and how many, that have to be surely metal. True ones had 0.25 to 0.56, a
-# plate in polarized light 0.02 to 0.13. Neighbors hang together from this likeness of their normals on.
-SURE_SHARE, FEWEST_SURE = 0.18, 10
-TOUCHING = 0.2
-# No metal reflects one color less than about 0.38 times another (gold, blue and red). A body whose colors, over those
-# of the scene, differ by more than this is none.
-LEAST_TINT = 0.25
-ROUNDS, FILLING = 12, 40
+from polarguide.training.metals.rules import Limits, MetalRules
 
 
-class Limits(NamedTuple):
-    """From which on a neighborhood is metal in polarized light.
+def decide(found: Evidence, was: Tensor, allowed: Tensor, rules: MetalRules) -> Tensor:
+    """Which Gaussians are metals, [N] bool: hysteresis thresholding on the graph of neighbors.
 
-    Attributes:
-        oblique: what is polarized at 45 degrees, as a share of what is seen. light: of the scene's mean light.
-        times: how many times its square that of the metal's misfit may be.
-        ratio: evidence below which a dielectric explains more.
-    """
-
-    oblique: float
-    light: float
-    times: float
-    ratio: float
-
-
-BEGIN_OBLIQUELY, CONTINUE_OBLIQUELY = Limits(0.03, 0.08, 4.0, 0.0), Limits(0.02, 0.02, 6.0, -0.5)
-
-
-def decide(found: Evidence, was: Tensor, allowed: Tensor) -> Tensor:
-    """Which Gaussians are metals, [N] bool.
-
-    What is surely metal begins; what is likely joins where enough of its nearest neighbors are. What was metal before
-    and still is rather plainly begins, too; the rest of it has to join again, or a metal would creep on over what lies
-    beside it. Single ones are none, and neither are pieces of which little is sure: a metal is plainly one over much of
-    its surface. What lies among metal joins even where a dielectric explains it a little better. What the user says of
-    a Gaussian is so.
+    Seeds have evidence above ``begin``, or above ``stay`` if they were metals before; the others of those have to join
+    again, or a metal would creep on over its surroundings. Regions grow to neighbors with evidence above ``proceed``.
+    Isolated Gaussians and regions with few seeds are dropped, and holes are filled. The user's labels override all.
 
     Args:
-        was: [N] bool, metal until now. allowed: [N] bool, those that may be.
+        was: [N] bool, metals until now. allowed: [N] bool, those that may be.
     """
-    told = found.said.sum(dim=1) > LEAST_SEEN
-    told_metal = told & (found.said[:, 1] > found.said[:, 0])
-    allowed = allowed & ~told & (found.tint > LEAST_TINT)
-    able = allowed & (found.misfit > CONTINUE_MISFIT) & (found.support > LEAST_SUPPORT)
-    no_dielectric = found.misfit > BEGIN_MISFIT
-    surely = told_metal | (able & no_dielectric & (found.ratio > BEGIN))
-    begun = surely | (able & was & (found.ratio > STAY))
-    metal = _pieces(found, surely, begun, able & (found.ratio > CONTINUE))
-    surely = able & no_dielectric & _obliquely(found, BEGIN_OBLIQUELY)
-    likely = able & _obliquely(found, CONTINUE_OBLIQUELY)
-    metal |= _pieces(found, surely, surely | (was & likely), likely)
-    # Of what hardly any view shows nothing is known, and the ratio is 0: among metal, it is metal.
-    return told_metal | _grown(found, metal, allowed & (found.ratio > AMONG), MAJORITY, FILLING)
+    labeled = found.said.sum(dim=1) > rules.least_weight
+    labeled_metal = labeled & (found.said[:, 1] > found.said[:, 0])
+    allowed = allowed & ~labeled & (found.tint > rules.least_tint)
+    able = allowed & (found.misfit > rules.proceed_misfit) & (found.support > rules.least_support)
+    no_dielectric = found.misfit > rules.begin_misfit
+    surely = labeled_metal | (able & no_dielectric & (found.ratio > rules.begin))
+    begun = surely | (able & was & (found.ratio > rules.stay))
+    metal = _regions(found, surely, begun, able & (found.ratio > rules.proceed), rules)
+    surely = able & no_dielectric & _obliquely(found, rules.begin_oblique)
+    likely = able & _obliquely(found, rules.proceed_oblique)
+    metal |= _regions(found, surely, surely | (was & likely), likely, rules)
+    # Nothing is known of what hardly any view shows, and its evidence is 0: among metals, it is one.
+    among = allowed & (found.ratio > rules.among)
+    return labeled_metal | _grown(found, metal, among, rules.majority, rules.filling, rules.nearest)
 
 
 def _obliquely(found: Evidence, limits: Limits) -> Tensor:
@@ -87,38 +44,40 @@ def _obliquely(found: Evidence, limits: Limits) -> Tensor:
     return much & (found.metal_misfit**2 < limits.times * found.oblique**2) & (found.ratio > limits.ratio)
 
 
-def _pieces(found: Evidence, surely: Tensor, metal: Tensor, likely: Tensor) -> Tensor:
-    """What is metal [N] where ``metal`` begins and ``likely`` joins, in pieces of which enough is sure."""
-    metal = _grown(found, metal, likely, CROWD, ROUNDS)
-    metal = metal & (_share_of_nearest(found, metal) > ALONE)
-    touching = found.alike[:, :NEAREST] > TOUCHING
-    return metal & _sure_enough(found.near[:, :NEAREST], touching, metal, surely)
+def _regions(found: Evidence, surely: Tensor, metal: Tensor, likely: Tensor, rules: MetalRules) -> Tensor:
+    """Metals [N]: ``metal`` grown over ``likely``, in connected regions with enough seeds that are sure."""
+    metal = _grown(found, metal, likely, rules.crowd, rules.rounds, rules.nearest)
+    metal = metal & (_share_of_nearest(found, metal, rules.nearest) > rules.alone)
+    touching = found.alike[:, : rules.nearest] > rules.touching
+    return metal & _sure_enough(found.near[:, : rules.nearest], touching, metal, surely, rules)
 
 
-def _share_of_nearest(found: Evidence, metal: Tensor) -> Tensor:
+def _share_of_nearest(found: Evidence, metal: Tensor, nearest: int) -> Tensor:
     """Share [N] of metals among the nearest of each, by how alike they are."""
-    counts = found.alike[:, :NEAREST]
-    return (metal[found.near[:, :NEAREST]] * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1e-6)
+    counts = found.alike[:, :nearest]
+    return (metal[found.near[:, :nearest]] * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1e-6)
 
 
-def _grown(found: Evidence, metal: Tensor, likely: Tensor, share: float, rounds: int) -> Tensor:
+def _grown(found: Evidence, metal: Tensor, likely: Tensor, share: float, rounds: int, nearest: int) -> Tensor:
     """``metal`` [N], and what is ``likely`` and has more than this share of metals among its nearest, over and over."""
     for _ in range(rounds):
-        grown = metal | (likely & (_share_of_nearest(found, metal) > share))
+        grown = metal | (likely & (_share_of_nearest(found, metal, nearest) > share))
         if bool((grown == metal).all()):
             break
         metal = grown
     return metal
 
 
-def _sure_enough(nearest: Tensor, touching: Tensor, metal: Tensor, surely: Tensor) -> Tensor:
-    """Which metals [N] lie in a connected piece of them of which enough is sure."""
+def _sure_enough(
+    nearest: Tensor, touching: Tensor, metal: Tensor, surely: Tensor, rules: MetalRules
+) -> Tensor:
+    """Which metals [N] lie in a connected region with enough seeds that are sure."""
     near, inside, sure = nearest.cpu().numpy(), metal.cpu().numpy(), surely.cpu().numpy()
     edges = touching.cpu().numpy() & inside[:, None] & inside[near]
     rows, columns = np.nonzero(edges)
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, near[rows, columns])), shape=(len(inside),) * 2)
-    pieces, piece = connected_components(graph, directed=False)
-    counts = np.bincount(piece, minlength=pieces)
-    certain = np.bincount(piece[sure & inside], minlength=pieces)
-    enough = (certain >= FEWEST_SURE) & (certain >= SURE_SHARE * counts)
-    return torch.from_numpy(enough[piece]).to(metal.device)
+    regions, region = connected_components(graph, directed=False)
+    counts = np.bincount(region, minlength=regions)
+    certain = np.bincount(region[sure & inside], minlength=regions)
+    enough = (certain >= rules.fewest_sure) & (certain >= rules.sure_share * counts)
+    return torch.from_numpy(enough[region]).to(metal.device)

@@ -15,19 +15,14 @@ from polarguide.raster import Rasterize
 from polarguide.shading.metal import FIRST_REFLECTANCE
 from polarguide.shading.model import Parameters
 from polarguide.system import UNBOUNDED, MemoryBound
-from polarguide.training.metals.explanations import DARK, oblique_light, residuals
-from polarguide.training.metals.looks import MOST_VIEWS, evenly, seen_by, seen_of
-from polarguide.training.metals.words import LEAST_SEEN, said_by
+from polarguide.training.metals.explanations import oblique_light, residuals
+from polarguide.training.metals.looks import evenly, seen_by, seen_of
+from polarguide.training.metals.rules import MetalRules
+from polarguide.training.metals.words import said_by
 from polarguide.vectors import dot
 
-LEAST_VIEWS = 4.0
-NEIGHBORS = 64
 CHUNK = 1 << 14
-# Mean squares of relative residuals below this count as this.
-LEAST_RESIDUAL = 2e-4
-# Neighbors whose brightness, or whose colors in proportion to it, differ by this factor's logarithm are of another
-# material, more or less.
-LIKE_BRIGHTNESS, LIKE_TINT = 0.4, 0.25
+"""Gaussians at a time, so that intermediate tensors take little memory."""
 
 
 class Evidence(NamedTuple):
@@ -82,6 +77,7 @@ def evidence(
     views: Sequence[View],
     rasterize: Rasterize,
     refractive_index: float,
+    rules: MetalRules,
     memory: MemoryBound = UNBOUNDED,
 ) -> Evidence:
     """What views say of each Gaussian; see ``training.metals.explanations``.
@@ -90,15 +86,15 @@ def evidence(
     """
     said = said_by(gaussians, views, rasterize, memory)
     explained = None
-    if measured := evenly([view for view in views if view.is_determined], MOST_VIEWS):
-        looks = seen_by(gaussians, memory.between(measured), rasterize)
-        explained = _explained(looks, refractive_index)
+    if measured := evenly([view for view in views if view.is_determined], rules.most_views):
+        looks = seen_by(gaussians, memory.between(measured), rasterize, rules)
+        explained = _explained(looks, refractive_index, rules)
         del looks
     memory.clear()
-    near, alike = _neighborhoods(gaussians)
+    near, alike = _neighborhoods(gaussians, rules.neighbors)
     if explained is None:
         return _nothing_measured(near, alike, said)
-    return _of_neighbors(explained, near, alike, said)
+    return _of_neighbors(explained, near, alike, said, rules)
 
 
 def _chunks(count: int) -> list[slice]:
@@ -106,11 +102,11 @@ def _chunks(count: int) -> list[slice]:
     return [slice(begin, min(begin + CHUNK, count)) for begin in range(0, max(1, count), CHUNK)]
 
 
-def _neighborhoods(gaussians: Parameters) -> tuple[Tensor, Tensor]:
+def _neighborhoods(gaussians: Parameters, most: int) -> tuple[Tensor, Tensor]:
     """The nearest of each Gaussian [N, K], and how alike they are turned."""
     means = gaussians["means"].detach()
     places = means.cpu().double().numpy()
-    count = min(NEIGHBORS, len(places))
+    count = min(most, len(places))
     tree, axes = (
         cKDTree(places),
         shortest_axis_normals(
@@ -133,28 +129,31 @@ def _nothing_measured(near: Tensor, alike: Tensor, said: Tensor) -> Evidence:
     return Evidence(none, none, gray, near, alike, none, none, none, none, none, said)
 
 
-def _explained(looks: Sequence[Tensor], refractive_index: float) -> _Explained:
+def _explained(looks: Sequence[Tensor], refractive_index: float, rules: MetalRules) -> _Explained:
     """Explanations of all Gaussians, of which ``looks`` are ``seen_by``."""
     parts = []
     for chunk in _chunks(len(looks[0])):
-        seen = seen_of(looks, chunk)
+        seen = seen_of(looks, chunk, rules)
         total = seen.weight.sum(dim=0)
         effective = total * total / (seen.weight**2).sum(dim=0).clamp(min=1e-9)
         color = (seen.weight[..., None] * seen.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
-        known = total.clamp(max=20) * (effective > LEAST_VIEWS)
-        fitted = residuals(seen, refractive_index)
-        parts.append(_Explained(*fitted, oblique_light(seen), known, color.clamp(min=0)))
+        known = total.clamp(max=20) * (effective > rules.least_views)
+        fitted = residuals(seen, refractive_index, rules)
+        parts.append(_Explained(*fitted, oblique_light(seen, rules.dark), known, color.clamp(min=0)))
     return _Explained(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-def _of_neighbors(found: _Explained, near: Tensor, alike: Tensor, said: Tensor) -> Evidence:
+def _of_neighbors(
+    found: _Explained, near: Tensor, alike: Tensor, said: Tensor, rules: MetalRules
+) -> Evidence:
     """Evidence of what was measured, over neighborhoods in which those of like color count."""
     known = found.known
     mean = (found.color * known[:, None]).sum(dim=0) / known.sum().clamp(min=1e-6)
     tints = found.color / mean.clamp(min=1e-6)
-    color = found.color + DARK
+    color = found.color + rules.dark
     brightness = color.mean(dim=1)
-    ratio = (found.dielectric.clamp(min=LEAST_RESIDUAL) / found.metal.clamp(min=LEAST_RESIDUAL)).log()
+    floor = rules.least_residual
+    ratio = (found.dielectric.clamp(min=floor) / found.metal.clamp(min=floor)).log()
     each = (
         ratio,
         found.dielectric,
@@ -166,11 +165,11 @@ def _of_neighbors(found: _Explained, near: Tensor, alike: Tensor, said: Tensor) 
     means, support = [], []
     for chunk in _chunks(len(near)):
         nearest = near[chunk]
-        like_color = _like_color(color, chunk, nearest)
+        like_color = _like_color(color, chunk, nearest, rules)
         trust = (known + 1e-6)[nearest] * like_color
         whole = trust.sum(dim=1)
         means.append(torch.stack([(values[nearest] * trust).sum(dim=1) / whole for values in each]))
-        support.append((known > LEAST_SEEN).float()[nearest].mean(dim=1))
+        support.append((known > rules.least_weight).float()[nearest].mean(dim=1))
         alike[chunk] *= like_color
     ratio, dielectric, metal, oblique, *rest = torch.cat(means, dim=1)
     tints = torch.stack(rest[3:], dim=1)
@@ -189,10 +188,10 @@ def _of_neighbors(found: _Explained, near: Tensor, alike: Tensor, said: Tensor) 
     )
 
 
-def _like_color(color: Tensor, which: slice, near: Tensor) -> Tensor:
+def _like_color(color: Tensor, which: slice, near: Tensor, rules: MetalRules) -> Tensor:
     """How much the neighbors [n, K] of some Gaussians look like them, in [0, 1]; of colors [N, 3] over 0."""
     brightness, logarithms = color.mean(dim=1).log(), color.log()
     tint = logarithms - logarithms.mean(dim=1, keepdim=True)
-    brighter = (brightness[near] - brightness[which, None]) / LIKE_BRIGHTNESS
-    tinted = (tint[near] - tint[which, None]) / LIKE_TINT
+    brighter = (brightness[near] - brightness[which, None]) / rules.like_brightness
+    tinted = (tint[near] - tint[which, None]) / rules.like_tint
     return torch.exp(-0.5 * (brighter.square() + tinted.square().mean(dim=2)))

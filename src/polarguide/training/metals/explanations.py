@@ -23,26 +23,21 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.training.metals.looks import Seen
-
-# Reflectances that are tried: a level times a power of the color that is seen.
-LEVELS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95)
-POWERS = (0.5, 0.75, 1.0)
-# Light below which nothing is told: residuals are relative to S0 and this.
-DARK = 0.02
+from polarguide.training.metals.rules import MetalRules
 
 
-def _relative(seen: Seen) -> tuple[Tensor, Tensor]:
+def _relative(seen: Seen, dark: float) -> tuple[Tensor, Tensor]:
     """Weights [V, N, 3] of squares, and what their sums over the views are relative to [N, 3]."""
-    above = seen.s0.clamp(min=0) + DARK  # the variance of light that is counted grows with the light
+    above = seen.s0.clamp(min=0) + dark  # the variance of light that is counted grows with the light
     weight = seen.weight[..., None] / above
     return weight, (weight * above * above).sum(dim=0).clamp(min=1e-9)
 
 
-def residuals(seen: Seen, refractive_index: float) -> tuple[Tensor, Tensor, Tensor]:
+def residuals(seen: Seen, refractive_index: float, rules: MetalRules) -> tuple[Tensor, Tensor, Tensor]:
     """Mean squares of the relative residuals of a dielectric and of a metal [N], and the metal's reflectance [N, 3]."""
     s0, across, cosine = seen.s0, seen.across, seen.cosine[..., None]
     sine2 = 1 - cosine * cosine
-    weight, scale = _relative(seen)
+    weight, scale = _relative(seen, rules.dark)
     specular, diffuse = (slope * sine2 for slope in optics.dolp_slopes(cosine, refractive_index))
     seen_body, of_body = specular * s0 - across, specular + diffuse
     by_line = weight / (1 + specular * specular)
@@ -52,8 +47,8 @@ def residuals(seen: Seen, refractive_index: float) -> tuple[Tensor, Tensor, Tens
     color = (color / color.amax(dim=1, keepdim=True).clamp(min=1e-6)).clamp(min=0.05)
     best = torch.full_like(misfit[:, 0], torch.inf)
     fitted = torch.zeros_like(color)
-    for power in POWERS:
-        for level in LEVELS:
+    for power in rules.powers:
+        for level in rules.levels:
             reflectance = level * color**power
             degree = optics.conductor(cosine, reflectance)[1] * sine2
             off = (weight * (across - degree * s0) ** 2 / (1 + degree * degree)).sum(dim=0) / scale
@@ -64,7 +59,7 @@ def residuals(seen: Seen, refractive_index: float) -> tuple[Tensor, Tensor, Tens
     return misfit.mean(dim=1), best, fitted
 
 
-def oblique_light(seen: Seen) -> Tensor:
+def oblique_light(seen: Seen, dark: float) -> Tensor:
     """Mean squares [N] of the polarization at 45 degrees to the plane of incidence, relative like the residuals."""
-    weight, scale = _relative(seen)
+    weight, scale = _relative(seen, dark)
     return ((weight * seen.oblique**2).sum(dim=0) / scale).mean(dim=1)

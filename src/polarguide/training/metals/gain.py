@@ -13,9 +13,7 @@ from polarguide.shading.gbuffer import render
 from polarguide.shading.model import Light, ShadingModel
 from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.metals.looks import evenly
-
-# Of how many views the gain of the light is taken, and where.
-GAIN_VIEWS, CLEAR_SHARE, LEAST_COVERED, MOST_GAIN = 10, 0.6, 0.003, 4.0
+from polarguide.training.metals.rules import MetalRules
 
 
 @torch.no_grad()
@@ -25,6 +23,7 @@ def light_gain(
     views: Sequence[View],
     rasterize: Rasterize,
     shading: ShadingModel,
+    rules: MetalRules,
     memory: MemoryBound = UNBOUNDED,
 ) -> float:
     """By how much the light should be brighter, as the first metals show it.
@@ -36,22 +35,22 @@ def light_gain(
         so little that strengths would have to exceed 1.
     """
     ratios, pixels = [], 0
-    for view in memory.between(evenly(views, GAIN_VIEWS)):
+    for view in memory.between(evenly(views, rules.gain_views)):
         shown = view.photograph().to(gaussians["means"].device).flatten(0, 1)
         metal = render(gaussians, view.camera, rasterize, shading=shading, light=light).metal
         pixels += len(shown)
         if metal is None:
             continue
-        clear = (metal.share > CLEAR_SHARE) & ~(view.saturated | view.invalid).to(shown.device).flatten()[
-            metal.pixels
-        ]
+        clear = (metal.share > rules.gain_share) & ~(view.saturated | view.invalid).to(
+            shown.device
+        ).flatten()[metal.pixels]
         rendered = metal.specular[clear].mean(dim=1) / metal.share[clear]
         ratios.append(((shown[metal.pixels[clear]].mean(dim=1) + 1e-3) / (rendered + 1e-3)).log())
     found = torch.cat(ratios) if ratios else gaussians["means"].new_zeros(0)
-    if not len(found) or len(found) < LEAST_COVERED * pixels:
+    if not len(found) or len(found) < rules.gain_pixels * pixels:
         return 1.0
     body = gaussians["metalness"] == 0
     least = (
         torch.quantile(shading.strength(gaussians)[body], 0.9) if bool(body.any()) else found.new_tensor(0.1)
     )
-    return float(found.median().exp().clamp(min=float(least), max=MOST_GAIN))
+    return float(found.median().exp().clamp(min=float(least), max=rules.most_gain))

@@ -16,15 +16,9 @@ from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import any_nonzero
 from polarguide.shading.model import Parameters
 from polarguide.shading.splatting import splats
+from polarguide.training.metals.rules import MetalRules
 from polarguide.training.priors import guide_normals
 from polarguide.vectors import dot
-
-MOST_VIEWS = 32
-"""That are asked."""
-# A view counts if the Gaussian shows at least this share of what it shows in its best view.
-LEAST_SHARE = 0.3
-# Cosines of zeniths that count: head-on nothing is polarized, at grazing angles normals and reflectances are unsure.
-COSINES = (0.25, 0.97)
 
 
 class Seen(NamedTuple):
@@ -39,11 +33,13 @@ class Seen(NamedTuple):
     cosine: Tensor
 
 
-def seen_by(gaussians: Parameters, views: Iterable[View], rasterize: Rasterize) -> list[Tensor]:
+def seen_by(
+    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, rules: MetalRules
+) -> list[Tensor]:
     """Sums [N, 11] over the pixels of each view, all of which determine the Stokes vector. ``seen_of`` tells what they
     say of some of the Gaussians.
     """
-    return [_look(gaussians, view, rasterize) for view in views]
+    return [_look(gaussians, view, rasterize, rules.least_normal) for view in views]
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
@@ -62,14 +58,14 @@ def shares(gaussians: Parameters, view: View, target: Tensor, rasterize: Rasteri
     return features.grad
 
 
-def _look(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
+def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
     """Sums [N, 11] over a view's pixels: 1, S0, P, the polarization at 45 degrees to it and the cosine."""
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, sh_degree=0).normal
     assert normal is not None
     view = view.to(device)
     rays = view.camera.rays(device=device)
-    guide, known = guide_normals(view.camera.to_camera(normal), rays)
+    guide, known = guide_normals(view.camera.to_camera(normal), rays, least_normal)
     s0, s1, s2 = view.stokes()
     x_ref, up_ref = optics.lens_frame(rays)
     x, y = dot(guide, x_ref), dot(guide, up_ref)
@@ -82,13 +78,14 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
     return shares(gaussians, view, target.contiguous(), rasterize)
 
 
-def seen_of(looks: Sequence[Tensor], which: slice) -> Seen:
+def seen_of(looks: Sequence[Tensor], which: slice, rules: MetalRules) -> Seen:
     """Means of the sums of some Gaussians, with the weight of views that count."""
     sums = torch.stack([look[which] for look in looks])
     weight = sums[..., 0]
     means = sums[..., 1:] / weight.clamp(min=1e-6)[..., None]
     cosine = means[..., 9].clamp(0, 1)
-    counts = (weight > LEAST_SHARE * weight.amax(dim=0)) & (cosine > COSINES[0]) & (cosine < COSINES[1])
+    counts = weight > rules.least_share * weight.amax(dim=0)
+    counts &= (cosine > rules.cosines[0]) & (cosine < rules.cosines[1])
     return Seen(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
 
 

@@ -14,7 +14,7 @@ from polarguide.raster import Backend
 from polarguide.shading.model import ShadingModel
 from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
-from polarguide.training.metals.decision import REACH, decide
+from polarguide.training.metals.decision import decide
 from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.gain import light_gain
 from polarguide.training.metals.words import contradicted
@@ -44,7 +44,8 @@ class MetalSearch:
         warn: Callable[[str], None],
         memory: MemoryBound,
     ) -> None:
-        self._scene, self._between, self._shading = scene, recipe.metals, shading
+        self._scene, self._shading = scene, shading
+        self._between, self._rules = recipe.metals, recipe.metal_rules
         self._index, self._backend, self._ranks, self._warn = settings.refractive_index, backend, ranks, warn
         self._memory = memory
         self._on = shading.knows_metals and settings.materials == "auto"
@@ -76,8 +77,10 @@ class MetalSearch:
         if not any(view.is_determined or view.materials is not None for view in views):
             return
         gaussians, rasterize = state.gaussians, self._backend.rasterize
-        found = evidence(gaussians, views, rasterize, self._index, self._memory)
-        if not self._told and (wrong := contradicted(gaussians, views, rasterize, found.said, self._memory)):
+        found = evidence(gaussians, views, rasterize, self._index, self._rules, self._memory)
+        if not self._told and (
+            wrong := contradicted(gaussians, views, rasterize, found.said, self._rules, self._memory)
+        ):
             self._told = True
             names = listed([f"materials/{name}.png" for name in wrong])
             self._warn(
@@ -85,13 +88,16 @@ class MetalSearch:
                 "dielectric in one view, metal in another. The larger part counts; look at these files."
             )
         centers = torch.stack([view.camera.center for view in self._scene.train_views])
-        near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, REACH)
+        near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, self._rules.reach)
         was = gaussians["metalness"] > 0
-        metal, reflectance = decide(found, was, near.to(was.device)).float(), found.reflectance
+        metal = decide(found, was, near.to(was.device), self._rules).float()
+        reflectance = found.reflectance
         for values in (metal, reflectance):
             self._ranks.broadcast(values)
         shown = [view for view in views if view.is_determined]
-        gain = partial(light_gain, gaussians, state.light, shown, rasterize, self._shading, self._memory)
+        gain = partial(
+            light_gain, gaussians, state.light, shown, rasterize, self._shading, self._rules, self._memory
+        )
         self._shading.become_metal(gaussians, state.light, metal > 0, reflectance, gain)
         del found
         self._memory.clear()

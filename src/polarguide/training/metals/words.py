@@ -12,11 +12,7 @@ from polarguide.raster import Rasterize
 from polarguide.shading.model import Parameters
 from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.metals.looks import shares
-
-# Weight of pixels, over all views, from which on something is known of a Gaussian.
-LEAST_SEEN = 0.3
-# Share of a view's words from which on it is told that other views contradict them.
-CONTRADICTED = 0.15
+from polarguide.training.metals.rules import MetalRules
 
 
 def with_words(views: Iterable[View]) -> list[View]:
@@ -40,6 +36,7 @@ def contradicted(
     views: Iterable[View],
     rasterize: Rasterize,
     said: Tensor,
+    rules: MetalRules,
     memory: MemoryBound = UNBOUNDED,
 ) -> dict[str, float]:
     """Views whose words the other views contradict, the most contradicted first, with the share of those words of
@@ -52,10 +49,10 @@ def contradicted(
     for view in memory.between(with_words(views)):
         own = _said_in(gaussians, view, rasterize)
         others = (said - own).clamp(min=0)
-        own = own * (others.sum(dim=1, keepdim=True) > LEAST_SEEN)
+        own = own * (others.sum(dim=1, keepdim=True) > rules.least_weight)
         opposed = (own * (others.flip(1) > others)).sum()
         share = float(opposed / own.sum().clamp(min=1e-6))
-        if share > CONTRADICTED:
+        if share > rules.contradicted:
             found[view.name] = share
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
