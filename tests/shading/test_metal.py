@@ -23,7 +23,8 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.runs.point_cloud import shown_colors, write_run_ply
 from polarguide.shading.conversion import convert, mirror_base, scale_light, spread_directions
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.layout import Layout
 from polarguide.shading.metal import FIRST_ROUGHNESS, any_metal, metal_pixels, reflectance, reflectance_logits
 from polarguide.shading.model import mirrored
 from polarguide.shading.result import RenderResult
@@ -45,7 +46,7 @@ def rendered(shading: DeferredShading, values: dict[str, Tensor], **options: boo
     native = values["means"].dtype == torch.float32
     rasterize = rasterize_cpu if native else rasterize_reference
     seen = light(values["means"].dtype)
-    return render(values, camera(), rasterize, shading=shading, light=seen, **options)
+    return render(values, camera(), rasterize, RenderRequest(**options), shading=shading, light=seen)
 
 
 def test_without_a_metal_every_bit_is_as_before() -> None:
@@ -187,8 +188,10 @@ def test_gradients_of_pixels_follow_finite_differences() -> None:
     share = 0.2 + 0.8 * uniform(40, 1)
     features = torch.cat((share * (0.3 + 0.6 * uniform(40, 3)), share, share * uniform(40, 1)), dim=1)
 
+    layout = Layout({"local": 3, "metal": 5})
+
     def loss(features: Tensor, normals: Tensor, light: Tensor, local: Tensor) -> Tensor:
-        metal = metal_pixels(torch.cat((local, features), dim=1), 3, rays, normals, light, 0)
+        metal = metal_pixels(torch.cat((local, features), dim=1), layout, rays, normals, light)
         return metal.specular.sin().sum() + (metal.slope * metal.specular).sum()
 
     finite_differences(loss, [features, normals, 0.5 + uniform(6, 8, 8, 3), uniform(40, 3)])
@@ -205,9 +208,9 @@ def test_single_precision_agrees_with_the_reference() -> None:
 def test_held_layers_send_normals_nothing() -> None:
     values = gaussians()
     values["quaternions"].requires_grad_()
-    result = rendered(SHADING, values, held=True)
-    assert result.held is not None
-    specular, diffuse, metal = result.held
+    result = rendered(SHADING, values, layers_detached=True)
+    assert result.detached_layers is not None
+    specular, diffuse, metal = result.detached_layers
     assert metal is not None
     assert result.specular is not None
     assert torch.equal(specular, result.specular)

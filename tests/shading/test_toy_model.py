@@ -28,7 +28,7 @@ from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.point_cloud import write_run_ply
 from polarguide.scene_frame import scene_frame
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.training.actions import reset_opacity
 from polarguide.training.recipe import Recipe
@@ -70,7 +70,12 @@ def picture(trainer: Trainer, **layers: bool) -> RenderResult:
     rasterize = trainer.backend.rasterize
     with torch.no_grad():
         return render(
-            state.gaussians, view.camera, rasterize, shading=trainer.shading, light=state.light, **layers
+            state.gaussians,
+            view.camera,
+            rasterize,
+            RenderRequest(**layers),
+            shading=trainer.shading,
+            light=state.light,
         )
 
 

@@ -41,10 +41,10 @@ def trainer(scene: Scene, background: str, recipe: str = "3dgs", steps: int = 60
 
 def outside(made: Trainer, scene: Scene) -> float:
     """Mean alpha of the first view's two outermost rows."""
-    from polarguide.shading.gbuffer import render
+    from polarguide.shading.gbuffer import RenderRequest, render
 
     alpha = render(
-        made.state.gaussians, scene.views[0].camera, BACKEND.rasterize, normals=False
+        made.state.gaussians, scene.views[0].camera, BACKEND.rasterize, RenderRequest(normals=False)
     ).alpha.detach()
     return float(torch.cat((alpha[:2], alpha[-2:])).mean())
 

@@ -25,7 +25,7 @@ from polarguide.recipes import recipe_named
 from polarguide.records import read_record
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import Recipe
@@ -121,8 +121,8 @@ def _same(folder: Path, wanted: dict[str, object]) -> bool:
 @torch.no_grad()
 def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
     """The surface of the trained Gaussians in one view, on the CPU, where pictures are compared with it."""
-    result = render(state.gaussians, view.camera, backend.rasterize, sh_degree=0, normals=True, depth=True)
-    result = result.to("cpu")
+    request = RenderRequest(sh_degree=0, depth=True)
+    result = render(state.gaussians, view.camera, backend.rasterize, request).to("cpu")
     if result.normal is None or result.depth is None:
         raise PolarguideError(
             view.name, expected="normals and depth", found="none", remedy="Report this: it is a fault here."

@@ -12,7 +12,7 @@ from polarguide.capture import View
 from polarguide.capture.background import empty_pixels
 from polarguide.color import srgb_encode
 from polarguide.raster import Backend
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.flat import Flat, flat_surfaces
 from polarguide.training.indices import index_picture
@@ -134,7 +134,7 @@ class Feed:
 
     def _new_priors(self, view: View, fields: frozenset[str], frozen: Mapping[str, Tensor]) -> Entry:
         with torch.no_grad():
-            guide = render(frozen, view.camera, self._backend.rasterize, sh_degree=0).normal
+            guide = render(frozen, view.camera, self._backend.rasterize, RenderRequest(sh_degree=0)).normal
         assert guide is not None
         metal = metalness_share(frozen, view.camera, self._backend.rasterize)
 

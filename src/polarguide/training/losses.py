@@ -221,8 +221,8 @@ def step_loss(
         empty: [H, W] 1 where the view shows nothing; None: where that is not known.
         partial: what a view measured that does not determine the Stokes vector, in place of ``shown``.
     """
-    if result.held is not None:
-        specular, diffuse, metal = result.held
+    if result.detached_layers is not None:
+        specular, diffuse, metal = result.detached_layers
         result = replace(result, specular=specular, diffuse=diffuse, metal=metal)
     if partial is None:
         picture = photometric_terms(result.final, shown, valid, ssim_weight)

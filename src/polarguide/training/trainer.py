@@ -19,7 +19,8 @@ from polarguide.gaussians.densify import densify
 from polarguide.gaussians.free_space import free_space
 from polarguide.gaussians.initialize import orbit, scene_extent
 from polarguide.raster import Backend, ScreenStatistic
-from polarguide.shading.gbuffer import COLOR_CHANNELS, render
+from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.layout import COLOR_CHANNELS
 from polarguide.shading.model import PLAIN
 from polarguide.shading.visibility import outward_directions, touched_pixels
 from polarguide.system import UNBOUNDED, MemoryBound
@@ -230,14 +231,16 @@ class Trainer:
             state.gaussians,
             view.camera,
             self.backend.rasterize,
-            sh_degree=self.schedule.sh_degree(state.step),
+            RenderRequest(
+                sh_degree=self.schedule.sh_degree(state.step),
+                normals=stage.weights.normals,
+                depth=stage.weights.depth or turning,
+                normal_rotation_only=turning,
+                layers_detached=stage.reflection and stage.hold_normals and stage.weights.layers,
+                statistic=statistic,
+            ),
             shading=shading,
             light=state.light,
-            normals=stage.weights.normals,
-            depth=stage.weights.depth or turning,
-            still=turning,
-            held=stage.reflection and stage.hold_normals and stage.weights.layers,
-            statistic=statistic,
         )
         if turning:
             assert stage.behind is not None
@@ -312,8 +315,9 @@ class Trainer:
             degree = self.schedule.sh_degree(state.step)
             rasterize, shading = self.backend.rasterize, self.shading
             self._memory.clear()
+            request = RenderRequest(sh_degree=degree)
             result = render(
-                state.gaussians, view.camera, rasterize, sh_degree=degree, shading=shading, light=state.light
+                state.gaussians, view.camera, rasterize, request, shading=shading, light=state.light
             )
             return shading.predicted_stokes(result, view.camera)
 

@@ -17,7 +17,7 @@ from polarguide.raster.interface import Rasterize
 from polarguide.rendering.relight import RELIT_RESOLUTION, turned_cubemap
 from polarguide.runs.families import AnyTrainer
 from polarguide.runs.opened import OpenedRun
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.trainer import Trainer
@@ -88,11 +88,9 @@ class Shown:
             gaussians,
             camera,
             self.rasterize,
-            sh_degree=self.sh_degree,
+            RenderRequest(self.sh_degree, depth=depth, at_median_depth=surface),
             shading=self.shading,
             light=self.light if turn is None else self._turned(turn),
-            depth=depth,
-            surface=surface,
         ).to("cpu")
 
     def _turned(self, turn: Tensor) -> Light:
