@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from polarguide import __version__
+from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import FOUR
 from polarguide.errors import PolarguideError
@@ -31,7 +32,6 @@ from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer
 from polarguide.vectors import dot, unit
 
 RECIPE = "3dgs-dr:consistent"
@@ -93,7 +93,7 @@ def short_run(
     until = until or steps
     state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
     asked = TrainSettings(steps, 0, refractive_index, begin_again=False)
-    trainer = Trainer(scene, recipe, resolve(asked, scene, recipe), backend, state)
+    trainer = AngleTrainer(scene, recipe, resolve(asked, scene, recipe), backend, state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)

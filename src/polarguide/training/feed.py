@@ -1,9 +1,8 @@
-"""What a step reads of the views: photographs as shown, and priors, on the backend's device and kept between steps."""
+"""The targets of training views: made when a step first needs them, kept between steps on the backend's device."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,37 +15,25 @@ from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.flat import Flat, flat_surfaces
 from polarguide.training.indices import index_picture
+from polarguide.training.losses import Weights
 from polarguide.training.metals.looks import metalness_share
 from polarguide.training.packing import (
     Entry,
     Packed,
-    fields_read,
     holds,
     pack_priors,
     packed,
     unpack_priors,
     unpacked,
 )
-from polarguide.training.partial import PartialView
-from polarguide.training.priors import Unguided, ViewPriors, unguided, view_priors
-from polarguide.training.recipe import Priors, Stage
+from polarguide.training.priors import Unguided, unguided, view_priors
+from polarguide.training.recipe import Priors
+from polarguide.training.targets import PartialView, StepTargets, ViewPriors
 from polarguide.training.view_store import ViewStore
 
 
-class Shown(NamedTuple):
-    """A training view's photograph [H, W, 3] as shown, 1 where it counts [H, W] (None: everywhere), and 1 where it
-    shows nothing [H, W] (None: where that is not known). And what was measured where that does not determine the
-    Stokes vector.
-    """
-
-    picture: Tensor
-    valid: Tensor | None
-    empty: Tensor | None
-    partial: PartialView | None
-
-
 class Feed:
-    """Photographs and priors of the views that a training asks for.
+    """Makes and keeps the targets of training views.
 
     Args:
         backend: device and rasterizer. priors: the recipe's. index: of refraction.
@@ -70,55 +57,60 @@ class Feed:
     ) -> None:
         self._backend, self._settings, self._index, self._black = backend, priors, index, black
         self._store, self._views, self._memory = store, views, memory
-        self._shown, self._unguided, self._priors = (label + kind for kind in ("shown", "unguided", "priors"))
+        kinds = (label + kind for kind in ("photograph", "unguided", "priors"))
+        self._photographs, self._unguided, self._priors = kinds
         self._flat: dict[str, Flat] | None = None
         self._partial: dict[str, PartialView] = {}
 
     def forget(self, names: Collection[str]) -> None:
-        """What is believed of these views has changed."""
+        """Make the targets of these views anew: their exposures have changed."""
         for name in names:
             self._partial.pop(name, None)
-            for kind in (self._shown, self._unguided, self._priors):
+            for kind in (self._photographs, self._unguided, self._priors):
                 self._store.drop(kind, name)
 
     def clear(self) -> None:
         """Forget everything; it is made again where it is asked for."""
         self._partial.clear()
-        for kind in (self._shown, self._unguided, self._priors):
+        for kind in (self._photographs, self._unguided, self._priors):
             self._store.drop(kind)
 
     def refresh_priors(self) -> None:
-        """There is another guide."""
+        """Make the priors of all views anew: there is another guide."""
         self._store.drop(self._priors)
 
-    def shown(self, view: View) -> Shown:
-        """The photograph of a view."""
+    def targets(self, view: View, weights: Weights, guide: Mapping[str, Tensor] | None) -> StepTargets:
+        """What a step compares the rendering of a view with.
 
-        def make() -> Entry:
-            device = self._backend.device
-            entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
-            if bool(view.invalid.any()):
-                entry["valid"] = Packed((~view.invalid).to(device))
-            if self._black:
-                entry["empty"] = Packed(empty_pixels(view).to(device))
-            return entry
-
-        kept = self._store.get(self._shown, view.name, make)
+        Args:
+            weights: of the stage, which say what its terms read.
+            guide: Gaussians whose normals resolve what polarization leaves open; needed where a term reads priors.
+        """
+        priors = None
+        if weights.priors and view.is_determined:
+            assert guide is not None
+            priors = self._priors_of(view, weights.fields_read, guide)
+        kept = self._store.get(self._photographs, view.name, lambda: self._photograph(view))
         valid, empty = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
         if view.is_determined:
-            return Shown(unpacked(kept["picture"]), valid, empty, None)
+            return StepTargets(view.camera, unpacked(kept["picture"]), valid, empty, priors=priors)
         if view.name not in self._partial:
             self._partial[view.name] = PartialView.of(view, self._backend.device)
         partial = self._partial[view.name]
-        return Shown(partial.shown, valid, empty, partial)
+        return StepTargets(view.camera, partial.shown, valid, empty, partial)
 
-    def priors(self, view: View, stage: Stage, guide: Mapping[str, Tensor]) -> ViewPriors:
-        """The priors of a view that determines its Stokes vectors.
+    def _photograph(self, view: View) -> Entry:
+        """The photograph as displayed, where it counts, and where it shows nothing."""
+        device = self._backend.device
+        entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
+        if bool(view.invalid.any()):
+            entry["valid"] = Packed((~view.invalid).to(device))
+        if self._black:
+            entry["empty"] = Packed(empty_pixels(view).to(device))
+        return entry
 
-        Args:
-            guide: Gaussians whose normals resolve what polarization leaves open.
-        """
-        fields = fields_read(stage.weights)
+    def _priors_of(self, view: View, fields: frozenset[str], guide: Mapping[str, Tensor]) -> ViewPriors:
+        """The fields of the priors of a view that determines its Stokes vectors."""
 
         def make() -> Entry:
             self._memory.clear()

@@ -7,20 +7,18 @@ polarization normals and the separation, and what comes out supervises the Gauss
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.capture.exposures import FOUR
 from polarguide.color import srgb_encode
 from polarguide.training.flat import Flat
 from polarguide.training.recipe import Candidates, Priors
+from polarguide.training.targets import ViewPriors, stokes_weight, surface_weight
 from polarguide.vectors import dot, unit
 
 # Rendered normals shorter than this are too mixed to be trusted.
@@ -35,70 +33,6 @@ GRAY = (0.2, 0.3)
 ASTRAY = math.cos(math.radians(10))
 # Shares of metals between which a pixel goes over from a dielectric to a metal.
 METAL = (0.25, 0.75)
-
-
-@dataclass(frozen=True, eq=False)
-class ViewPriors:
-    """Targets of one view.
-
-    Attributes:
-        specular, diffuse: [H, W, 3] shown (sRGB) separated pictures, on the scale of S0/2.
-        separated: [H, W] weight of both: 1 where the separation is well conditioned.
-        normal: [H, W, 3] disambiguated polarization normal, world axes.
-        candidates: [H, W, K, 3] what each step chooses from in place of ``normal``, world axes; None: nothing.
-        plane: [H, W, 3] world normal of the plane of incidence that the AoLP gives.
-        weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
-        chromatic: [H, W, 3] normal from the polarization of color differences, world axes, or of a flat surface.
-        chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
-        camera: of the view.
-        stokes: [3, H, W, 3] as measured.
-        reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or clips.
-        settings: what they were computed with.
-    """
-
-    specular: Tensor
-    diffuse: Tensor
-    separated: Tensor
-    normal: Tensor
-    plane: Tensor
-    weight: Tensor
-    chromatic: Tensor
-    chromatic_weight: Tensor
-    camera: Camera
-    stokes: Tensor
-    reliable: Tensor
-    settings: Priors
-    candidates: Tensor | None = None
-
-    @cached_property
-    def stokes_weight(self) -> Tensor:
-        """[H, W] weight of S1 and S2: one over the root of S0, since their variance grows with S0 where light itself is
-        the noise.
-        """
-        return self.reliable * (self.stokes[0].mean(dim=-1) + 0.01).rsqrt()
-
-    @cached_property
-    def total(self) -> Tensor:
-        """What sums with ``weight`` are divided by: its sum, or the least share of the pixels."""
-        return _total(self.weight, self.settings.azimuth_share)
-
-    @cached_property
-    def chromatic_total(self) -> Tensor:
-        """What sums with ``chromatic_weight`` are divided by: its sum, or the least share of the pixels."""
-        return _total(self.chromatic_weight, self.settings.chromatic_share)
-
-    @cached_property
-    def separated_share(self) -> Tensor:
-        """The mean of ``separated``."""
-        return self.separated.mean()
-
-    @cached_property
-    def surface(self) -> Tensor:
-        """[H, W] weight of the agreement of normals and depth, in [0, 1]."""
-        if not self.settings.bright:
-            return self.weight
-        shown = optics.luminance(self.stokes)[0] / 2
-        return torch.maximum(self.weight, (shown / self.settings.bright).clamp(0, 1))
 
 
 class Unguided(NamedTuple):
@@ -250,9 +184,11 @@ def view_priors(
         chromatic_weight=chromatic_weight,
         camera=view.camera,
         stokes=stokes,
-        reliable=reliable,
-        settings=settings,
+        stokes_weight=stokes_weight(stokes, reliable),
+        surface=surface_weight(stokes, weight, settings.bright),
         candidates=view.camera.to_world(_normals(candidates)) if settings.live else None,
+        azimuth_share=settings.azimuth_share,
+        chromatic_share=settings.chromatic_share,
     )
 
 
@@ -271,10 +207,6 @@ def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
     """1 up to ``full`` degrees between unit normals [H, W, 3], 0 from ``none`` on; [H, W]."""
     off = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
     return ((none - off) / (none - full)).clamp(0, 1)
-
-
-def _total(weight: Tensor, share: float) -> Tensor:
-    return weight.sum().clamp(min=max(1.0, share * weight.numel()))
 
 
 def _noise(view: View) -> Tensor | float:

@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from polarguide.angles.trainer import AngleTrainer
 from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.neural.model import FieldModel
@@ -20,7 +21,6 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
-from polarguide.training.trainer import Trainer
 
 FIELD_SHARE = 4
 """A field is shown with so many times fewer pixels each way: it takes seconds for a picture of full size."""
@@ -148,7 +148,7 @@ def shown_training(trainer: AnyTrainer) -> Scenery:
         model = FieldModel(trainer.state, trainer.recipe, trainer.state.field.distances.device, trained=False)
         status = f"{trainer.recipe.name}, step {trainer.state.step:,} of {steps:,}"
         return ShownField(model, f"{status}; shown at a quarter of the size")
-    assert isinstance(trainer, Trainer)
+    assert isinstance(trainer, AngleTrainer)
     state = trainer.state
     stage = trainer.schedule.at(min(state.step, steps - 1)).stage
     progress = f"step {state.step:,} of {steps:,} ({stage.name})"
