@@ -19,8 +19,7 @@ from polarguide.training.metals.decision import decide
 from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.words import contradicted, said_by
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
-from polarguide.training.unused import warn_of_unused_materials
+from polarguide.training.trainer import Trainer, warn_of_unused_materials
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
 
 RECIPE = RECIPES["polarguide-stokes"]

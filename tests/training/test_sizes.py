@@ -15,10 +15,9 @@ from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.forecast import _priors_made
-from polarguide.training.feed import Feed
+from polarguide.training.feed import Feed, coarse_steps
 from polarguide.training.recipe import Coarse
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
-from polarguide.training.sizes import coarse_steps
 from polarguide.training.targets import StepTargets
 from polarguide.training.trainer import Trainer
 from polarguide.training.view_store import ViewStore

@@ -33,7 +33,7 @@ from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings, StepReport
-from polarguide.training.unused import warn_of_unused_materials
+from polarguide.training.trainer import warn_of_unused_materials
 from polarguide.training.view_store import ViewStore
 
 

@@ -13,10 +13,10 @@ from polarguide.capture import Scene
 from polarguide.raster import Backend
 from polarguide.runs.memory import in_gigabytes
 from polarguide.system import MEBIBYTE, peak_memory_mib
+from polarguide.training.feed import coarse_steps
 from polarguide.training.recipe import Recipe
 from polarguide.training.schedule import Schedule
 from polarguide.training.settings import ResolvedSettings
-from polarguide.training.sizes import coarse_steps
 from polarguide.training.trainer import Trainer
 
 LEAST_STEPS = 500

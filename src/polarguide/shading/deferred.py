@@ -40,6 +40,7 @@ from polarguide.shading.mips import mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
     ChannelParameters,
+    Channels,
     GBuffer,
     Light,
     PageShading,
@@ -202,9 +203,7 @@ class DeferredShading(ShadingModel):
         s, p = reflectances_from_cosine(cosine, self.refractive_index if index is None else index)
         return strength * (0.5 * (s + p)) * light, base
 
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int
-    ) -> dict[str, Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
         """``color`` [N, 3] (the base color), ``strength`` [N, 1], with ``local`` the Gaussians' own light ``local``
         [N, 3]; where some are metals ``metal`` [N, 5], and where some have refractive indices of their own ``index``
         [N, 1], these less the run's.
@@ -295,7 +294,7 @@ class DeferredShading(ShadingModel):
         local = splatted["local"] if self.local else None
         index = self._index_picture(splatted)
         layers = reflect_reference(
-            splatted.color, splatted.normal, strength, texels, camera, self, local, index
+            splatted["color"], splatted["normal"], strength, texels, camera, self, local, index
         )
         return self._with_metals({**layers, "strength": strength, "index": index}, splatted, texels, camera)
 
@@ -326,7 +325,7 @@ class DeferredShading(ShadingModel):
                 features.flatten(0, 1),
                 splatted.layout,
                 rays.flatten(0, 1),
-                splatted.normal.flatten(0, 1),
+                splatted["normal"].flatten(0, 1),
                 self.radiance(texels),
             )
         found = layers if metal is None else with_metal(layers, metal)

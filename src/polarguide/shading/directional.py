@@ -31,6 +31,7 @@ from polarguide.gaussians.harmonics import SH_C0
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
+    Channels,
     GBuffer,
     Light,
     PageShading,
@@ -158,9 +159,7 @@ class DirectionalShading(ShadingModel):
         out = torch.addmm(light["mlp_bias_2"], hidden, light["mlp_weight_2"])
         return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int
-    ) -> dict[str, Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
         """Albedo, or harmonics without a surface, as ``color`` [N, 3]; ``roughness`` [N, 1], ``feature`` [N, 4] and
         ``surface`` [N, 1].
 
@@ -179,7 +178,7 @@ class DirectionalShading(ShadingModel):
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the color that was splatted is the diffuse one."""
-        albedo, normal, alpha = splatted.color, splatted.normal, splatted.alpha
+        albedo, normal, alpha = splatted["color"], splatted["normal"], splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
         directions = mirrored(rays, unit(normal, 1e-3))
         radiance = self.radiance(

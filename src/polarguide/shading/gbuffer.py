@@ -86,7 +86,7 @@ def render(
             normal, blended = picture.alpha[..., None] * found.directions, normal
     return RenderResult(
         final=layers["final"],
-        base=splatted.color,
+        base=splatted["color"],
         **{name: layers.get(name) for name in ("specular", "diffuse", "reflection", "strength", "metalness")},
         normal=normal,
         depth=camera_depth,

@@ -29,6 +29,8 @@ from polarguide.vectors import dot
 MAXIMUM_LOG_LIGHT = 5.0
 PLAIN_LAYERS = ("final", "normal", "depth", "alpha")
 
+Channels = dict[str, Tensor]
+"""Channels [N, C] of Gaussians by name, of a shading model."""
 Light = Mapping[str, Tensor]
 """The learned light of a shading model: its parameters by name."""
 
@@ -86,7 +88,7 @@ class GBuffer:
     """What was splatted for a picture that is shaded afterwards; ``splatted["strength"]`` are channels by name.
 
     Attributes:
-        features: [H, W, D] all channels, blended.
+        features: [H, W, D] all channels, blended: ``color``, ``normal`` (world axes, not normalized), and others.
         alpha: [H, W].
         layout: which channels are what.
         metal: what metals add to the picture, where that is known before; None: not yet.
@@ -99,16 +101,6 @@ class GBuffer:
 
     def __getitem__(self, name: str) -> Tensor:
         return self.features[..., self.layout.channels(name)]
-
-    @property
-    def color(self) -> Tensor:
-        """[H, W, 3]."""
-        return self["color"]
-
-    @property
-    def normal(self) -> Tensor:
-        """[H, W, 3] blended, world axes, not normalized."""
-        return self["normal"]
 
 
 class RadianceCubemap(NamedTuple):
@@ -269,9 +261,7 @@ class ShadingModel(ABC):
         return "specular" in self.layers
 
     @abstractmethod
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int
-    ) -> dict[str, Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
         """Per Gaussian by name: ``color`` [N, 3], and what else is blended, each [N, C]; not ``normal`` or ``depth``.
 
         Args:
@@ -370,9 +360,7 @@ class PlainShading(ShadingModel):
         """Without reflection there is one color."""
         return PLAIN_LAYERS
 
-    def channels(
-        self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int
-    ) -> dict[str, Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
         """Base color [N, 3]."""
         return {"color": base_colors(gaussians, center, degree)}
 
@@ -382,7 +370,7 @@ class PlainShading(ShadingModel):
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final`` [H, W, 3]."""
-        return {"final": splatted.color}
+        return {"final": splatted["color"]}
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Base colors [N, 3]; see ``ShadingModel``."""

@@ -26,13 +26,13 @@ from polarguide.training.actions import OPACITY_REST, propagate_normals, reset_o
 from polarguide.training.behind import turned_behind
 from polarguide.training.density import DensityControl
 from polarguide.training.distributed import ALONE, Ranks
-from polarguide.training.indices import index_offsets
+from polarguide.training.feed import Feed
+from polarguide.training.indices import index_offsets, numbers_in
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.search import MetalSearch
 from polarguide.training.recipe import Action, Recipe, Stage
 from polarguide.training.schedule import Schedule
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
-from polarguide.training.sizes import Sizes
 from polarguide.training.state import TrainingState, first_state, seeded
 from polarguide.training.targets import Step, StepTargets
 from polarguide.training.view_store import ViewStore
@@ -86,7 +86,7 @@ class Trainer:
         self.state = state or first_state(
             scene, recipe, settings, backend.device, surroundings=not self.black
         )
-        self._sizes = Sizes(
+        self._feed = Feed(
             backend,
             recipe,
             index,
@@ -106,7 +106,7 @@ class Trainer:
     def set_exposures(self, exposures: Mapping[str, tuple[Exposure, ...]]) -> None:
         """Take views, by name, for captured with these exposures from now on; their targets are made anew."""
         self._exposures.update(exposures)
-        self._sizes.forget(exposures)
+        self._feed.forget(exposures)
 
     def run(self, on_step: Callable[[StepReport], None], *, until: int | None = None) -> None:
         """Train until the last step (or ``until``), reporting each step."""
@@ -119,7 +119,7 @@ class Trainer:
         position = self.schedule.at(state.step)
         stage, self.whole = position.stage, not position.actions
         if "refresh_priors" in position.actions:
-            self._sizes.refresh_priors()  # first: they leave room for looks at all views
+            self._feed.refresh_priors()  # first: they leave room for looks at all views
         for action in position.actions:
             self._act(action)
         mine = self.ranks.slots(views)
@@ -149,7 +149,8 @@ class Trainer:
         """Render the view of a slot and add its gradients; [3] as of ``StepReport.measured``."""
         state, shading = self.state, self.shading if stage.reflection else PLAIN
         targets = self._targets(slot, stage)  # before there is a picture, which takes memory, too
-        camera, statistic = targets.camera, ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
+        camera = targets.camera
+        statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
         request = requested(stage, self.schedule.sh_degree(state.step), statistic)
         rasterize, light = self.backend.rasterize, state.light
         result = render(state.gaussians, camera, rasterize, request, shading=shading, light=light)
@@ -173,14 +174,14 @@ class Trainer:
         view = self._view_of(state.step * self.settings.views_per_step + slot)
         if stage.weights.priors and view.is_determined and state.frozen is None:
             self._act("refresh_priors")
-        return self._sizes.feed(state.step).targets(view, stage.weights, state.frozen)
+        return self._feed.targets(state.step, view, stage.weights, state.frozen)
 
     def _view_of(self, place: int) -> View:
         """The view at a place in the sequence of all views ever trained on.
 
         Every epoch visits every training view once, in an order of its own.
         """
-        views = self._sizes.views(self.state.step)
+        views = self._feed.views(self.state.step)
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
         view = views[int(order[place])]
@@ -267,3 +268,22 @@ def requested(stage: Stage, sh_degree: int, statistic: ScreenStatistic | None) -
         normal_rotation_only=fades,
         statistic=statistic,
     )
+
+
+def warn_of_unused_materials(
+    scene: Scene, recipe: Recipe, settings: ResolvedSettings, backend: Backend, warn: Callable[[str], None]
+) -> None:
+    """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training."""
+    steps, shading = settings.steps, recipe.shading.bind(settings.refractive_index)
+    schedule = Schedule(recipe, steps)
+    refreshes = [step / steps for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
+    MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never(refreshes)
+    if not scene.indices:
+        return
+    if not (shading.knows_indices and refreshes):
+        why = f"the recipe {recipe.name} takes the run's for everything"
+    elif not any(numbers_in(view) & scene.indices.keys() for view in scene.train_views):
+        why = "no picture in materials/ of a training view has one of their numbers"
+    else:
+        return
+    warn(f"the refractive indices that scene.json lists under materials are not used: {why}.")
