@@ -55,9 +55,11 @@ def test_the_mode_is_found_from_the_pictures_unless_it_is_given(
     tiny_scene: Scene, black_scene: Scene
 ) -> None:
     for scene, found in ((tiny_scene, False), (black_scene, True)):
+        held = set(vars(scene))
         assert is_black(scene, TrainSettings()) == found
         assert not is_black(scene, TrainSettings(background="scene"))
         assert is_black(scene, TrainSettings(background="black"))
+        assert set(vars(scene)) == held, "a scene is frozen"
 
 
 @pytest.mark.parametrize("name", ["3dgs", "3dgs-dr", "ref-gs", "polarguide-stokes"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -238,6 +238,17 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
     assert float(photometric) == pytest.approx(float(expected_photometric), rel=1e-6)
     squares = (srgb_encode(rendered.final.clamp(0, 1)) - shown).square().mean(dim=-1)
     assert float(error) == pytest.approx(float((valid * squares).sum() / valid.sum()), rel=1e-5)
+
+
+def test_every_term_reads_targets_and_layers_that_there_are() -> None:
+    known = {field.name for field in fields(ViewPriors)}
+    for weight in fields(Weights):
+        alone = Weights(**{"photometric": 0.0, weight.name: 1.0})
+        assert alone.fields_read <= known, weight.name
+        assert {*weight.metadata["rendered"]} <= {"normal", "depth", "layers"}, weight.name
+        assert alone.normals == ("normal" in weight.metadata["rendered"]), weight.name
+        # Priors are made for whoever needs them, and the agreement with the depth does without.
+        assert alone.priors == (weight.name not in ("photometric", "flatness", "consistency")), weight.name
 
 
 def test_few_polarized_pixels_pull_no_harder_than_many(priors: ViewPriors) -> None:
