@@ -122,8 +122,7 @@ def view_priors(
         metal: [H, W] share of metals, where what holds for dielectrics alone does not count; None: no metal.
         flat: a flat surface, whose normal replaces the guide and the color differences where the guide is far from it.
     """
-    view = view.to(normal.device)
-    rays = view.camera.rays(device=normal.device)
+    view, rays = view.to(normal.device), view.camera.rays(device=normal.device)
     if known is None:
         assert not isinstance(refractive_index, Tensor)
         known = unguided(view, settings, refractive_index)
