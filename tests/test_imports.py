@@ -44,6 +44,7 @@ ROOMS = (
     "shots",
     "measurement",
     "training",
+    "angles",
     "neural",
     "recipes",
     "runs",

@@ -25,16 +25,16 @@ from typing import Any
 import numpy as np
 
 import polarguide
+from polarguide.angles.polarizers import Judgment
+from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.view import View
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.runs.defaults import resolve
-from polarguide.training.polarizers import Judgment
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
 
 RIGHT, ACROSS = 15.0, 45.0
 """Degrees of error up to which an angle is called right, and from which on it is nearer to the one across."""
@@ -56,7 +56,7 @@ def searched(scene: Scene, steps: int) -> list[Judgment]:
     recipe = recipe_named("polarguide-stokes")
     assert isinstance(recipe, Recipe)
     settings = resolve(TrainSettings(steps=steps), scene, recipe)
-    trainer = Trainer(scene, recipe, settings, choose_backend("cpu"))
+    trainer = AngleTrainer(scene, recipe, settings, choose_backend("cpu"))
     while not trainer.polarizers.settled:
         trainer.step()
     return trainer.polarizers.judgments()

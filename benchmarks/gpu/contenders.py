@@ -15,7 +15,7 @@ from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
@@ -65,9 +65,9 @@ class Ours:
             state.gaussians,
             trainer._view_of(state.step + self._next()).camera,
             trainer.backend.rasterize,
+            RenderRequest(depth=True),
             shading=trainer.shading,
             light=state.light,
-            depth=True,
         )
 
     def look(self) -> None:
@@ -87,10 +87,9 @@ class Ours:
             state.gaussians,
             view.camera,
             trainer.backend.rasterize,
+            RenderRequest(normals=layers, depth=layers),
             shading=trainer.shading,
             light=state.light,
-            normals=layers,
-            depth=layers,
         )
 
     def parts(self) -> dict[str, Any]:

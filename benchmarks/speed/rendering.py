@@ -23,7 +23,7 @@ from polarguide import _native
 from polarguide.api import Run, open_run
 from polarguide.camera import Camera
 from polarguide.raster import use_threads
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.system import keep_freed_memory
 
 ROUNDS = 7
@@ -50,7 +50,7 @@ def measure(opened: Run, rounds: int, size: tuple[int, int] | None, threads: int
     rows, rasterize = opened.model.state.gaussians, opened.model.backend.rasterize
 
     def plain(camera: Camera) -> object:
-        return render(rows, camera, rasterize, normals=False)
+        return render(rows, camera, rasterize, RenderRequest(normals=False))
 
     def layers(camera: Camera) -> object:
         return opened.result(camera, depth=False, surface=False).to("cpu")

@@ -73,8 +73,7 @@ class Clock:
                 of = getattr(_native, holder) if holder else _native
                 setattr(of, attribute, self.timed(part, getattr(of, attribute)))
         Trained.step = self.timed("Adam", Trained.step)  # type: ignore[method-assign]
-        for name in ("priors", "shown"):
-            setattr(Feed, name, self.timed("targets", getattr(Feed, name)))
+        Feed.targets = self.timed("targets", Feed.targets)  # type: ignore[method-assign]
 
     def take(self) -> dict[str, float]:
         """What has been added up; then it starts again."""

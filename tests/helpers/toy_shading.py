@@ -11,6 +11,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.recipes import RECIPES
 from polarguide.shading.model import (
+    Channels,
     GBuffer,
     Light,
     Parameter,
@@ -58,15 +59,16 @@ class SkyShading(ShadingModel):
         above = 0.5 - 0.5 * directions[..., 1:2]
         return torch.exp(torch.lerp(light["sky"][0], light["sky"][1], above))
 
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
         gloss = torch.sigmoid(gaussians["gloss_logits"])[:, None]
-        return [base_colors(gaussians, center, degree), gloss, gloss * gaussians["tint"]]
+        color = base_colors(gaussians, center, degree)
+        return {"color": color, "gloss": gloss, "mirror": gloss * gaussians["tint"]}
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
-        base, normal = splatted.color, splatted.normal
+        base, normal = splatted["color"], splatted["normal"]
         rays = camera.world_rays(dtype=base.dtype, device=base.device)
-        specular = splatted.further[..., 1:4] * self.sky(light, mirrored(rays, unit(normal, 1e-3)))
-        strength = splatted.further[..., 0]
+        specular = splatted["mirror"] * self.sky(light, mirrored(rays, unit(normal, 1e-3)))
+        strength = splatted["gloss"][..., 0]
         return {"final": base + specular, "specular": specular, "diffuse": base, "strength": strength}
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:

@@ -9,10 +9,15 @@ from torch.testing import assert_close
 
 from polarguide import _native
 from polarguide.shading.gbuffer import split, split_reference
+from polarguide.shading.layout import Layout
 from polarguide.shading.native import split_native
 
 HEIGHT, WIDTH, CHANNELS = 40, 61, 11
 SIZE = (HEIGHT, WIDTH)
+
+
+def layout(*, depth: bool) -> Layout:
+    return Layout({"color": 3, "normal": 3, "own": CHANNELS - 6 - depth, **({"depth": 1} if depth else {})})
 
 
 def buffers(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -25,7 +30,7 @@ def buffers(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
 
 def with_gradients(function, dtype: torch.dtype, read: str, depth: bool) -> list[Tensor]:
     features, alpha = buffers(dtype)
-    given = dict(zip("fnd", function(features, alpha, normals=True, depth=depth), strict=True))
+    given = dict(zip("fnd", function(features, alpha, layout(depth=depth)), strict=True))
     seed = torch.Generator().manual_seed(1)
     total = sum((torch.randn(given[k].shape, generator=seed) * given[k]).sum() for k in read)
     total.backward()
@@ -55,10 +60,10 @@ def test_threads_do_not_change_the_result() -> None:
 
 def test_without_further_channels_the_slices_do() -> None:
     features, alpha = torch.rand(*SIZE, 6), torch.rand(SIZE)
-    _, normal, depth = split(features, alpha, normals=True, depth=False)
+    _, normal, depth = split(features, alpha, Layout({"color": 3, "normal": 3}))
     assert normal is not None
     assert torch.equal(normal, features[..., 3:6])
     assert depth is None
-    assert split(features, alpha, normals=False, depth=False)[1] is None
+    assert split(features, alpha, Layout({"color": 3, "own": 3}))[1] is None
     with pytest.raises(ValueError, match="features: expected color, normal and a further channel"):
         split_native(features, alpha, depth=True)

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.layout import Layout
 from polarguide.shading.metal import BLUR, MINIMUM_SHARE, where_metal
 from polarguide.shading.model import GBuffer
 from polarguide.shading.native import MetalArguments, reflect_native
@@ -51,12 +52,19 @@ def buffers(shading: DeferredShading) -> tuple[Tensor, Tensor]:
     return torch.cat([*parts, uniform(HEIGHT, WIDTH, 1)], dim=-1), texels
 
 
+def layout(shading: DeferredShading, *, metal: bool = True) -> Layout:
+    own = {"local": 3} if shading.local else {}
+    return Layout(
+        {"color": 3, "normal": 3, "strength": 1, **own, **({"metal": 5, "depth": 1} if metal else {})}
+    )
+
+
 def results(shading: DeferredShading, dtype: torch.dtype, *, held: bool) -> list[Tensor]:
     """Layers and what metals reflect, then the gradients of a random sum of them by features and texels."""
     features, texels = (t.to(dtype).requires_grad_() for t in buffers(shading))
-    splatted = GBuffer(features, features.new_ones(HEIGHT, WIDTH))
+    splatted = GBuffer(features, features.new_ones(HEIGHT, WIDTH), layout(shading))
     if held:
-        layers, again = shading.shade_held(splatted, {"texels": texels}, camera())
+        layers, again = shading.shade_detached(splatted, {"texels": texels}, camera())
         assert again is not None
     else:
         layers, again = shading.shade(splatted, {"texels": texels}, camera()), None
@@ -95,8 +103,10 @@ def test_where_no_pixel_shows_metal_the_layers_are_those_of_dielectrics() -> Non
     features, texels = buffers(shading)
     features[..., 10:15] = 0
     alpha, light = torch.ones(HEIGHT, WIDTH), {"texels": texels}
-    with_channels = shading.shade(GBuffer(features, alpha), light, camera())
-    without = shading.shade(GBuffer(features[..., :10].contiguous(), alpha), light, camera())
+    with_channels = shading.shade(GBuffer(features, alpha, layout(shading)), light, camera())
+    without = shading.shade(
+        GBuffer(features[..., :10].contiguous(), alpha, layout(shading, metal=False)), light, camera()
+    )
     assert torch.equal(with_channels["final"], without["final"])
     assert len(with_channels["metal"].pixels) == 0
     assert without["metal"] is None
@@ -110,9 +120,9 @@ def test_a_view_without_metal_has_the_gradients_of_one_of_dielectrics() -> None:
         features[..., 10:15] = 0
         features = features[..., :channels].contiguous().requires_grad_()
         texels.requires_grad_()
-        shading.shade(GBuffer(features, alpha), {"texels": texels}, camera())[
-            "final"
-        ].square().sum().backward()
+        shading.shade(
+            GBuffer(features, alpha, layout(shading, metal=channels > 10)), {"texels": texels}, camera()
+        )["final"].square().sum().backward()
         assert features.grad is not None
         found.append((features.grad[..., :10], texels.grad))
     for ours, theirs in zip(*found, strict=True):
@@ -123,12 +133,16 @@ def test_light_that_is_not_trained_gets_no_gradient() -> None:
     shading = MODELS[0]
     features, texels = buffers(shading)
     features.requires_grad_()
-    layers = shading.shade(GBuffer(features, torch.ones(HEIGHT, WIDTH)), {"texels": texels}, camera())
+    layers = shading.shade(
+        GBuffer(features, torch.ones(HEIGHT, WIDTH), layout(shading)), {"texels": texels}, camera()
+    )
     layers["final"].sum().backward()
     trained, (_, light) = features.grad, buffers(shading)
     features.grad = None
     layers = shading.shade(
-        GBuffer(features, torch.ones(HEIGHT, WIDTH)), {"texels": light.requires_grad_()}, camera()
+        GBuffer(features, torch.ones(HEIGHT, WIDTH), layout(shading)),
+        {"texels": light.requires_grad_()},
+        camera(),
     )
     layers["final"].sum().backward()
     assert texels.grad is None

@@ -8,6 +8,7 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.shading.deferred import DeferredShading, reflect_reference
+from polarguide.shading.layout import Layout
 from polarguide.shading.model import GBuffer, ShadingModel
 from polarguide.shading.native import reflect_native, world_rays_native
 
@@ -137,11 +138,12 @@ def test_held_layers_are_those_of_normals_without_a_gradient(
     simd: str, shading: DeferredShading, wanted: tuple[int, ...]
 ) -> None:
     """Against shading a second time, both with a gradient of the picture that does reach the normals."""
+    layout = Layout({"color": 3, "normal": 3, "strength": 1, "local": 3})
     grid = torch.linspace(-1, 2, HEIGHT * WIDTH * 3).reshape(HEIGHT, WIDTH, 3)
     results = []
-    for function in (DeferredShading.shade_held, ShadingModel.shade_held):
+    for function in (DeferredShading.shade_detached, ShadingModel.shade_detached):
         features, texels = (t.requires_grad_() for t in buffers())
-        splatted = GBuffer(features, features[..., 0])
+        splatted = GBuffer(features, features[..., 0], layout)
         layers, held = function(shading, splatted, {"texels": texels}, camera())
         assert held is not None
         specular, diffuse, metal = held

@@ -52,7 +52,7 @@ def with_gradients(
 ) -> tuple[Splats, dict[str, Tensor]]:
     """What is splatted, and the gradients of a fixed weighted sum of all of it."""
     leaves = {name: t.clone().requires_grad_() for name, t in given.items()}
-    found = function(leaves, CAMERA, shading, **how)
+    found, _ = function(leaves, CAMERA, shading, **how)
     total = sum(
         (t * torch.linspace(-1, 2, t.numel(), dtype=t.dtype).reshape(t.shape)).sum()
         for t in found
@@ -98,7 +98,7 @@ def test_plain_splats_with_and_without_normals(normals: bool, oriented: bool) ->
     if not oriented:
         del given["outward"]
     how = {"sh_degree": 2, "normals": normals, "depth": False}
-    found, expected = (f(given, CAMERA, PLAIN, **how) for f in (splatting, splatting_reference))
+    found, expected = (f(given, CAMERA, PLAIN, **how)[0] for f in (splatting, splatting_reference))
     assert found.features.shape == (40, 6 if normals else 3)
     assert_close(found.features, expected.features, rtol=1e-5, atol=3e-6)
 
@@ -134,7 +134,7 @@ def test_threads_do_not_change_the_result() -> None:
 def test_no_gradient_is_kept_where_none_is_wanted() -> None:
     given, how = gaussians(100), {"sh_degree": 3, "normals": True, "depth": True}
     with torch.no_grad():
-        still = splatting(given, CAMERA, WHOLE, **how)
+        still, _ = splatting(given, CAMERA, WHOLE, **how)
     moving, _ = with_gradients(splatting, given, WHOLE, **how)
     assert still.features.grad_fn is None
     for mine, theirs in zip(still, moving, strict=True):
@@ -153,18 +153,19 @@ def test_not_a_number_and_too_much_are_not_hidden() -> None:
         given = gaussians(20)
         given[name].view(20, -1)[7, 0] = value
         with pytest.raises(PolarguideError, match="Gaussian 7"):
-            rasterize_cpu(splatting(given, CAMERA, DeferredShading("fresnel", local=True), **how), CAMERA)
+            rasterize_cpu(splatting(given, CAMERA, DeferredShading("fresnel", local=True), **how)[0], CAMERA)
 
 
 def test_a_model_with_channels_of_its_own_is_asked_for_them() -> None:
     class Doubled(DeferredShading):
         def channels(
             self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int
-        ) -> list[Tensor]:
-            return [2 * base_colors(gaussians, center, degree), self.strength(gaussians)[:, None]]
+        ) -> dict[str, Tensor]:
+            color = 2 * base_colors(gaussians, center, degree)
+            return {"color": color, "strength": self.strength(gaussians)[:, None]}
 
     given, how = gaussians(10), {"sh_degree": 3, "normals": True, "depth": False}
-    twice, once = (splatting(given, CAMERA, model, **how) for model in (Doubled(), DeferredShading()))
+    twice, once = (splatting(given, CAMERA, model, **how)[0] for model in (Doubled(), DeferredShading()))
     assert_close(twice.features[:, :3], 2 * once.features[:, :3], rtol=1e-5, atol=3e-6)
 
 

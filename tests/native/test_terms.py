@@ -15,10 +15,9 @@ from polarguide.camera import Camera
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
-from polarguide.training.losses import normal_terms, normal_terms_reference
+from polarguide.training.losses import Weights, normal_terms, normal_terms_reference
 from polarguide.training.native_terms import Polarization, Terms, pixel_terms
-from polarguide.training.priors import ViewPriors
-from polarguide.training.recipe import Priors, Weights
+from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
 
 HEIGHT, WIDTH = 37, 70  # more than one block of pixels in a row, and more than one part
 SIZE = (HEIGHT, WIDTH)
@@ -87,8 +86,10 @@ def measured() -> ViewPriors:
         chromatic_weight=weight.square(),
         camera=camera(),
         stokes=stokes,
-        reliable=(random(17, *SIZE) > -1).double(),
-        settings=Priors(azimuth_share=0.7, chromatic_share=0.01, bright=20.0),
+        stokes_weight=stokes_weight(stokes, (random(17, *SIZE) > -1).double()),
+        surface=surface_weight(stokes, weight, 20.0),
+        azimuth_share=0.7,
+        chromatic_share=0.01,
     )
 
 
@@ -130,12 +131,17 @@ def names(weights: Weights) -> str:
     return "+".join(f.name for f in fields(weights)[1:] if getattr(weights, f.name))
 
 
+def step(result: RenderResult, priors: ViewPriors, shading: ShadingModel = SHADING) -> Step:
+    targets = StepTargets(camera(), result.final, priors=priors)
+    return Step(result, targets, shading, torch.zeros(1, 3), 1.0)
+
+
 def native(weights: Weights, shading: ShadingModel = SHADING):
-    return lambda result, priors: normal_terms(result, weights, priors, camera(), shading)
+    return lambda result, priors: normal_terms(step(result, priors, shading), weights)
 
 
 def reference(weights: Weights, shading: ShadingModel = SHADING):
-    return lambda result, priors: normal_terms_reference(result, weights, priors, camera(), shading)
+    return lambda result, priors: normal_terms_reference(step(result, priors, shading), weights)
 
 
 @pytest.mark.parametrize("weights", [*SINGLE, ALL], ids=names)
@@ -229,10 +235,12 @@ def test_intensities_behind_a_polarizer_at_any_angle() -> None:
     def directly(result: RenderResult, priors: ViewPriors) -> Tensor:
         stokes = SHADING.predicted_stokes(result, camera())
         expected = torch.stack([optics.intensity(stokes, angle) for angle in angles])
-        return 0.3 * (priors.reliable[..., None] * (expected - seen).abs()).sum()
+        return 0.3 * (priors.stokes_weight[..., None] * (expected - seen).abs()).sum()
 
     def fused(result: RenderResult, priors: ViewPriors) -> Tensor:
-        polarization = Polarization(seen.float(), analyzers, priors.reliable, 0.3, SHADING.refractive_index)
+        polarization = Polarization(
+            seen.float(), analyzers, priors.stokes_weight, 0.3, SHADING.refractive_index
+        )
         return pixel_terms(result, camera(), Terms(polarization, (), None))
 
     assert_same(with_gradients(fused, torch.float32), with_gradients(directly, torch.float64))
@@ -244,8 +252,8 @@ def test_no_weight_no_light_and_no_surface_cost_nothing() -> None:
     flat = torch.zeros(SIZE)
     result = replace(cast(rendered(), torch.float32), **nothing, depth=depth, alpha=flat)
     priors = cast(measured(), torch.float32)
-    dark = replace(priors, weight=flat, chromatic_weight=flat, stokes=torch.zeros(3, *SIZE, 3))
-    value = normal_terms(result, ALL, dark, camera(), SHADING)
+    dark = replace(priors, weight=flat, chromatic_weight=flat, stokes=torch.zeros(3, *SIZE, 3), surface=flat)
+    value = normal_terms(step(result, dark), ALL)
     value.backward()
     assert float(value.detach()) == 0
     for leaf in (*nothing.values(), depth):
@@ -258,11 +266,11 @@ def test_not_a_number_is_not_hidden() -> None:
         broken = getattr(rendered(), name).clone().float()
         broken[18, 33] = torch.nan
         result = replace(cast(rendered(), torch.float32), **{name: broken})
-        value = normal_terms(result, ALL, cast(measured(), torch.float32), camera(), SHADING)
+        value = normal_terms(step(result, cast(measured(), torch.float32)), ALL)
         assert not bool(torch.isfinite(value)), name
 
 
 def test_shapes_are_checked() -> None:
     result = replace(cast(rendered(), torch.float32), specular=torch.zeros(3, 3, 3))
     with pytest.raises(ValueError, match="specular: expected shape"):
-        normal_terms(result, ALL, cast(measured(), torch.float32), camera(), SHADING)
+        normal_terms(step(result, cast(measured(), torch.float32)), ALL)

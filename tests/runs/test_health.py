@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 import polarguide
+from polarguide.angles.polarizers import Polarizers
 from polarguide.camera import Camera
 from polarguide.capture import Scene, View, load_scene
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
@@ -27,7 +28,6 @@ from polarguide.runs.health import HEALTH, Evidence, Health, Limits, examine, wa
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.polarization import Polarization
 from polarguide.shading.result import RenderResult
-from polarguide.training.polarizers import Polarizers
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
 from tests.helpers.heard import Heard

@@ -15,7 +15,8 @@ from polarguide.gaussians.harmonics import SH_C0, sh_basis
 from polarguide.raster import Rasterize, ScreenStatistic, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import DeferredShading, local_light, reflect_reference
-from polarguide.shading.gbuffer import COLOR_CHANNELS, render
+from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.layout import COLOR_CHANNELS
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, base_colors, mirrored
 
 COUNT, RESOLUTION = 30, 8
@@ -105,13 +106,18 @@ def test_without_environment_there_is_no_reflection(gaussians: dict[str, Tensor]
     assert result.specular is result.diffuse is result.reflection is result.strength is result.depth is None
     assert torch.equal(result.final, result.base)
     assert result.normal is not None
-    assert render(gaussians, camera(), rasterize_cpu, normals=False).normal is None
+    assert render(gaussians, camera(), rasterize_cpu, RenderRequest(normals=False)).normal is None
 
 
 def test_the_base_does_not_depend_on_what_else_is_splatted(gaussians: dict[str, Tensor]) -> None:
-    plain = render(gaussians, camera(), rasterize_cpu, normals=False)
+    plain = render(gaussians, camera(), rasterize_cpu, RenderRequest(normals=False))
     full = render(
-        gaussians, camera(), rasterize_cpu, shading=LERP, light={"texels": environment()}, depth=True
+        gaussians,
+        camera(),
+        rasterize_cpu,
+        RenderRequest(depth=True),
+        shading=LERP,
+        light={"texels": environment()},
     )
     for name in ("base", "alpha", "radii"):
         torch.testing.assert_close(getattr(plain, name), getattr(full, name))
@@ -163,7 +169,7 @@ def test_depth_of_one_gaussian_is_its_camera_depth(gaussians: dict[str, Tensor])
     one = {name: t[:1].clone() for name, t in gaussians.items()}
     one["means"] = torch.tensor([[0.0, 0.1, 0.5]])
     one["log_scales"] = torch.zeros(1, 3)
-    result = render(one, camera(), rasterize_cpu, depth=True)
+    result = render(one, camera(), rasterize_cpu, RenderRequest(depth=True))
     assert result.depth is not None
     torch.testing.assert_close(result.depth, torch.full((20, 24), 4.5), rtol=1e-5, atol=0)
 
@@ -194,9 +200,9 @@ def test_every_parameter_that_shows_gets_a_finite_gradient(
         trained,
         camera(),
         rasterize_cpu,
+        RenderRequest(statistic=statistic),
         shading=shading if reflects else PLAIN,
         light={"texels": texels},
-        statistic=statistic,
     )
     loss = result.final.square().mean()
     loss.backward()
@@ -219,7 +225,9 @@ def test_native_and_reference_render_the_same_with_gradients(
     for rasterize, dtype in ((rasterize_cpu, torch.float32), (rasterize_reference, torch.float64)):
         trained = {name: t.to(dtype).detach().clone().requires_grad_() for name, t in gaussians.items()}
         texels = environment().to(dtype).detach().requires_grad_()
-        result = render(trained, camera(), rasterize, shading=shading, light={"texels": texels}, depth=True)
+        result = render(
+            trained, camera(), rasterize, RenderRequest(depth=True), shading=shading, light={"texels": texels}
+        )
         result.final.square().mean().backward()
         outcomes.append((result, {name: t.grad for name, t in trained.items()}))
     (fast, fast_gradients), (slow, slow_gradients) = outcomes
@@ -308,33 +316,40 @@ def test_held_layers_are_the_layers_and_leave_rotations_alone(
     leaves = {name: values.clone().requires_grad_() for name, values in gaussians.items()}
     texels = environment().requires_grad_()
     result = render(
-        leaves, camera(), rasterize_cpu, shading=shading, light={"texels": texels}, held=True, depth=True
+        leaves,
+        camera(),
+        rasterize_cpu,
+        RenderRequest(layers_detached=True, depth=True),
+        shading=shading,
+        light={"texels": texels},
     )
-    assert result.held is not None
+    assert result.detached_layers is not None
     assert result.specular is not None
     assert result.diffuse is not None
-    assert torch.equal(result.held[0], result.specular)
-    assert torch.equal(result.held[1], result.diffuse)
+    assert torch.equal(result.detached_layers[0], result.specular)
+    assert torch.equal(result.detached_layers[1], result.diffuse)
 
     def gradients(layer: Tensor) -> dict[str, Tensor]:
         wanted = [leaves["strength_logits"], leaves["sh_dc"], texels, leaves["quaternions"]]
         found = torch.autograd.grad(layer.square().sum(), wanted, retain_graph=True, materialize_grads=True)
         return dict(zip(("strength", "base", "texels", "quaternions"), found, strict=True))
 
-    moved, held = gradients(result.specular), gradients(result.held[0])
+    moved, held = gradients(result.specular), gradients(result.detached_layers[0])
     for name in ("strength", "base", "texels"):
         torch.testing.assert_close(held[name], moved[name])
     # Rotations shape the splats, too, so that what is left of their gradient is not zero: it is that of a picture whose
     # normals are given.
     assert float((held["quaternions"] - moved["quaternions"]).abs().max()) > 1e-4
     frozen = {**leaves, "quaternions": leaves["quaternions"].detach()}
-    still = render(frozen, camera(), rasterize_cpu, shading=shading, light={"texels": texels}, depth=True)
+    still = render(
+        frozen, camera(), rasterize_cpu, RenderRequest(depth=True), shading=shading, light={"texels": texels}
+    )
     assert still.specular is not None
-    assert torch.equal(still.specular, result.held[0])
+    assert torch.equal(still.specular, result.detached_layers[0])
 
 
 def test_layers_are_held_only_where_asked_for(gaussians: dict[str, Tensor]) -> None:
     light = {"texels": environment()}
-    assert render(gaussians, camera(), rasterize_cpu, shading=FRESNEL, light=light).held is None
-    plain = render(gaussians, camera(), rasterize_cpu, shading=PLAIN, held=True)
-    assert plain.held is None
+    assert render(gaussians, camera(), rasterize_cpu, shading=FRESNEL, light=light).detached_layers is None
+    plain = render(gaussians, camera(), rasterize_cpu, RenderRequest(layers_detached=True), shading=PLAIN)
+    assert plain.detached_layers is None

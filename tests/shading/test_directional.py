@@ -14,11 +14,13 @@ from torch.testing import assert_close
 from polarguide.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.layout import Layout
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, GBuffer, harmonic_colors, mirrored
 
 SHADING = DirectionalShading(width=8, environment_resolution=8, environment_spread=1.0)
+LAYOUT = Layout({"color": 3, "normal": 3, "roughness": 1, "feature": FEATURES, "surface": 1})
 COUNT, RESOLUTION, LEVELS = 30, 8, 5
 
 
@@ -107,7 +109,9 @@ def test_length_of_a_feature_does_not_matter_and_brightness_has_an_end() -> None
 
 
 def test_layers_add_up_to_the_final_picture(gaussians: dict[str, Tensor]) -> None:
-    result = render(gaussians, camera(), rasterize_cpu, shading=SHADING, light=light(), depth=True)
+    result = render(
+        gaussians, camera(), rasterize_cpu, RenderRequest(depth=True), shading=SHADING, light=light()
+    )
     assert result.specular is not None
     assert result.diffuse is not None
     assert torch.equal(result.specular + result.diffuse, result.final)
@@ -152,7 +156,9 @@ def test_degenerate_normals_and_features_stay_finite_with_gradients(scale: float
     further = torch.cat((torch.rand(*size, 1), scale * normal(14, *size, FEATURES)), dim=-1)
     further = torch.cat((further, torch.rand(*size, 1)), dim=-1).requires_grad_()
     values = {name: t.requires_grad_() for name, t in light().items()}
-    layers = SHADING.shade(GBuffer(torch.cat((albedo, direction, further), dim=-1), alpha), values, camera())
+    layers = SHADING.shade(
+        GBuffer(torch.cat((albedo, direction, further), dim=-1), alpha, LAYOUT), values, camera()
+    )
     layers["final"].square().mean().backward()
     for tensor in (layers["final"], albedo.grad, direction.grad, further.grad, values["texels"].grad):
         assert tensor is not None
@@ -210,7 +216,7 @@ def test_a_pixel_reflects_by_the_share_of_its_alpha_that_has_a_surface() -> None
 
     def specular(surface: float) -> Tensor:
         splatted = torch.cat((shown, further, torch.full((*size, 1), surface)), dim=-1)
-        return SHADING.shade(GBuffer(splatted, alpha), light(), camera())["specular"]
+        return SHADING.shade(GBuffer(splatted, alpha, LAYOUT), light(), camera())["specular"]
 
     whole = specular(0.8)
     assert float(whole.min()) > 0

@@ -14,7 +14,7 @@ from polarguide import optics
 from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
 
@@ -38,7 +38,14 @@ def rendered(shading: DeferredShading, values: dict[str, Tensor], **options: boo
     generator = torch.Generator().manual_seed(1)
     texels = 0.1 * torch.randn(6, RESOLUTION, RESOLUTION, 3, generator=generator, dtype=torch.float64)
     rasterize = rasterize_cpu if dtype == torch.float32 else rasterize_reference
-    return render(values, camera(), rasterize, shading=shading, light={"texels": texels.to(dtype)}, **options)
+    return render(
+        values,
+        camera(),
+        rasterize,
+        RenderRequest(**options),
+        shading=shading,
+        light={"texels": texels.to(dtype)},
+    )
 
 
 @pytest.mark.parametrize("metals", [0, 10])
@@ -70,14 +77,14 @@ def test_the_native_pass_agrees_with_the_reference(metals: int, held: bool, dept
         values = gaussians(dtype, metals=metals)
         for name in TRAINED:
             values[name].requires_grad_()
-        result = rendered(SHADING, values, held=held, depth=depth)
+        result = rendered(SHADING, values, layers_detached=held, depth=depth)
         assert result.index is not None
         assert not result.index.requires_grad
         assert result.specular is not None
         loss = (result.final * result.final).sum() + result.specular.sum()
         if held:
-            assert result.held is not None
-            loss = loss + 2 * result.held[0].sum()
+            assert result.detached_layers is not None
+            loss = loss + 2 * result.detached_layers[0].sum()
         loss = loss + SHADING.predicted_stokes(result, camera()).square().sum()
         loss.backward()
         shown = [result.final, result.specular, result.index, loss]

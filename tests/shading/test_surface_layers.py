@@ -13,7 +13,7 @@ from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
 from polarguide.runs.defaults import resolve
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
 from polarguide.shading.splatting import splatting
@@ -38,15 +38,15 @@ def seen(trainer: Trainer, **asked: bool) -> RenderResult:
             state.gaussians,
             camera,
             trainer.backend.rasterize,
+            RenderRequest(**asked),
             shading=trainer.shading,
             light=state.light,
-            **asked,
         )
 
 
 def test_the_layers_and_the_polarization_stay(trainer: Trainer) -> None:
     camera = trainer.scene.test_views[0].camera
-    blended, found = seen(trainer, depth=True), seen(trainer, depth=True, surface=True)
+    blended, found = seen(trainer, depth=True), seen(trainer, depth=True, at_median_depth=True)
     for field in fields(RenderResult):
         one, other = (getattr(result, field.name) for result in (blended, found))
         if field.name not in ("normal", "depth", "blended_normal") and isinstance(one, Tensor):
@@ -60,12 +60,12 @@ def test_the_layers_and_the_polarization_stay(trainer: Trainer) -> None:
 
 
 def test_normals_and_depth_are_those_around_the_median(trainer: Trainer) -> None:
-    found, gaussians = seen(trainer, depth=True, surface=True), trainer.state.gaussians
+    found, gaussians = seen(trainer, depth=True, at_median_depth=True), trainer.state.gaussians
     camera = trainer.scene.test_views[0].camera
     assert found.normal is not None
     assert found.depth is not None
     with torch.no_grad():
-        given = splatting(gaussians, camera, PLAIN, sh_degree=0, normals=False, depth=False)
+        given, _ = splatting(gaussians, camera, PLAIN, sh_degree=0, normals=False, depth=False)
     expected = surface_picture(given, camera)
     assert torch.equal(found.depth, expected.depth)
     assert bool((found.normal.norm(dim=-1) <= found.alpha + 1e-5).all())
@@ -75,16 +75,14 @@ def test_normals_and_depth_are_those_around_the_median(trainer: Trainer) -> None
 
 
 def test_what_is_not_asked_for_is_not_there(trainer: Trainer) -> None:
-    assert seen(trainer, surface=True).depth is None
+    assert seen(trainer, at_median_depth=True).depth is None
     state, camera = trainer.state, trainer.scene.test_views[0].camera
     plain = render(
         state.gaussians,
         camera,
         trainer.backend.rasterize,
+        RenderRequest(normals=False, depth=True, at_median_depth=True),
         shading=PLAIN,
-        normals=False,
-        depth=True,
-        surface=True,
     )
     assert plain.normal is None
     assert plain.blended_normal is None

@@ -13,6 +13,7 @@ import torch
 from plugins import install
 from torch import Tensor
 
+from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.scores import score_view
@@ -28,7 +29,7 @@ from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.point_cloud import write_run_ply
 from polarguide.scene_frame import scene_frame
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.training.actions import reset_opacity
 from polarguide.training.recipe import Recipe
@@ -70,7 +71,12 @@ def picture(trainer: Trainer, **layers: bool) -> RenderResult:
     rasterize = trainer.backend.rasterize
     with torch.no_grad():
         return render(
-            state.gaussians, view.camera, rasterize, shading=trainer.shading, light=state.light, **layers
+            state.gaussians,
+            view.camera,
+            rasterize,
+            RenderRequest(**layers),
+            shading=trainer.shading,
+            light=state.light,
         )
 
 
@@ -131,7 +137,8 @@ def test_it_is_shared_with_baked_colors_and_a_note(trained: Trainer) -> None:
 
 def test_it_is_viewed(trained: Trainer) -> None:
     cameras = [view.camera for view in trained.scene.views]
-    painter, shown, camera = Painter(scene_frame(cameras)), shown_training(trained), cameras[0]
+    running = AngleTrainer(trained.scene, trained.recipe, trained.settings, trained.backend, trained.state)
+    painter, shown, camera = Painter(scene_frame(cameras)), shown_training(running), cameras[0]
     pictures = {layer: painter.paint(shown, camera, Appearance(layer=layer)) for layer in LAYERS}
     assert {layer for layer, found in pictures.items() if found is not None} == set(trained.shading.layers)
     stronger = Appearance(strength=2.0, turn=30.0, crop=Crop((-9, -9, -9), (9, 9, 9)))

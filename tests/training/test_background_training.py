@@ -15,6 +15,7 @@ from polarguide.runs.defaults import resolve
 from polarguide.shading.visibility import LEAST_PIXELS, touched_pixels
 from polarguide.training import losses as losses_of_steps
 from polarguide.training.losses import coverage_loss
+from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import first_state
 from polarguide.training.trainer import Trainer
@@ -34,17 +35,18 @@ def black_scene(tiny_scene: Scene) -> Scene:
     return replace(tiny_scene, views=tuple(views))
 
 
-def trainer(scene: Scene, background: str, recipe: str = "3dgs", steps: int = 60) -> Trainer:
+def trainer(scene: Scene, background: str, recipe: Recipe | str = "3dgs", steps: int = 60) -> Trainer:
     settings = TrainSettings(steps, 3, background=background)  # type: ignore[arg-type]
-    return Trainer(scene, RECIPES[recipe], resolve(settings, scene, RECIPES[recipe]), BACKEND)
+    chosen = RECIPES[recipe] if isinstance(recipe, str) else recipe
+    return Trainer(scene, chosen, resolve(settings, scene, chosen), BACKEND)
 
 
 def outside(made: Trainer, scene: Scene) -> float:
     """Mean alpha of the first view's two outermost rows."""
-    from polarguide.shading.gbuffer import render
+    from polarguide.shading.gbuffer import RenderRequest, render
 
     alpha = render(
-        made.state.gaussians, scene.views[0].camera, BACKEND.rasterize, normals=False
+        made.state.gaussians, scene.views[0].camera, BACKEND.rasterize, RenderRequest(normals=False)
     ).alpha.detach()
     return float(torch.cat((alpha[:2], alpha[-2:])).mean())
 
@@ -153,13 +155,12 @@ def test_surroundings_keep_what_no_view_sees(black_scene: Scene) -> None:
 
 
 def test_what_is_faint_in_all_views_goes_where_the_recipe_says_so(black_scene: Scene) -> None:
-    stages = {}
+    stages, recipe = {}, RECIPES["polarguide-stokes"]
+    assert isinstance(recipe, Recipe)
+    assert recipe.densification.faint_pixels == 0.1
     for faint in (0.0, 0.1):
-        made = trainer(black_scene, "scene", recipe="polarguide-stokes", steps=40)
-        assert made.recipe.densification.faint_pixels == 0.1
-        made.recipe = replace(
-            made.recipe, densification=replace(made.recipe.densification, faint_pixels=faint)
-        )
+        changed = replace(recipe, densification=replace(recipe.densification, faint_pixels=faint))
+        made = trainer(black_scene, "scene", recipe=changed, steps=40)
         with torch.no_grad():
             made.state.gaussians["opacity_logits"][1] = -5.4  # over the least opacity, and hardly to be seen
         made.run(lambda _: None, until=19)

@@ -11,7 +11,7 @@ from polarguide.camera import Camera
 from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Rasterize
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import RenderResult
 from polarguide.training.behind import shares_before, turned_behind
 
@@ -44,7 +44,7 @@ def gaussians(dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 def rendered(of: dict[str, Tensor], rasterize: Rasterize) -> RenderResult:
-    return render(of, CAMERA, rasterize, sh_degree=0, depth=True, still=True)
+    return render(of, CAMERA, rasterize, RenderRequest(sh_degree=0, depth=True, normal_rotation_only=True))
 
 
 def gradients(
@@ -103,11 +103,11 @@ def test_pictures_are_the_same_to_the_bit() -> None:
     of = gaussians(torch.float32)
     result = rendered(of, rasterize_cpu)
     turned = turned_behind(result, 3.0, 5.0)
-    assert torch.equal(result.still_normal, result.normal)
+    assert torch.equal(result.rotation_only_normal, result.normal)
     assert torch.equal(turned.normal, result.normal)
     assert torch.equal(turned.depth, result.depth)
-    assert rendered(of, rasterize_cpu).still_normal is not None
-    assert render(of, CAMERA, rasterize_cpu, sh_degree=0).still_normal is None
+    assert rendered(of, rasterize_cpu).rotation_only_normal is not None
+    assert render(of, CAMERA, rasterize_cpu, RenderRequest(sh_degree=0)).rotation_only_normal is None
 
 
 def test_shares_by_depth() -> None:

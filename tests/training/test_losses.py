@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -17,6 +17,7 @@ from polarguide.errors import PolarguideError
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult
 from polarguide.training.losses import (
+    Weights,
     azimuth_loss,
     chromatic_loss,
     flatness_loss,
@@ -25,8 +26,7 @@ from polarguide.training.losses import (
     stokes_loss,
 )
 from polarguide.training.photometric import photometric_loss
-from polarguide.training.priors import ViewPriors
-from polarguide.training.recipe import Priors, Weights
+from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
 
 SIZE = (12, 14)
 GLASS = DeferredShading("fresnel").bind(1.5)
@@ -69,8 +69,8 @@ def priors() -> ViewPriors:
         weight.square(),
         CAMERA,
         measured(1.0),
-        torch.ones(SIZE),
-        Priors(),
+        stokes_weight(measured(1.0), torch.ones(SIZE)),
+        weight,
     )
 
 
@@ -83,6 +83,16 @@ def measured(index_shift: float) -> Tensor:
     specular, diffuse = LAYERS
     normal = CAMERA.to_camera(FACING)
     return optics.predicted_stokes(2 * specular, 2 * diffuse, normal, CAMERA.rays(), 0.5 + index_shift)
+
+
+def step(
+    result: RenderResult,
+    shown: Tensor,
+    priors: ViewPriors | None,
+    valid: Tensor | None = None,
+    ssim_weight: float = 0.2,
+) -> Step:
+    return Step(result, StepTargets(CAMERA, shown, valid, priors=priors), GLASS, SCALES, 2.0, ssim_weight)
 
 
 def result(**layers: Tensor | None) -> RenderResult:
@@ -161,7 +171,7 @@ def test_stokes_loss_is_zero_for_the_layers_and_normals_that_were_measured(prior
     assert float(stokes_loss(rendered, priors, GLASS.bind(1.4))) > 1e-3
     swapped = result(specular=LAYERS[1], diffuse=LAYERS[0], normal=FACING)
     assert float(stokes_loss(swapped, priors, GLASS)) > 1e-2
-    nothing = replace(priors, reliable=torch.zeros(SIZE))
+    nothing = replace(priors, stokes_weight=torch.zeros(SIZE))
     assert float(stokes_loss(swapped, nothing, GLASS)) == 0
 
 
@@ -209,9 +219,7 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         flatness=0.9,
         stokes=1.1,
     )
-    total, photometric, error = step_loss(
-        rendered, shown, valid, weights, priors, ssim_weight=0.3, shading=GLASS, log_scales=SCALES, extent=2.0
-    )
+    total, photometric, error = step_loss(step(rendered, shown, priors, valid, 0.3), weights)
     assert rendered.specular is not None
     assert rendered.diffuse is not None
     assert rendered.normal is not None
@@ -232,18 +240,29 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
     assert float(error) == pytest.approx(float((valid * squares).sum() / valid.sum()), rel=1e-5)
 
 
+def test_every_term_reads_targets_and_layers_that_there_are() -> None:
+    known = {field.name for field in fields(ViewPriors)}
+    for weight in fields(Weights):
+        alone = Weights(**{"photometric": 0.0, weight.name: 1.0})
+        assert alone.fields_read <= known, weight.name
+        assert {*weight.metadata["rendered"]} <= {"normal", "depth", "layers"}, weight.name
+        assert alone.normals == ("normal" in weight.metadata["rendered"]), weight.name
+        # Priors are made for whoever needs them, and the agreement with the depth does without.
+        assert alone.priors == (weight.name not in ("photometric", "flatness", "consistency")), weight.name
+
+
 def test_few_polarized_pixels_pull_no_harder_than_many(priors: ViewPriors) -> None:
     one = torch.zeros(SIZE)
     one[3, 4] = 1.0
     few = replace(priors, weight=one, chromatic_weight=one)
-    spread = replace(few, settings=Priors(azimuth_share=0.5, chromatic_share=0.25))
+    spread = replace(few, azimuth_share=0.5, chromatic_share=0.25)
     pixels = SIZE[0] * SIZE[1]
     for loss, share in ((azimuth_loss, 0.5), (normal_loss, 0.5), (chromatic_loss, 0.25)):
         assert float(loss(unit(9), spread)) == pytest.approx(float(loss(unit(9), few)) / (share * pixels))
     # Where more than that share is polarized, the least share means nothing.
     whole = replace(spread, weight=torch.ones(SIZE))
     assert float(azimuth_loss(unit(9), whole)) == pytest.approx(
-        float(azimuth_loss(unit(9), replace(whole, settings=Priors())))
+        float(azimuth_loss(unit(9), replace(whole, azimuth_share=0.0)))
     )
 
 
@@ -251,14 +270,13 @@ def test_what_is_bright_counts_for_the_agreement_with_depth_whatever_its_polariz
     priors: ViewPriors,
 ) -> None:
     dark, bright = torch.zeros_like(priors.stokes), torch.ones_like(priors.stokes)
-    settings = Priors(bright=0.25)
-    none = replace(priors, weight=torch.zeros(SIZE), settings=settings)
-    assert torch.equal(replace(none, stokes=bright).surface, torch.ones(SIZE))
-    assert torch.equal(replace(none, stokes=dark).surface, torch.zeros(SIZE))
+    nowhere = torch.zeros(SIZE)
+    assert torch.equal(surface_weight(bright, nowhere, 0.25), torch.ones(SIZE))
+    assert torch.equal(surface_weight(dark, nowhere, 0.25), nowhere)
     # S0/2 of 0.125 is half of what counts fully.
-    torch.testing.assert_close(replace(none, stokes=0.25 * bright).surface, torch.full(SIZE, 0.5))
-    assert torch.equal(replace(priors, stokes=dark, settings=settings).surface, priors.weight)
-    assert torch.equal(replace(none, stokes=bright, settings=Priors()).surface, none.weight)
+    torch.testing.assert_close(surface_weight(0.25 * bright, nowhere, 0.25), torch.full(SIZE, 0.5))
+    assert torch.equal(surface_weight(dark, priors.weight, 0.25), priors.weight)
+    assert torch.equal(surface_weight(bright, nowhere, 0.0), nowhere)
 
 
 def test_layers_of_half_the_picture_weigh_half(priors: ViewPriors) -> None:
@@ -269,15 +287,7 @@ def test_layers_of_half_the_picture_weigh_half(priors: ViewPriors) -> None:
 
     def layers(given: ViewPriors) -> float:
         total, photometric, _ = step_loss(
-            rendered,
-            srgb_encode(picture(6)),
-            None,
-            Weights(specular=0.5),
-            given,
-            ssim_weight=0.2,
-            shading=GLASS,
-            log_scales=SCALES,
-            extent=2.0,
+            step(rendered, srgb_encode(picture(6)), given), Weights(specular=0.5)
         )
         return float(total - photometric)
 
@@ -289,52 +299,20 @@ def test_a_perfect_picture_costs_nothing(priors: ViewPriors) -> None:
     assert priors.separated.all()
     rendered = result(final=picture(6), specular=picture(3), diffuse=picture(4), normal=priors.normal)
     weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
-    total, *_ = step_loss(
-        rendered,
-        srgb_encode(picture(6)),
-        None,
-        weights,
-        priors,
-        ssim_weight=0.2,
-        shading=GLASS,
-        log_scales=SCALES,
-        extent=2.0,
-    )
+    total, *_ = step_loss(step(rendered, srgb_encode(picture(6)), priors), weights)
     assert float(total) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_layers_that_a_recipe_lacks_are_left_out(priors: ViewPriors) -> None:
     weights = Weights(specular=0.5, diffuse=0.2, normal=0.3, azimuth=0.4)
     shown = srgb_encode(picture(6))
-    total, photometric, _ = step_loss(
-        result(), shown, None, weights, priors, ssim_weight=0.2, shading=GLASS, log_scales=SCALES, extent=2.0
-    )
+    total, photometric, _ = step_loss(step(result(), shown, priors), weights)
     assert torch.equal(total, photometric)
-    total, photometric, _ = step_loss(
-        result(normal=unit(1)),
-        shown,
-        None,
-        weights,
-        None,
-        ssim_weight=0.2,
-        shading=GLASS,
-        log_scales=SCALES,
-        extent=2.0,
-    )
+    total, photometric, _ = step_loss(step(result(normal=unit(1)), shown, None), weights)
     assert torch.equal(total, photometric)
 
 
 def test_a_loss_that_is_not_finite_is_an_error(priors: ViewPriors) -> None:
     rendered = result(normal=torch.full((*SIZE, 3), torch.nan))
     with pytest.raises(PolarguideError, match="finite loss"):
-        step_loss(
-            rendered,
-            picture(6),
-            None,
-            Weights(normal=0.1),
-            priors,
-            ssim_weight=0.2,
-            shading=GLASS,
-            log_scales=SCALES,
-            extent=2.0,
-        )
+        step_loss(step(rendered, picture(6), priors), Weights(normal=0.1))

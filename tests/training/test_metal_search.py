@@ -20,7 +20,7 @@ from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.rules import MetalRules
 from polarguide.training.metals.words import contradicted, said_by
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
+from polarguide.training.trainer import Trainer, warn_of_unused_materials
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
 
 RULES = MetalRules()
@@ -81,13 +81,8 @@ def test_too_few_steps_to_heed_materials_are_told_of(tiny_scene: Scene, minimum:
     )
     recipe, scene = dataclasses.replace(RECIPE, stages=stages), with_materials(tiny_scene, 2)
     for given in (scene, tiny_scene):
-        Trainer(
-            given,
-            recipe,
-            resolve(TrainSettings(60, 3), given, recipe),
-            choose_backend("cpu"),
-            warn=heard.append,
-        )
+        settings = resolve(TrainSettings(60, 3), given, recipe)
+        warn_of_unused_materials(given, recipe, settings, choose_backend("cpu"), heard.append)
     if minimum == 1:
         assert not heard
     else:

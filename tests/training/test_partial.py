@@ -17,10 +17,10 @@ from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.optics import Mount
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult
-from polarguide.training.losses import step_loss
-from polarguide.training.partial import PartialView, partial_terms
+from polarguide.training.losses import Weights, step_loss
+from polarguide.training.partial import partial_terms
 from polarguide.training.photometric import photometric_loss
-from polarguide.training.recipe import Weights
+from polarguide.training.targets import PartialView, Step, StepTargets
 
 SIZE = (12, 14)
 GLASS = DeferredShading("fresnel").bind(1.5)
@@ -75,11 +75,13 @@ def measured(result: RenderResult, exposures: tuple[Exposure, ...], mount: Mount
 
 
 def terms(result: RenderResult, view: View, weights: Weights = WEIGHTS) -> tuple[Tensor, Tensor]:
-    partial = PartialView.of(view, CPU)
-    total, picture = partial_terms(
-        result, partial, weights, valid=None, ssim_weight=0.2, shading=GLASS, camera=CAMERA
-    )
+    total, picture = partial_terms(step(result, view), weights.photometric, weights.stokes)
     return total, picture.loss
+
+
+def step(result: RenderResult, view: View) -> Step:
+    partial = PartialView.of(view, CPU)
+    return Step(result, StepTargets(CAMERA, partial.shown, partial=partial), GLASS, torch.zeros(1, 3), 1.0)
 
 
 KINDS = {
@@ -163,11 +165,7 @@ def test_saturated_pixels_say_nothing_about_polarization() -> None:
 def test_the_step_takes_it_in_place_of_the_photograph() -> None:
     result = rendered()
     view = measured(result, KINDS["one"])
-    partial = PartialView.of(view, CPU)
-    options = {"ssim_weight": 0.2, "shading": GLASS, "log_scales": torch.zeros(1, 3), "extent": 1.0}
-    total, *_ = step_loss(
-        result, partial.shown, None, WEIGHTS, None, camera=CAMERA, partial=partial, **options
-    )
+    total, *_ = step_loss(step(result, view), WEIGHTS)
     assert torch.equal(total, terms(result, view)[0])
     assert not measured(result, KINDS["one"]).is_determined
     assert measured(result, FOUR).is_determined

@@ -133,9 +133,11 @@ def test_what_was_measured_is_separated_with_the_index_of_each_pixel(
     gaussians = {name: values.detach() for name, values in run.gaussians.items()}
 
     def separated(index: float, offset: float) -> torch.Tensor:
-        feed = Feed(choose_backend("cpu"), recipe.priors, index, ViewStore(), [view], black=False)
+        feed = Feed(choose_backend("cpu"), recipe, index, ViewStore(), [view], 60, black=False)
         own = {**gaussians, "index_offset": torch.full_like(gaussians["index_offset"], offset)}
-        return feed.priors(view, stage, own).diffuse[run.result(view.name).alpha > 0.99]
+        priors = feed.targets(59, view, stage.weights, own).priors
+        assert priors is not None
+        return priors.diffuse[run.result(view.name).alpha > 0.99]
 
     as_said, as_of_all, other = separated(1.5, -0.17), separated(1.33, 0.0), separated(1.5, 0.0)
     assert float((as_said - as_of_all).abs().mean()) < 0.05 * float((as_said - other).abs().mean())

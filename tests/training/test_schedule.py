@@ -51,6 +51,15 @@ def test_every_step_of_a_short_training_has_a_stage() -> None:
         assert len(names(steps)) == steps
 
 
+@pytest.mark.parametrize("steps", range(1, 12))
+@EVERY_RECIPE
+def test_what_a_stage_begins_with_happens_in_the_shortest_training(recipe: Recipe, steps: int) -> None:
+    schedule = Schedule(recipe, steps)
+    happened = [action for step in range(steps) for action in schedule.at(step).actions]
+    assert {action for stage in recipe.stages for action in stage.on_enter} <= {*happened}
+    assert schedule.at(steps - 1).stage is recipe.stages[-1]
+
+
 def test_actions_are_due_at_their_distance_from_the_stage_start() -> None:
     schedule = Schedule(RECIPE, 100)
     due = {step: schedule.at(step).actions for step in range(100) if schedule.at(step).actions}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,11 +15,12 @@ from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.forecast import _priors_made
-from polarguide.training.feed import Feed
+from polarguide.training.feed import Feed, coarse_steps
 from polarguide.training.recipe import Coarse
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
-from polarguide.training.sizes import coarse_steps
+from polarguide.training.targets import StepTargets
 from polarguide.training.trainer import Trainer
+from polarguide.training.view_store import ViewStore
 
 STOKES = RECIPES["polarguide-stokes"]
 STEPS = 40
@@ -26,10 +28,21 @@ HALVED = dataclasses.replace(STOKES, coarse=Coarse(share=0.5, factor=2, pixels=1
 NEVER = dataclasses.replace(STOKES, coarse=Coarse(share=0.0))
 
 
-def trained(scene: Scene, recipe: object, until: int | None = None, state: object = None) -> Trainer:
+def trained(
+    scene: Scene,
+    recipe: object,
+    until: int | None = None,
+    state: object = None,
+    store: ViewStore | None = None,
+) -> Trainer:
     reports: list[StepReport] = []
     trainer = Trainer(
-        scene, recipe, resolve(TrainSettings(STEPS, 3), scene, recipe), choose_backend("cpu"), state
+        scene,
+        recipe,
+        resolve(TrainSettings(STEPS, 3), scene, recipe),
+        choose_backend("cpu"),
+        state,
+        store=store,
     )  # type: ignore[arg-type]
     trainer.run(reports.append, until=until)
     return trainer
@@ -43,27 +56,28 @@ def test_the_first_half_of_the_steps_looks_at_smaller_pictures(
     tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[int, ...]] = []
-    shown = Feed.shown
+    targets = Feed.targets
 
-    def watched(self: Feed, view: object) -> object:
-        found = shown(self, view)  # type: ignore[arg-type]
+    def watched(self: Feed, *given: Any) -> StepTargets:
+        found = targets(self, *given)
         seen.append(tuple(found.picture.shape[:2]))
         return found
 
-    monkeypatch.setattr(Feed, "shown", watched)
+    monkeypatch.setattr(Feed, "targets", watched)
     trained(tiny_scene, HALVED)
     height, width = tiny_scene.train_views[0].codes.shape[1:3]
     assert seen == [(height // 2, width // 2)] * (STEPS // 2) + [(height, width)] * (STEPS // 2)
 
 
 def test_what_was_kept_of_smaller_pictures_goes(tiny_scene: Scene) -> None:
-    trainer = trained(tiny_scene, HALVED, until=STEPS // 2)
-    kinds = {kind for kind, _ in trainer._store._held}
-    assert {"small shown", "small priors"} <= kinds
+    store = ViewStore()
+    trainer = trained(tiny_scene, HALVED, until=STEPS // 2, store=store)
+    kinds = {kind for kind, _ in store._held}
+    assert {"small photograph", "small priors"} <= kinds
     trainer.run(lambda _: None)
-    kinds = {kind for kind, _ in trainer._store._held}
+    kinds = {kind for kind, _ in store._held}
     assert not any(kind.startswith("small") for kind in kinds)
-    assert {"shown", "priors"} <= kinds
+    assert {"photograph", "priors"} <= kinds
 
 
 @pytest.mark.parametrize("stop", [13, 20, 27])

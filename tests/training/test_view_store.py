@@ -17,7 +17,6 @@ from polarguide.training import view_store
 from polarguide.training.packing import (
     Entry,
     Packed,
-    fields_read,
     holds,
     pack_priors,
     packed,
@@ -156,10 +155,10 @@ def test_terms_find_what_they_read_of_the_priors(tiny_scene: Scene) -> None:
     view, recipe = tiny_scene.train_views[0], RECIPES["polarguide-stokes"]
     guide = -view.camera.world_rays()
     priors = view_priors(view, guide, recipe.priors, 1.5)
-    fields = fields_read(recipe.stages[1].weights)
+    fields = recipe.stages[1].weights.fields_read
     entry = pack_priors(priors, fields)
     assert holds(entry, fields)
-    assert not holds(entry, fields_read(Weights(normal=1.0)))
+    assert not holds(entry, Weights(normal=1.0).fields_read)
     found = unpack_priors(entry, view.camera, recipe.priors)
     for name in fields:
         expected, values = getattr(priors, name), getattr(found, name)

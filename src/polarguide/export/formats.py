@@ -33,7 +33,7 @@ from polarguide.rendering.relight import needs_radiance, panorama, write_exr
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.point_cloud import write_run_ply
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import Parameters
 from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
@@ -252,11 +252,9 @@ def _fused(run: OpenedRun, shown: _Shown, resolution: int) -> ColoredMesh:
             gaussians,
             camera,
             model.backend.rasterize,
+            RenderRequest(depth=True, at_median_depth=True),
             shading=model.shading,
             light=model.light,
-            normals=True,
-            depth=True,
-            surface=True,
         )
 
     with torch.no_grad():

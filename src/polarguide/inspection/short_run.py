@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from polarguide import __version__
+from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import FOUR
 from polarguide.errors import PolarguideError
@@ -25,13 +26,12 @@ from polarguide.recipes import recipe_named
 from polarguide.records import read_record
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import Priors, Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer
 from polarguide.vectors import dot, unit
 
 RECIPE = "3dgs-dr:consistent"
@@ -95,7 +95,7 @@ def short_run(
     }
     until = until or steps
     state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
-    trainer = Trainer(scene, recipe, settings, backend, state)
+    trainer = AngleTrainer(scene, recipe, settings, backend, state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)
@@ -123,8 +123,8 @@ def _same(folder: Path, wanted: dict[str, object]) -> bool:
 @torch.no_grad()
 def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
     """The surface of the trained Gaussians in one view, on the CPU, where pictures are compared with it."""
-    result = render(state.gaussians, view.camera, backend.rasterize, sh_degree=0, normals=True, depth=True)
-    result = result.to("cpu")
+    request = RenderRequest(sh_degree=0, depth=True)
+    result = render(state.gaussians, view.camera, backend.rasterize, request).to("cpu")
     if result.normal is None or result.depth is None:
         raise PolarguideError(
             view.name, expected="normals and depth", found="none", remedy="Report this: it is a fault here."

@@ -1,6 +1,6 @@
 """Captures with other pictures than four angles a view: what they are, and whether they agree with what is said.
 
-A short training that is told no angle finds that of every picture in closed form (``training.polarizers``). What it
+A short training that is told no angle finds that of every picture in closed form (``angles.polarizers``). What it
 finds is compared with what the capture says.
 """
 
@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from polarguide.angles.polarizers import LAST, REMEDY, Judgment, Polarizers
 from polarguide.capture import Scene
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.view import View, listed
@@ -22,7 +23,6 @@ from polarguide.inspection.short_run import short_run
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
-from polarguide.training.polarizers import LAST, REMEDY, Judgment, Polarizers
 from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import StepReport
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from polarguide.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.capture import Scene
 from polarguide.capture.angle_table import TABLE, table_text
 from polarguide.capture.exposures import Exposure
@@ -13,7 +14,6 @@ from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.files import write_text
 from polarguide.progress import Reporter
-from polarguide.training.polarizers import REMEDY, Judgment, Polarizers
 
 ANY = 90.0
 """Degrees: as far as two angles can be apart."""

@@ -9,6 +9,8 @@ from typing import Any, Protocol
 
 import torch
 
+from polarguide.angles.polarizers import predicts_filters
+from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.neural.model import FieldModel
@@ -27,20 +29,22 @@ from polarguide.runs.polarization import Polarization
 from polarguide.shading.model import ShadingModel
 from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
-from polarguide.training.polarizers import predicts_filters
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings, StepReport
-from polarguide.training.trainer import Trainer
+from polarguide.training.trainer import warn_of_unused_materials
 from polarguide.training.view_store import ViewStore
 
 
 class AnyTrainer(Protocol):
-    """What the loop of a training asks for; see ``training.trainer.Trainer``."""
+    """What the loop of a training asks for; see ``angles.trainer.AngleTrainer``."""
 
     scene: Scene
     settings: ResolvedSettings
     ranks: Ranks
-    whole: bool
+
+    @property
+    def whole(self) -> bool:
+        """Whether the state is one between two steps; an exception may leave it in the middle of a change."""
 
     @property
     def shading(self) -> ShadingModel:
@@ -160,9 +164,10 @@ class GaussianFamily(Family):
         store: ViewStore,
         reporter: Reporter,
         memory: MemoryBound,
-    ) -> Trainer:
+    ) -> AngleTrainer:
         """See ``Family``."""
-        made = Trainer(scene, method, settings, backend, state, ranks, store, reporter.warn, memory)
+        warn_of_unused_materials(scene, method, settings, backend, reporter.warn)
+        made = AngleTrainer(scene, method, settings, backend, state, ranks, store, reporter.warn, memory)
         if made.polarizers.ignored:
             reporter.warn(_ignored(method))
         return made
@@ -179,13 +184,13 @@ class GaussianFamily(Family):
         """See ``Family``."""
         return GaussianModel(state, method.shading.bind(settings.refractive_index), backend)
 
-    def finish(self, out: Path, trainer: Trainer, model: GaussianModel, reporter: Reporter) -> None:
+    def finish(self, out: Path, trainer: AngleTrainer, model: GaussianModel, reporter: Reporter) -> None:
         """See ``Family``: what was found out of polarizers, and the PLY."""
         report_polarizers(out, trainer.scene, trainer.polarizers, reporter)
         centers = torch.stack([view.camera.center for view in trainer.scene.views])
         write_run_ply(out / PLY, model.state, model.shading, centers)
 
-    def evidence(self, trainer: Trainer, method: Recipe) -> Evidence:
+    def evidence(self, trainer: AngleTrainer, method: Recipe) -> Evidence:
         """See ``Family``. A look at a view takes two renderings without gradients, a third of a step each."""
         views = [trainer.polarizers.believed(view) for view in trainer.scene.train_views]
         filters, priors = predicts_filters(method), any(stage.weights.priors for stage in method.stages)

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from polarguide.angles.polarizers import SEARCH_SIZE, Polarizers, search_steps
 from polarguide.capture import Scene
 from polarguide.raster import Backend
 from polarguide.runs.memory import in_gigabytes
 from polarguide.system import MEBIBYTE, peak_memory_mib
-from polarguide.training.polarizers import SEARCH_SIZE, Polarizers, search_steps
+from polarguide.training.feed import coarse_steps
 from polarguide.training.recipe import Recipe
 from polarguide.training.schedule import Schedule
 from polarguide.training.settings import ResolvedSettings
-from polarguide.training.sizes import coarse_steps
 from polarguide.training.trainer import Trainer
 
 LEAST_STEPS = 500

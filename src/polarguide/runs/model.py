@@ -11,7 +11,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.raster import Backend
 from polarguide.raster.in_front import alpha_in_front
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.shading.splatting import splats
@@ -113,11 +113,9 @@ class GaussianModel:
             self.state.gaussians,
             camera,
             self.backend.rasterize,
+            RenderRequest(normals=normals, depth=depth, at_median_depth=surface),
             shading=self.shading,
             light=self.light,
-            normals=normals,
-            depth=depth,
-            surface=surface,
         )
 
     @torch.no_grad()

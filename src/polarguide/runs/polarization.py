@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from polarguide.angles.polarizers import Judgment
 from polarguide.capture import View
-from polarguide.training.polarizers import Judgment
 
 Word = Literal["measured", "fitted", "none"]
 Count = Annotated[int, msgspec.Meta(ge=0)]

@@ -21,7 +21,6 @@ from polarguide.shading.conversion import convert, mirror_base, scale_light
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.metal import (
     BLUR,
-    CHANNELS,
     FIRST_REFLECTANCE,
     FIRST_ROUGHNESS,
     MINIMUM_SHARE,
@@ -40,6 +39,7 @@ from polarguide.shading.mips import mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
     ChannelParameters,
+    Channels,
     GBuffer,
     Light,
     PageShading,
@@ -53,7 +53,7 @@ from polarguide.shading.model import (
     mirrored,
 )
 from polarguide.shading.native import MetalArguments, reflect_native, world_rays_native
-from polarguide.shading.result import LAYERS, HeldLayers
+from polarguide.shading.result import LAYERS, DetachedLayers
 from polarguide.vectors import dot, unit
 
 Blend = Literal["lerp", "fresnel"]
@@ -202,37 +202,40 @@ class DeferredShading(ShadingModel):
         s, p = reflectances_from_cosine(cosine, self.refractive_index if index is None else index)
         return strength * (0.5 * (s + p)) * light, base
 
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
-        """Base color [N, 3], strength [N, 1], with ``local`` the Gaussians' own light [N, 3], where some are metals
-        what these need [N, 5], and where some have refractive indices of their own these less the run's [N, 1].
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
+        """``color`` [N, 3] (the base color), ``strength`` [N, 1], with ``local`` the Gaussians' own light ``local``
+        [N, 3]; where some are metals ``metal`` [N, 5], and where some have refractive indices of their own ``index``
+        [N, 1], these less the run's.
         """
-        channels = [base_colors(gaussians, center, degree), self.strength(gaussians)[:, None]]
-        if self.local:
-            directions = mirrored_directions(gaussians["means"], center, normals)
-            channels.append(local_light(gaussians, directions, degree))
+        channels = {
+            "color": base_colors(gaussians, center, degree),
+            "strength": self.strength(gaussians)[:, None],
+        }
         if self._has_metal(gaussians):
             body = 1 - gaussians["metalness"].detach()[:, None]
-            channels = [channels[0] * body, channels[1] * body, *channels[2:]]
-        return channels + self._further(gaussians)
+            channels = {name: values * body for name, values in channels.items()}
+        if self.local:
+            directions = mirrored_directions(gaussians["means"], center, normals)
+            channels["local"] = local_light(gaussians, directions, degree)
+        return channels | self._further(gaussians)
 
-    def _further(self, gaussians: Parameters) -> list[Tensor]:
+    def _further(self, gaussians: Parameters) -> dict[str, Tensor]:
         """The channels of metals and of refractive indices, where there are some."""
-        further = [self._metals(gaussians)] if self._has_metal(gaussians) else []
+        further = {"metal": self._metals(gaussians)} if self._has_metal(gaussians) else {}
         if self._has_indices(gaussians):
-            further.append(gaussians["index_offset"].detach()[:, None])
+            further["index"] = gaussians["index_offset"].detach()[:, None]
         return further
 
     def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
         """What ``channels`` reads; None for a class with other channels."""
         if type(self).channels is not DeferredShading.channels:
             return None
-        further = self._further(gaussians)
         return ChannelParameters(
             gaussians["strength_logits"],
             gaussians["local_dc"] if self.local else None,
             gaussians["local_rest"] if self.local else None,
             gaussians["metalness"].detach() if self._has_metal(gaussians) else None,
-            torch.cat(further, dim=1) if further else None,
+            self._further(gaussians),
         )
 
     @property
@@ -283,26 +286,30 @@ class DeferredShading(ShadingModel):
         With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``. Where there are several refractive
         indices, ``index`` [H, W].
         """
-        features, texels = splatted.features, light["texels"]
-        if splatted.metal is None and fits(features, texels):
-            return self._shade_native(splatted, texels, camera, held=False)
-        strength = features[..., 6]
-        local = features[..., 7:10] if self.local else None
+        texels = light["texels"]
+        if splatted.metal is None and fits(splatted.features, texels):
+            return self._shade_native(splatted, texels, camera, detached=False)
+        strength = splatted["strength"][..., 0]
+        local = splatted["local"] if self.local else None
         index = self._index_picture(splatted)
         layers = reflect_reference(
-            splatted.color, splatted.normal, strength, texels, camera, self, local, index
+            splatted["color"], splatted["normal"], strength, texels, camera, self, local, index
         )
         return self._with_metals({**layers, "strength": strength, "index": index}, splatted, texels, camera)
 
-    def shade_held(
+    def shade_detached(
         self, splatted: GBuffer, light: Light, camera: Camera
-    ) -> tuple[dict[str, Any], HeldLayers | None]:
+    ) -> tuple[dict[str, Any], DetachedLayers | None]:
         """As ``ShadingModel`` has it; on the CPU in float32 one native pass."""
         texels = light["texels"]
         if not fits(splatted.features, texels):
-            return super().shade_held(splatted, light, camera)
-        layers = self._shade_native(splatted, texels, camera, held=True)
-        return layers, (layers.pop("held specular"), layers.pop("held diffuse"), layers.get("metal"))
+            return super().shade_detached(splatted, light, camera)
+        layers = self._shade_native(splatted, texels, camera, detached=True)
+        return layers, (
+            layers.pop("detached specular"),
+            layers.pop("detached diffuse"),
+            layers.get("metal"),
+        )
 
     def _with_metals(
         self, layers: dict[str, Any], splatted: GBuffer, texels: Tensor, camera: Camera
@@ -311,49 +318,31 @@ class DeferredShading(ShadingModel):
         if not self.metal:
             return layers
         features, metal = splatted.features, splatted.metal
-        if metal is None and self._shows_metals(splatted):
+        if metal is None and "metal" in splatted.layout:
             rays = camera.world_rays(dtype=features.dtype, device=features.device)
             metal = metal_pixels(
                 features.flatten(0, 1),
-                self._first_of_metals,
+                splatted.layout,
                 rays.flatten(0, 1),
-                splatted.normal.flatten(0, 1),
+                splatted["normal"].flatten(0, 1),
                 self.radiance(texels),
-                7 if self.local else None,
             )
         found = layers if metal is None else with_metal(layers, metal)
         return {**found, "metalness": metalness_picture(metal, features), "metal": metal}
 
-    @property
-    def _first_of_metals(self) -> int:
-        """The channel where those of metals begin, behind the ones of dielectrics."""
-        return 10 if self.local else 7
-
-    def _more_channels(self, splatted: GBuffer) -> int:
-        """Channels behind those of dielectrics: none, five of metals, one of indices, or both; that of depth apart."""
-        return splatted.features.shape[-1] - splatted.depth - self._first_of_metals
-
-    def _shows_metals(self, splatted: GBuffer) -> bool:
-        """Whether there are channels of metals."""
-        return self.metal and self._more_channels(splatted) >= CHANNELS
-
-    def _index_channel(self, splatted: GBuffer) -> int:
-        """The channel of what is added to the refractive index; -1: there is none."""
-        more = self._more_channels(splatted)
-        return self._first_of_metals + more - 1 if self.indices and more in (1, CHANNELS + 1) else -1
-
     def _index_picture(self, splatted: GBuffer) -> Tensor | None:
         """Refractive indices [H, W]; None: the run's everywhere."""
-        channel = self._index_channel(splatted)
-        return None if channel < 0 else self.refractive_index + splatted.features[..., channel].detach()
+        if "index" not in splatted.layout:
+            return None
+        return self.refractive_index + splatted["index"][..., 0].detach()
 
     def _shade_native(
-        self, splatted: GBuffer, texels: Tensor, camera: Camera, *, held: bool
+        self, splatted: GBuffer, texels: Tensor, camera: Camera, *, detached: bool
     ) -> dict[str, Any]:
-        features = splatted.features
+        features, layout = splatted.features, splatted.layout
         pixels, metal, levels = features.flatten(0, 1), None, []
-        if self._shows_metals(splatted):
-            first, local = self._first_of_metals, 7 if self.local else -1
+        if "metal" in layout:
+            first, local = layout.first("metal"), layout.first("local")
             metal = MetalArguments(where_metal(pixels, first), first, local, MINIMUM_SHARE, BLUR)
             levels = metal_mips(self.radiance(texels))
         found = reflect_native(
@@ -363,8 +352,8 @@ class DeferredShading(ShadingModel):
             fresnel=self.blend == "fresnel",
             local=self.local,
             refractive_index=self.refractive_index,
-            index=self._index_channel(splatted),
-            held=held,
+            index=layout.first("index"),
+            detached=detached,
             metal=metal,
             levels=levels,
         )
@@ -373,12 +362,12 @@ class DeferredShading(ShadingModel):
             "specular",
             "diffuse",
             "reflection",
-            *(("held specular", "held diffuse") if held else ()),
+            *(("detached specular", "detached diffuse") if detached else ()),
         ]
         layers: dict[str, Any] = {
             name: layer.unflatten(0, features.shape[:2]) for name, layer in zip(names, found, strict=False)
         }
-        layers |= {"strength": features[..., 6], "index": self._index_picture(splatted)}
+        layers |= {"strength": splatted["strength"][..., 0], "index": self._index_picture(splatted)}
         if self.metal:
             shown = None if metal is None else MetalPixels(metal.pixels, *found[len(names) :])
             layers |= {"metalness": metalness_picture(shown, features), "metal": shown}

@@ -31,6 +31,7 @@ from polarguide.gaussians.harmonics import SH_C0
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
+    Channels,
     GBuffer,
     Light,
     PageShading,
@@ -158,29 +159,35 @@ class DirectionalShading(ShadingModel):
         out = torch.addmm(light["mlp_bias_2"], hidden, light["mlp_weight_2"])
         return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
-        """Albedo, or harmonics without a surface [N, 3]; then roughness, feature and ``surface`` together, [N, 6].
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
+        """Albedo, or harmonics without a surface, as ``color`` [N, 3]; ``roughness`` [N, 1], ``feature`` [N, 4] and
+        ``surface`` [N, 1].
 
         Without a surface the latter are 0.
         """
         surface = gaussians["surface"].detach()[:, None]
         colors = torch.where(surface > 0, albedo_of(gaussians), base_colors(gaussians, center, degree))
         roughness = torch.sigmoid(gaussians["roughness_logits"])[:, None]
-        lit = torch.cat((roughness, torch.tanh(gaussians["features"])), dim=1)
-        return [colors, torch.cat((surface * lit, surface), dim=1)]
+        feature = torch.tanh(gaussians["features"])
+        return {
+            "color": colors,
+            "roughness": surface * roughness,
+            "feature": surface * feature,
+            "surface": surface,
+        }
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the color that was splatted is the diffuse one."""
-        albedo, normal, further, alpha = splatted.color, splatted.normal, splatted.further, splatted.alpha
+        albedo, normal, alpha = splatted["color"], splatted["normal"], splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
         directions = mirrored(rays, unit(normal, 1e-3))
         radiance = self.radiance(
             light,
             directions.reshape(-1, 3),
-            further[..., 0].flatten(),
-            further[..., 1 : 1 + FEATURES].reshape(-1, FEATURES),
+            splatted["roughness"].flatten(),
+            splatted["feature"].reshape(-1, FEATURES),
         ).reshape(albedo.shape)
-        share = (further[..., 1 + FEATURES] / alpha.clamp(min=MINIMUM_ALPHA)).clamp(max=1)
+        share = (splatted["surface"][..., 0] / alpha.clamp(min=MINIMUM_ALPHA)).clamp(max=1)
         specular = radiance * (share * (alpha > MINIMUM_ALPHA))[..., None]
         return {"final": albedo + specular, "specular": specular, "diffuse": albedo}
 

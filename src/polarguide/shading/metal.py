@@ -22,6 +22,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.optics.conductor import LARGEST_REFLECTANCE
+from polarguide.shading.layout import Layout
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.vectors import dot, unit
 
@@ -30,7 +31,6 @@ LEAST = 0.2
 # Mip levels from a mirror to a roughness of 1.
 BLUR = 4.0
 FIRST_REFLECTANCE, FIRST_ROUGHNESS = 0.7, 0.3
-CHANNELS = 5
 # Pixels with less of a metal than this are shaded as dielectrics alone.
 MINIMUM_SHARE = 0.01
 
@@ -94,27 +94,27 @@ def where_metal(features: Tensor, first: int) -> Tensor:
 
 
 def metal_pixels(
-    features: Tensor, first: int, rays: Tensor, normal: Tensor, light: Tensor, local: int | None
+    features: Tensor, layout: Layout, rays: Tensor, normal: Tensor, light: Tensor
 ) -> MetalPixels:
     """Shade what shows metal: the reference implementation of what ``reflect_native`` does of metals.
 
     Args:
-        features: [P, C] blended. first: of its channels the one where ``metal_channels`` begin.
+        features: [P, C] blended. layout: of its channels: ``metal`` as of ``metal_channels``, and ``local`` if
+            Gaussians have light of their own.
         rays: [P, 3] unit, world. normal: [P, 3] blended, world.
         light: [6, R, R, 3] radiance from afar.
-        local: the channel where the three of the light of the Gaussians' own begin; None: there is none.
     """
-    pixels = where_metal(features, first)
+    pixels = where_metal(features, layout.first("metal"))
     # All channels at once: each part taken by itself would send back a picture of all of them.
     shown, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
-    metal = shown[:, first : first + CHANNELS]
+    metal = shown[:, layout.channels("metal")]
     share = metal[:, 3]
     along = dot(rays, facing)[:, None]
     inverse = 1 / share.clamp(min=MINIMUM_SHARE)
     level = BLUR * metal[:, 4] * inverse
     seen = mip_lookup(metal_mips(light), (rays - 2 * along * facing).contiguous(), level)
-    if local is not None:
-        seen = (seen + shown[:, local : local + 3]).clamp(min=0)
+    if "local" in layout:
+        seen = (seen + shown[:, layout.channels("local")]).clamp(min=0)
     reflectances = metal[:, :3] * inverse[:, None]
     mean, slope = optics.conductor(-along, reflectances)
     return MetalPixels(pixels, share.detach(), share[:, None] * mean * seen, slope)

@@ -6,10 +6,10 @@ reflected, so that a new model is one new class, and nothing else changes.
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -20,14 +20,17 @@ from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.harmonics import evaluate_sh
+from polarguide.shading.layout import Layout
 from polarguide.shading.metal import MetalPixels, metal_stokes
-from polarguide.shading.result import HeldLayers, RenderResult
+from polarguide.shading.result import DetachedLayers, RenderResult
 from polarguide.vectors import dot
 
 # Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
 MAXIMUM_LOG_LIGHT = 5.0
 PLAIN_LAYERS = ("final", "normal", "depth", "alpha")
 
+Channels = dict[str, Tensor]
+"""Channels [N, C] of Gaussians by name, of a shading model."""
 Light = Mapping[str, Tensor]
 """The learned light of a shading model: its parameters by name."""
 
@@ -63,46 +66,41 @@ class ChannelParameters(NamedTuple):
         strength_logits: [N] raw reflection strength.
         light_dc, light_rest: [N, 3] and [N, 15, 3] harmonics of the mirrored direction: light of the Gaussians' own.
         metalness: [N] 1 of those without color and strength, else 0; without a gradient.
-        further: [N, K] channels behind these, as they are.
+        further: channels behind these by name, each [N, C], as they are.
     """
 
     strength_logits: Tensor | None = None
     light_dc: Tensor | None = None
     light_rest: Tensor | None = None
     metalness: Tensor | None = None
-    further: Tensor | None = None
+    further: Mapping[str, Tensor] = MappingProxyType({})
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Number of the channels by name, in order."""
+        own = {} if self.strength_logits is None else {"strength": 1}
+        local = {} if self.light_dc is None else {"local": 3}
+        return {**own, **local, **{name: values.shape[1] for name, values in self.further.items()}}
 
 
-class GBuffer(NamedTuple):
-    """What was splatted for a picture that is shaded afterwards.
+@dataclass(frozen=True, eq=False)
+class GBuffer:
+    """What was splatted for a picture that is shaded afterwards; ``splatted["strength"]`` are channels by name.
 
     Attributes:
-        features: [H, W, 6 + K] blended color, normal (world axes) and channels of the shading model; others may
-            follow.
+        features: [H, W, D] all channels, blended: ``color``, ``normal`` (world axes, not normalized), and others.
         alpha: [H, W].
+        layout: which channels are what.
         metal: what metals add to the picture, where that is known before; None: not yet.
-        depth: whether the last channel is the depth.
     """
 
     features: Tensor
     alpha: Tensor
+    layout: Layout
     metal: MetalPixels | None = None
-    depth: bool = False
 
-    @property
-    def color(self) -> Tensor:
-        """[H, W, 3]."""
-        return self.features[..., :3]
-
-    @property
-    def normal(self) -> Tensor:
-        """[H, W, 3] blended, world axes, not normalized."""
-        return self.features[..., 3:6]
-
-    @property
-    def further(self) -> Tensor:
-        """[H, W, K] channels of the shading model."""
-        return self.features[..., 6:]
+    def __getitem__(self, name: str) -> Tensor:
+        return self.features[..., self.layout.channels(name)]
 
 
 class RadianceCubemap(NamedTuple):
@@ -167,11 +165,11 @@ class ShadingModel(ABC):
         """
         if not refractive_index > 1:
             raise ValueError(f"refractive index: expected more than 1, found {refractive_index}")
-        return dataclasses.replace(self, refractive_index=refractive_index)
+        return replace(self, refractive_index=refractive_index)
 
     def data(self) -> dict[str, Any]:
         """The class's name and all fields of the recipe, for a run's folder; plain JSON values."""
-        values = dataclasses.asdict(self)
+        values = asdict(self)
         del values["refractive_index"]
         return {"model": type(self).__name__, **values}
 
@@ -263,8 +261,8 @@ class ShadingModel(ABC):
         return "specular" in self.layers
 
     @abstractmethod
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
-        """Per Gaussian: colors [N, 3], then what is blended behind color and normal, each [N, C].
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
+        """Per Gaussian by name: ``color`` [N, 3], and what else is blended, each [N, C]; not ``normal`` or ``depth``.
 
         Args:
             normals: [N, 3] unit, world axes. center: [3] of the camera. degree: of the base color's harmonics, 0 to 3.
@@ -278,18 +276,18 @@ class ShadingModel(ABC):
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
         """Layers of a picture by their names in ``RenderResult``; ``final`` at least. And ``metal``, where there is."""
 
-    def shade_held(
+    def shade_detached(
         self, splatted: GBuffer, light: Light, camera: Camera
-    ) -> tuple[dict[str, Any], HeldLayers | None]:
+    ) -> tuple[dict[str, Any], DetachedLayers | None]:
         """``shade``, and if it reflects ``specular`` and ``diffuse`` again, without a gradient on the normals but by
         what metals mirror, and those metals.
         """
-        layers, features = self.shade(splatted, light, camera), splatted.features
+        layers = self.shade(splatted, light, camera)
         if "specular" not in layers:
             return layers, None
-        parts = features[..., :3], features[..., 3:6].detach(), features[..., 6:]
-        held = GBuffer(torch.cat(parts, dim=-1), splatted.alpha, layers.get("metal"), splatted.depth)
-        again = self.shade(held, light, camera)
+        parts = [splatted[name].detach() if name == "normal" else splatted[name] for name in splatted.layout]
+        features = torch.cat(parts, dim=-1)
+        again = self.shade(replace(splatted, features=features, metal=layers.get("metal")), light, camera)
         return layers, (again["specular"], again["diffuse"], again.get("metal"))
 
     @property
@@ -362,9 +360,9 @@ class PlainShading(ShadingModel):
         """Without reflection there is one color."""
         return PLAIN_LAYERS
 
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> list[Tensor]:
+    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
         """Base color [N, 3]."""
-        return [base_colors(gaussians, center, degree)]
+        return {"color": base_colors(gaussians, center, degree)}
 
     def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
         """Nothing but the color; None for a class with other channels."""
@@ -372,7 +370,7 @@ class PlainShading(ShadingModel):
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final`` [H, W, 3]."""
-        return {"final": splatted.color}
+        return {"final": splatted["color"]}
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Base colors [N, 3]; see ``ShadingModel``."""

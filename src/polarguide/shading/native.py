@@ -46,7 +46,7 @@ class _Reflect(torch.autograd.Function):
         local: bool,
         ior: float,
         index: int,
-        held: bool,
+        detached: bool,
         metal: MetalArguments | None,
         *levels: Tensor,
     ) -> tuple[Tensor, ...]:
@@ -72,7 +72,7 @@ class _Reflect(torch.autograd.Function):
             ctx.mark_non_differentiable(share)
             found = [share, reflected, slope]
         ctx.save_for_backward(features, rays, texels, directions, seen, *kept)
-        again = [layers[1].clone(), layers[2].clone()] if held else []
+        again = [layers[1].clone(), layers[2].clone()] if detached else []
         return (*layers, *again, *found)
 
     @staticmethod
@@ -84,7 +84,7 @@ class _Reflect(torch.autograd.Function):
         to_layers = contiguous if ctx.metal is None else contiguous[:-3]
         to_layers += [None] * (6 - len(to_layers))
         to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
-        # What comes by the held layers goes to the texels, and not by way of the directions to the normals.
+        # What comes by the detached layers goes to the texels, and not by way of the directions to the normals.
         held = to_layers[4] is not None or to_layers[5] is not None
         to_look_up = torch.empty_like(seen) if held else None
         given: list[Any] = [features, rays, seen, *ctx.model, *to_layers, to_seen, to_look_up, to_features]
@@ -127,7 +127,7 @@ def reflect_native(
     local: bool,
     refractive_index: float,
     index: int = -1,
-    held: bool = False,
+    detached: bool = False,
     metal: MetalArguments | None = None,
     levels: Sequence[Tensor] = (),
 ) -> tuple[Tensor, ...]:
@@ -140,12 +140,12 @@ def reflect_native(
         local: whether channels 7 to 9 are light that is added to the environment's.
         refractive_index: of Fresnel's weight. index: the channel of what is added to it, without a gradient; -1: there
             is none.
-        held: also ``specular`` and ``diffuse`` once more, without a gradient on the normals but for that of metals.
+        detached: also ``specular`` and ``diffuse`` once more, without a gradient on the normals but for that of metals.
         metal: where there is some; it is added to ``final`` and ``specular``. levels: of light that it mirrors.
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features, texels and
-        levels, with ``held`` the two that are held, and with ``metal`` its share [K], not differentiable, what it
+        levels, with ``detached`` the detached two, and with ``metal`` its share [K], not differentiable, what it
         reflects [K, 3] and its degree of polarization over ``sin^2(zenith)`` [K, 3]; the same bits for any number of
         threads.
 
@@ -153,7 +153,7 @@ def reflect_native(
         ValueError: if a shape is not as above.
     """
     layers: tuple[Tensor, ...] = applied(
-        _Reflect, features, rays, texels, fresnel, local, refractive_index, index, held, metal, *levels
+        _Reflect, features, rays, texels, fresnel, local, refractive_index, index, detached, metal, *levels
     )
     return layers
 

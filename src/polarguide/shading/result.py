@@ -25,7 +25,7 @@ LAYERS = (
 """The pictures in a ``RenderResult``, by name."""
 
 
-HeldLayers = tuple[Tensor, Tensor, MetalPixels | None]
+DetachedLayers = tuple[Tensor, Tensor, MetalPixels | None]
 """``specular``, ``diffuse`` and ``metal`` of a result, without a gradient on the normals."""
 
 
@@ -47,10 +47,10 @@ class RenderResult:
             around the median.
         alpha: [H, W] in [0, 1].
         radii: [N] pixels, of the projected Gaussians; 0 where culled; None where there are no Gaussians.
-        held: ``specular``, ``diffuse`` and ``metal`` once more, without a gradient on the normals; None where not asked
-            for.
-        still_normal: the blended normal once more, with a gradient that turns Gaussians and neither moves nor fades
-            them; None where not asked for.
+        detached_layers: ``specular``, ``diffuse`` and ``metal`` once more, without a gradient on the normals; None
+            where not asked for.
+        rotation_only_normal: the blended normal once more, with a gradient that rotates Gaussians, but neither moves
+            them nor changes their opacity; None where not asked for.
         metal: what metals add to ``specular``; None where there is none.
         index: [H, W] refractive index of each pixel, without a gradient; None: that of the run everywhere.
         blended_normal: the blended normal, where ``normal`` is that of the surface.
@@ -66,8 +66,8 @@ class RenderResult:
     depth: Tensor | None
     alpha: Tensor
     radii: Tensor | None = None
-    held: HeldLayers | None = None
-    still_normal: Tensor | None = None
+    detached_layers: DetachedLayers | None = None
+    rotation_only_normal: Tensor | None = None
     metal: MetalPixels | None = None
     metalness: Tensor | None = None
     index: Tensor | None = None
@@ -79,14 +79,14 @@ class RenderResult:
         return self.normal if self.blended_normal is None else self.blended_normal
 
     def to(self, device: torch.device | str) -> RenderResult:
-        """The same on a device, but for ``held``; nothing is copied that is there already."""
+        """The same on a device, but for ``detached_layers``; nothing is copied that is there already."""
         layers = {field.name: getattr(self, field.name) for field in fields(self)}
         moved: dict[str, Any] = {name: t.to(device) for name, t in layers.items() if isinstance(t, Tensor)}
         metal = None if self.metal is None else type(self.metal)(*(t.to(device) for t in self.metal))
-        return replace(self, held=None, metal=metal, **moved)
+        return replace(self, detached_layers=None, metal=metal, **moved)
 
     def resized(self, width: int, height: int) -> RenderResult:
-        """The pictures in another size, each pixel that of the nearest place; without ``held`` and ``radii``."""
+        """The pictures in another size, each pixel that of the nearest place; nothing else is kept."""
         found: dict[str, Any] = {}
         for name in LAYERS:
             if (layer := getattr(self, name)) is not None:
@@ -96,6 +96,6 @@ class RenderResult:
                 )
                 found[name] = layer[rows][:, columns]
         bare: dict[str, Any] = dict.fromkeys(
-            ("held", "still_normal", "radii", "metal", "index", "blended_normal")
+            ("detached_layers", "rotation_only_normal", "radii", "metal", "index", "blended_normal")
         )
         return replace(self, **bare, **found)

@@ -6,6 +6,7 @@ On the CPU in float32 one native pass each way does what a shading model describ
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -17,6 +18,7 @@ from polarguide.camera import Camera
 from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
 from polarguide.native import applied, fits
 from polarguide.raster.interface import Splats
+from polarguide.shading.layout import Layout
 from polarguide.shading.model import Parameters, ShadingModel
 
 
@@ -40,8 +42,8 @@ def splatting(
     sh_degree: int,
     normals: bool,
     depth: bool,
-) -> Splats:
-    """Gaussians as a rasterizer takes them, with what a shading model splats.
+) -> tuple[Splats, Layout]:
+    """Gaussians as a rasterizer takes them, with what a shading model splats, and which feature is what.
 
     Features are its color [N, 3], with ``normals`` unit normals (``shortest_axis_normals``) in world axes [N, 3], its
     further channels, and with ``depth`` the camera depth [N, 1] at last.
@@ -59,14 +61,15 @@ def splatting(
     described = shading.channel_parameters(gaussians)
     core = [gaussians[name] for name in _CORE]
     outward = gaussians.get("outward") if normals else None
-    if described is None or not fits(*core, outward, *described):
+    if described is None or not fits(*core, outward, *described[:-1], *described.further.values()):
         return splatting_reference(
             gaussians, camera, shading, sh_degree=sh_degree, normals=normals, depth=depth
         )
     pose = camera.pose(torch.float32, core[0].device)
     forward = pose.rotation[2].contiguous() if depth else None
     settings = _Settings(sh_degree, pose.center.contiguous(), forward, normals)
-    return Splats(*applied(_Splatting, settings, *core, outward, *described))
+    given = applied(_Splatting, settings, *core, outward, *described[:-1], _joined(described.further))
+    return Splats(*given), Layout(_widths(described.widths, normals=normals, depth=depth))
 
 
 def splatting_reference(
@@ -77,7 +80,7 @@ def splatting_reference(
     sh_degree: int,
     normals: bool,
     depth: bool,
-) -> Splats:
+) -> tuple[Splats, Layout]:
     """The reference implementation of ``splatting``: plain torch around the model's channels, any dtype and device."""
     means = gaussians["means"]
     pose = camera.pose(means.dtype, means.device)
@@ -86,11 +89,20 @@ def splatting_reference(
         axes = shortest_axis_normals(*shape, pose.center, gaussians.get("outward"))
     else:
         axes = means.new_empty(len(means), 0)
-    channels = shading.channels(gaussians, axes, pose.center, sh_degree)
-    channels.insert(1, axes)
-    if depth:
-        channels.append(((means - pose.center) @ pose.rotation[2])[:, None])
-    return splats(gaussians, torch.cat(channels, dim=1))
+    own = shading.channels(gaussians, axes, pose.center, sh_degree)
+    widths = _widths({name: t.shape[1] for name, t in own.items()}, normals=normals, depth=depth)
+    own |= {"normal": axes, "depth": ((means - pose.center) @ pose.rotation[2])[:, None]}
+    return splats(gaussians, torch.cat([own[name] for name in widths], dim=1)), Layout(widths)
+
+
+def _widths(own: Mapping[str, int], *, normals: bool, depth: bool) -> dict[str, int]:
+    """Numbers of all channels, given those of the shading model, which begin with the color."""
+    first, last = {"color": 3, **({"normal": 3} if normals else {})}, {"depth": 1} if depth else {}
+    return {**first, **{name: width for name, width in own.items() if name != "color"}, **last}
+
+
+def _joined(further: Mapping[str, Tensor]) -> Tensor | None:
+    return torch.cat([*further.values()], dim=1) if further else None
 
 
 _CORE = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")

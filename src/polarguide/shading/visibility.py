@@ -11,7 +11,7 @@ from torch import Tensor
 from polarguide.camera import Camera, seen_at
 from polarguide.capture import View
 from polarguide.raster import Rasterize
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import Parameters
 from polarguide.shading.splatting import splats
 from polarguide.vectors import unit
@@ -20,6 +20,7 @@ from polarguide.vectors import unit
 DEPTH_SLACK = 0.02
 # Pixels that a Gaussian has to fill, counted by its blending weights, to add to a picture.
 LEAST_PIXELS = 0.05
+DEPTH_ALONE = RenderRequest(sh_degree=0, normals=False, depth=True)
 
 
 @torch.no_grad()
@@ -38,7 +39,7 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
     total = torch.zeros_like(means)
     for view in views:
         camera = view.camera
-        depth = render(gaussians, camera, rasterize, sh_degree=0, normals=False, depth=True).depth
+        depth = render(gaussians, camera, rasterize, DEPTH_ALONE).depth
         assert depth is not None
         center = camera.pose(means.dtype, means.device).center
         pixel, z, inside = seen_at(means - center, camera)

@@ -18,17 +18,17 @@ def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult
     as the farthest of its 3 x 3 neighbors, since the normals of the depth look at these.
 
     Args:
-        result: with ``normal``, ``still_normal`` and ``depth``.
+        result: with ``normal``, ``rotation_only_normal`` and ``depth``.
         near, far: camera depths, 0 < near < far.
     """
     assert result.normal is not None
-    assert result.still_normal is not None
+    assert result.rotation_only_normal is not None
     assert result.depth is not None
     held = result.depth.detach()
     share = shares_before(held, near, far)
     return replace(
         result,
-        normal=result.still_normal.lerp(result.normal, share[..., None]),
+        normal=result.rotation_only_normal.lerp(result.normal, share[..., None]),
         depth=held.lerp(result.depth, share),
     )
 

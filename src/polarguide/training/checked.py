@@ -11,8 +11,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from polarguide.training.polarizers import COLUMNS
 from polarguide.training.recipe import Recipe
+from polarguide.training.state import ANGLE_COLUMNS
 
 LARGEST = {"means": 1e12, "log_scales": 1e4}
 LARGEST_VALUE = 1e8
@@ -129,9 +129,14 @@ def _check_statistics(tensors: Mapping[str, Tensor], count: int) -> None:
 
 def _check_angles(values: Tensor) -> None:
     """Check what was found of polarizers: rows of a float64 table, as ``Polarizers`` leaves it."""
-    if values.dtype != torch.float64 or values.ndim != 3 or values.shape[2] != COLUMNS or not len(values):
+    if (
+        values.dtype != torch.float64
+        or values.ndim != 3
+        or values.shape[2] != ANGLE_COLUMNS
+        or not len(values)
+    ):
         raise ValueError(
-            f"angles of shape {list(values.shape)}, {values.dtype}, not [F, P, {COLUMNS}], torch.float64"
+            f"angles of shape {list(values.shape)}, {values.dtype}, not [F, P, {ANGLE_COLUMNS}], torch.float64"
         )
     if not bool(torch.isfinite(values).all()) or (values.numel() and float(values.min()) < 0):
         raise ValueError("angles with values that are negative or not finite")

@@ -1,140 +1,151 @@
-"""What a step reads of the views: photographs as shown, and priors, on the backend's device and kept between steps."""
+"""The targets of training views: made when a step first needs them, kept between steps on the backend's device."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from polarguide.capture import View
 from polarguide.capture.background import empty_pixels
+from polarguide.capture.smaller import SmallerViews
 from polarguide.color import srgb_encode
 from polarguide.raster import Backend
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.flat import Flat, flat_surfaces
 from polarguide.training.indices import index_picture
+from polarguide.training.losses import Weights
 from polarguide.training.metals.looks import metalness_share
 from polarguide.training.packing import (
     Entry,
     Packed,
-    fields_read,
     holds,
     pack_priors,
     packed,
     unpack_priors,
     unpacked,
 )
-from polarguide.training.partial import PartialView
-from polarguide.training.priors import Unguided, ViewPriors, unguided, view_priors
-from polarguide.training.recipe import Priors, Stage
+from polarguide.training.priors import Unguided, unguided, view_priors
+from polarguide.training.recipe import Recipe
+from polarguide.training.targets import PartialView, StepTargets, ViewPriors
 from polarguide.training.view_store import ViewStore
 
-
-class Shown(NamedTuple):
-    """A training view's photograph [H, W, 3] as shown, 1 where it counts [H, W] (None: everywhere), and 1 where it
-    shows nothing [H, W] (None: where that is not known). And what was measured where that does not determine the
-    Stokes vector.
-    """
-
-    picture: Tensor
-    valid: Tensor | None
-    empty: Tensor | None
-    partial: PartialView | None
+KINDS = ("photograph", "unguided", "priors")
+"""What is kept of a view."""
 
 
 class Feed:
-    """Photographs and priors of the views that a training asks for.
+    """The training views at the size of a step, and what their renderings are compared with.
+
+    Where the capture's pictures are large, the first steps look at smaller ones, as the recipe says.
 
     Args:
-        backend: device and rasterizer. priors: the recipe's. index: of refraction.
+        backend: device and rasterizer. recipe: the method. index: of refraction.
+        store: keeps what is computed of the views. views: that are trained on. steps: of the training.
         black: whether nothing is behind the subject.
-        store: keeps what is computed of the views. views: that are trained on.
-        label: of what is kept; views of another size have another.
         memory: gives back what was freed before and after the priors of a view are made.
     """
 
     def __init__(
         self,
         backend: Backend,
-        priors: Priors,
+        recipe: Recipe,
         index: float,
         store: ViewStore,
         views: Sequence[View],
+        steps: int,
         *,
         black: bool,
-        label: str = "",
         memory: MemoryBound = UNBOUNDED,
     ) -> None:
-        self._backend, self._settings, self._index, self._black = backend, priors, index, black
-        self._store, self._views, self._memory = store, views, memory
-        self._shown, self._unguided, self._priors = (label + kind for kind in ("shown", "unguided", "priors"))
-        self._flat: dict[str, Flat] | None = None
-        self._partial: dict[str, PartialView] = {}
+        self._backend, self._settings, self._index, self._black = backend, recipe.priors, index, black
+        self._store, self._memory, self._until = store, memory, coarse_steps(recipe, views, steps)
+        small = SmallerViews(views, recipe.coarse.factor) if self._until else views
+        self._views = {"small ": small, "": views}
+        self._flat: dict[str, dict[str, Flat]] = {}
+        self._partial: dict[tuple[str, str], PartialView] = {}
+
+    def _size(self, step: int) -> str:
+        """Prefix of what is kept for a step."""
+        return "small " if step < self._until else ""
+
+    def views(self, step: int) -> Sequence[View]:
+        """The views of a step."""
+        return self._views[self._size(step)]
 
     def forget(self, names: Collection[str]) -> None:
-        """What is believed of these views has changed."""
-        for name in names:
-            self._partial.pop(name, None)
-            for kind in (self._shown, self._unguided, self._priors):
-                self._store.drop(kind, name)
-
-    def clear(self) -> None:
-        """Forget everything; it is made again where it is asked for."""
-        self._partial.clear()
-        for kind in (self._shown, self._unguided, self._priors):
-            self._store.drop(kind)
+        """Make the targets of these views anew: their exposures have changed."""
+        for size, name in itertools.product(self._views, names):
+            self._partial.pop((size, name), None)
+            for kind in KINDS:
+                self._store.drop(size + kind, name)
 
     def refresh_priors(self) -> None:
-        """There is another guide."""
-        self._store.drop(self._priors)
+        """Make the priors of all views anew: there is another guide."""
+        for size in self._views:
+            self._store.drop(size + "priors")
 
-    def shown(self, view: View) -> Shown:
-        """The photograph of a view."""
-
-        def make() -> Entry:
-            device = self._backend.device
-            entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
-            if bool(view.invalid.any()):
-                entry["valid"] = Packed((~view.invalid).to(device))
-            if self._black:
-                entry["empty"] = Packed(empty_pixels(view).to(device))
-            return entry
-
-        kept = self._store.get(self._shown, view.name, make)
-        valid, empty = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
-        if view.is_determined:
-            return Shown(unpacked(kept["picture"]), valid, empty, None)
-        if view.name not in self._partial:
-            self._partial[view.name] = PartialView.of(view, self._backend.device)
-        partial = self._partial[view.name]
-        return Shown(partial.shown, valid, empty, partial)
-
-    def priors(self, view: View, stage: Stage, guide: Mapping[str, Tensor]) -> ViewPriors:
-        """The priors of a view that determines its Stokes vectors.
+    def targets(
+        self, step: int, view: View, weights: Weights, guide: Mapping[str, Tensor] | None
+    ) -> StepTargets:
+        """What a step compares the rendering of one of its views with.
 
         Args:
-            guide: Gaussians whose normals resolve what polarization leaves open.
+            weights: of the stage, which say what its terms read.
+            guide: Gaussians whose normals resolve what polarization leaves open; needed where a term reads priors.
         """
-        fields = fields_read(stage.weights)
+        size, priors = self._size(step), None
+        if step == self._until:  # what was kept of smaller pictures goes
+            self._partial = {key: kept for key, kept in self._partial.items() if key[0] == size}
+            for kind in KINDS:
+                self._store.drop("small " + kind)
+        if weights.priors and view.is_determined:
+            assert guide is not None
+            priors = self._priors(size, view, weights.fields_read, guide)
+        kept = self._store.get(size + "photograph", view.name, lambda: self._photograph(view))
+        valid, empty = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
+        if view.is_determined:
+            return StepTargets(view.camera, unpacked(kept["picture"]), valid, empty, priors=priors)
+        if (size, view.name) not in self._partial:
+            self._partial[size, view.name] = PartialView.of(view, self._backend.device)
+        partial = self._partial[size, view.name]
+        return StepTargets(view.camera, partial.shown, valid, empty, partial)
+
+    def _photograph(self, view: View) -> Entry:
+        """The photograph as displayed, where it counts, and where it shows nothing."""
+        device = self._backend.device
+        entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
+        if bool(view.invalid.any()):
+            entry["valid"] = Packed((~view.invalid).to(device))
+        if self._black:
+            entry["empty"] = Packed(empty_pixels(view).to(device))
+        return entry
+
+    def _priors(
+        self, size: str, view: View, fields: frozenset[str], guide: Mapping[str, Tensor]
+    ) -> ViewPriors:
+        """The fields of the priors of a view that determines its Stokes vectors."""
 
         def make() -> Entry:
             self._memory.clear()
-            entry = self._new_priors(view, fields, guide)
+            entry = self._new_priors(size, view, fields, guide)
             self._memory.clear()  # before there is a picture, which takes memory, too
             return entry
 
-        entry = self._store.get(self._priors, view.name, make)
+        entry = self._store.get(size + "priors", view.name, make)
         if not holds(entry, fields):  # the stage reads more than the one before
-            self._store.drop(self._priors, view.name)
-            entry = self._store.get(self._priors, view.name, make)
+            self._store.drop(size + "priors", view.name)
+            entry = self._store.get(size + "priors", view.name, make)
         return unpack_priors(entry, view.camera, self._settings)
 
-    def _new_priors(self, view: View, fields: frozenset[str], frozen: Mapping[str, Tensor]) -> Entry:
+    def _new_priors(
+        self, size: str, view: View, fields: frozenset[str], frozen: Mapping[str, Tensor]
+    ) -> Entry:
         with torch.no_grad():
-            guide = render(frozen, view.camera, self._backend.rasterize, sh_degree=0).normal
+            guide = render(frozen, view.camera, self._backend.rasterize, RenderRequest(sh_degree=0)).normal
         assert guide is not None
         metal = metalness_share(frozen, view.camera, self._backend.rasterize)
 
@@ -143,18 +154,24 @@ class Feed:
             return {name: Packed(values) for name, values in found.items() if values is not None}
 
         # It can be had again for a part of the work, so that it is not worth a file.
-        kept = self._store.get(self._unguided, view.name, make, disposable=True)
+        kept = self._store.get(size + "unguided", view.name, make, disposable=True)
         known = Unguided(**{name: part.codes for name, part in kept.items()})
-        flat = self._flat_surfaces().get(view.name)
+        flat = self._flat_surfaces(size).get(view.name)
         own = index_picture(frozen, view.camera, self._backend.rasterize, self._index)
         index = self._index if own is None else own
         return pack_priors(view_priors(view, guide, self._settings, index, known, metal, flat), fields)
 
-    def _flat_surfaces(self) -> dict[str, Flat]:
-        """Flat surfaces of all views, found when the first priors are asked for."""
-        if self._flat is None:
-            views = self._views if self._settings.flat else ()
+    def _flat_surfaces(self, size: str) -> dict[str, Flat]:
+        """Flat surfaces of all views, found when the first priors are needed."""
+        if size not in self._flat:
+            views = self._views[size] if self._settings.flat else ()
             # On the CPU, so that it is the same wherever one trains.
             found = flat_surfaces(self._memory.between(views), self._index, self._settings.flat_rules)
-            self._flat = {name: flat.to(self._backend.device) for name, flat in found.items()}
-        return self._flat
+            self._flat[size] = {name: flat.to(self._backend.device) for name, flat in found.items()}
+        return self._flat[size]
+
+
+def coarse_steps(recipe: Recipe, views: Sequence[View], steps: int) -> int:
+    """Steps at the beginning that look at smaller pictures; 0 where those of the capture are small."""
+    most = max((view.camera.width * view.camera.height for view in views), default=0)
+    return round(recipe.coarse.share * steps) if most > recipe.coarse.pixels else 0

@@ -1,8 +1,13 @@
-"""The loss of one step: each term a small function, summed by a stage's weights."""
+"""The loss of one step: its terms, what each of them reads, and their weighted sum.
+
+A new term is a field of ``Weights``, which says what has to be rendered and which targets are read, and a function in
+``TERMS``.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -24,14 +29,89 @@ from polarguide.training.native_terms import (
     Terms,
     pixel_terms,
 )
-from polarguide.training.partial import PartialView, partial_terms
+from polarguide.training.partial import partial_terms
 from polarguide.training.photometric import photometric_loss, photometric_terms
-from polarguide.training.priors import ViewPriors
-from polarguide.training.recipe import Weights
+from polarguide.training.targets import Step, ViewPriors
 from polarguide.vectors import dot, unit
 
 # Weight of ``coverage_loss``.
 COVERAGE = 0.1
+
+
+def term(*priors: str, rendered: tuple[str, ...] = (), optional: bool = False, default: float = 0.0) -> float:
+    """A weight, with what its term reads.
+
+    Args:
+        priors: fields of ``ViewPriors``; a view without them is not compared.
+        rendered: "normal", "depth" or "layers", if the term reads these.
+        optional: the term also counts in views without ``priors``.
+        default: weight of stages that do not give one.
+    """
+    reads = {"priors": frozenset(priors), "rendered": rendered, "optional": optional}
+    weight: float = field(default=default, metadata=reads)
+    return weight
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the loss terms; a term with weight 0 is not computed.
+
+    Attributes:
+        photometric: final picture against S0/2.
+        specular, diffuse: the two contributions against the separated pictures.
+        normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
+        azimuth: distance of the normal from the plane of incidence that the AoLP gives (azimuth alone).
+        chromatic: 1 - cosine with the normal from color differences, where these decide one.
+        stokes: S1 and S2 that the layers and the normal predict against the measured ones.
+        flatness: shortest scale of the Gaussians, in percent of the scene's extent.
+        consistency: alpha - cosine of the blended normal with that of the rendered depth.
+    """
+
+    photometric: float = term(default=1.0)
+    specular: float = term("specular", "separated", rendered=("layers",))
+    diffuse: float = term("diffuse", "separated", rendered=("layers",))
+    normal: float = term("normal", "candidates", "weight", rendered=("normal",))
+    azimuth: float = term("plane", "weight", rendered=("normal",))
+    chromatic: float = term("chromatic", "chromatic_weight", rendered=("normal",))
+    stokes: float = term("stokes", "stokes_weight", rendered=("normal", "layers"))
+    flatness: float = term()
+    consistency: float = term("surface", rendered=("normal", "depth"), optional=True)
+
+    @property
+    def priors(self) -> bool:
+        """Whether a term needs the priors of a view."""
+        return any(use.metadata["priors"] and not use.metadata["optional"] for use in self._used())
+
+    @property
+    def normals(self) -> bool:
+        """Whether a term reads the rendered normals."""
+        return self._read("normal")
+
+    @property
+    def depth(self) -> bool:
+        """Whether a term reads the rendered depth."""
+        return self._read("depth")
+
+    @property
+    def layers(self) -> bool:
+        """Whether a term reads the rendered layers one by one."""
+        return self._read("layers")
+
+    @property
+    def fields_read(self) -> frozenset[str]:
+        """The fields of ``ViewPriors`` that the terms read."""
+        return frozenset().union(*(use.metadata["priors"] for use in self._used()))
+
+    @classmethod
+    def known_priors(cls) -> frozenset[str]:
+        """The fields of ``ViewPriors`` that any term reads."""
+        return frozenset().union(*(weight.metadata["priors"] for weight in fields(cls)))
+
+    def _used(self) -> list[Field[Any]]:
+        return [weight for weight in fields(self) if getattr(self, weight.name)]
+
+    def _read(self, rendered: str) -> bool:
+        return any(rendered in use.metadata["rendered"] for use in self._used())
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
@@ -191,65 +271,6 @@ class StepLoss(NamedTuple):
     error: Tensor
 
 
-def step_loss(
-    result: RenderResult,
-    shown: Tensor,
-    valid: Tensor | None,
-    weights: Weights,
-    priors: ViewPriors | None,
-    *,
-    ssim_weight: float,
-    shading: ShadingModel,
-    log_scales: Tensor,
-    extent: float,
-    camera: Camera | None = None,
-    empty: Tensor | None = None,
-    partial: PartialView | None = None,
-) -> StepLoss:
-    """The weighted sum of a stage's terms, and how far the picture is from the photograph.
-
-    Args:
-        result: the rendered layers.
-        shown: [H, W, 3] the photograph as shown (sRGB).
-        valid: [H, W] 1 where the photograph counts; None: everywhere.
-        weights: of the stage.
-        priors: of the view; needed where a weight asks for them.
-        ssim_weight: lambda of the image terms.
-        shading: of the stage, for the run's refractive index.
-        log_scales: [N, 3] of the Gaussians. extent: of the scene.
-        camera: of the view; needed where a weight asks for the normals of the depth.
-        empty: [H, W] 1 where the view shows nothing; None: where that is not known.
-        partial: what a view measured that does not determine the Stokes vector, in place of ``shown``.
-    """
-    if result.held is not None:
-        specular, diffuse, metal = result.held
-        result = replace(result, specular=specular, diffuse=diffuse, metal=metal)
-    if partial is None:
-        picture = photometric_terms(result.final, shown, valid, ssim_weight)
-        total = weights.photometric * picture.loss
-    else:
-        assert camera is not None
-        total, picture = partial_terms(
-            result,
-            partial,
-            weights,
-            valid=valid,
-            ssim_weight=ssim_weight,
-            shading=shading,
-            camera=camera,
-        )
-    if priors is not None:
-        total = total + _layer_terms(result, weights, priors, ssim_weight)
-    if weights.flatness and result.radii is not None:
-        total = total + weights.flatness * flatness_loss(log_scales, result.radii, extent)
-    total = total + normal_terms(result, weights, priors, camera, shading)
-    if empty is not None:
-        total = total + COVERAGE * coverage_loss(result.alpha, empty)
-    if total.device.type == "cpu":
-        refuse_diverged(total.detach())
-    return StepLoss(total, *picture)
-
-
 def refuse_diverged(total: Tensor) -> None:
     """Raise PolarguideError unless all of ``total`` is finite.
 
@@ -264,40 +285,46 @@ def refuse_diverged(total: Tensor) -> None:
         )
 
 
-def _layer_terms(result: RenderResult, weights: Weights, priors: ViewPriors, ssim_weight: float) -> Tensor:
+def layer_terms(step: Step, weights: Weights) -> Tensor | None:
     """The weighted sum of the terms that compare layers with the separated pictures."""
-    total = result.final.new_zeros(())
+    result, priors = step.result, step.targets.priors
+    if priors is None or not (weights.specular or weights.diffuse):
+        return None
+    total, separated_share = result.final.new_zeros(()), priors.separated.mean()
     for weight, layer, target in (
         (weights.specular, result.specular, priors.specular),
         (weights.diffuse, result.diffuse, priors.diffuse),
     ):
         if weight and layer is not None:
             # Over all pixels like the picture's own term, so that before nothing it does not outweigh it.
-            share = weight * priors.separated_share
-            total = total + share * photometric_loss(layer, target, priors.separated, ssim_weight)
+            share = weight * separated_share
+            total = total + share * photometric_loss(layer, target, priors.separated, step.ssim_weight)
     return total
 
 
-def normal_terms(
-    result: RenderResult,
-    weights: Weights,
-    priors: ViewPriors | None,
-    camera: Camera | None,
-    shading: ShadingModel,
-) -> Tensor:
+def flatness_term(step: Step, weights: Weights) -> Tensor | None:
+    """The weighted flatness of the Gaussians that are visible."""
+    if not weights.flatness or step.result.radii is None:
+        return None
+    return weights.flatness * flatness_loss(step.log_scales, step.result.radii, step.extent)
+
+
+def coverage_term(step: Step, weights: Weights) -> Tensor | None:
+    """The weighted alpha of the pixels that show nothing."""
+    empty = step.targets.empty
+    return None if empty is None else COVERAGE * coverage_loss(step.result.alpha, empty)
+
+
+def normal_terms(step: Step, weights: Weights) -> Tensor:
     """The weighted sum of the terms that read the rendered normal.
 
     On the CPU in float32 they are one native pass, but for the Stokes term of a shading model with a prediction of its
-    own. ``normal_terms_reference`` is the reference implementation.
-
-    Args:
-        result: the rendered layers. weights: of the stage.
-        priors: of the view; None: the terms that compare with them are left out.
-        camera: of the view; None: the consistency is left out.
-        shading: of the stage.
+    own. ``normal_terms_reference`` is the reference implementation. Of a view without priors, the consistency is the
+    only one.
     """
+    result, priors, shading = step.result, step.targets.priors, step.shading
     if not _native_fits(result, priors):
-        return normal_terms_reference(result, weights, priors, camera, shading)
+        return normal_terms_reference(step, weights)
     stokes, directions, consistency, beside = None, [], None, result.alpha.new_zeros(())
     if priors is not None:
         assert result.normal is not None
@@ -322,15 +349,11 @@ def normal_terms(
             measured, index = priors.stokes[1:], shading.refractive_index
             factor = weights.stokes / measured.numel()
             stokes = Polarization(measured, S1_AND_S2, priors.stokes_weight, factor, index, result.index)
-    if weights.consistency and camera is not None:
+    if weights.consistency:
         factor = weights.consistency / ((result.alpha.shape[0] - 2) * (result.alpha.shape[1] - 2))
         consistency = Consistency(None if priors is None else priors.surface, factor)
     terms = Terms(stokes, directions, consistency)
-    if not any(terms):
-        return beside
-    of = camera if priors is None else priors.camera
-    assert of is not None
-    return beside + pixel_terms(result, of, terms)
+    return beside + pixel_terms(result, step.targets.camera, terms) if any(terms) else beside
 
 
 def _native_fits(result: RenderResult, priors: ViewPriors | None) -> bool:
@@ -340,14 +363,9 @@ def _native_fits(result: RenderResult, priors: ViewPriors | None) -> bool:
     return result.normal is not None and min(result.alpha.shape) >= 3 and fits(*rendered, *compared)
 
 
-def normal_terms_reference(
-    result: RenderResult,
-    weights: Weights,
-    priors: ViewPriors | None,
-    camera: Camera | None,
-    shading: ShadingModel,
-) -> Tensor:
+def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
     """The reference implementation of ``normal_terms``: plain torch, any dtype and device."""
+    result, priors, shading = step.result, step.targets.priors, step.shading
     total = result.final.new_zeros(())
     if priors is not None:
         for weight, loss in (
@@ -359,8 +377,40 @@ def normal_terms_reference(
                 total = total + weight * loss(result.normal, priors)
         if weights.stokes and shading.reflects:
             total = total + weights.stokes * stokes_loss(result, priors, shading)
-    if weights.consistency and camera is not None:
-        total = total + weights.consistency * consistency_loss(
-            result, camera, None if priors is None else priors.surface
-        )
+    if weights.consistency:
+        surface = None if priors is None else priors.surface
+        total = total + weights.consistency * consistency_loss(result, step.targets.camera, surface)
     return total
+
+
+Term = Callable[[Step, Weights], Tensor | None]
+TERMS: tuple[Term, ...] = (layer_terms, flatness_term, normal_terms, coverage_term)
+"""The terms beside the photometric one, in the order in which they are added; each gives its weighted loss, or None
+where it has nothing to compare. One may stand for several weights that share a pass over the pixels.
+"""
+
+
+def step_loss(step: Step, weights: Weights) -> StepLoss:
+    """The weighted sum of a stage's terms, and how far the picture is from the photograph.
+
+    Args:
+        step: what the terms read; priors are needed where a weight asks for them. weights: of the stage.
+
+    Raises:
+        PolarguideError: the loss is not finite (on the CPU; see ``refuse_diverged``).
+    """
+    result, targets = step.result, step.targets
+    if result.detached_layers is not None:
+        specular, diffuse, metal = result.detached_layers
+        step = replace(step, result=replace(result, specular=specular, diffuse=diffuse, metal=metal))
+    if targets.partial is None:
+        picture = photometric_terms(result.final, targets.picture, targets.valid, step.ssim_weight)
+        total = weights.photometric * picture.loss
+    else:
+        total, picture = partial_terms(step, weights.photometric, weights.stokes)
+    for each in TERMS:
+        if (loss := each(step, weights)) is not None:
+            total = total + loss
+    if total.device.type == "cpu":
+        refuse_diverged(total.detach())
+    return StepLoss(total, *picture)

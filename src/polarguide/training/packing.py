@@ -14,24 +14,11 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.training.priors import ViewPriors
-from polarguide.training.recipe import Priors, Weights
+from polarguide.training.losses import Weights
+from polarguide.training.recipe import Priors
+from polarguide.training.targets import ViewPriors
 
 FULL = 32767
-
-# What each term of the loss reads of the priors.
-_READ = {
-    "specular": ("specular", "separated"),
-    "diffuse": ("diffuse", "separated"),
-    "normal": ("normal", "candidates", "weight"),
-    "azimuth": ("plane", "weight"),
-    "chromatic": ("chromatic", "chromatic_weight"),
-    "stokes": ("stokes", "stokes_weight"),
-    "consistency": ("surface",),
-}
-# Of these, what is made of S0, which is not kept.
-_MADE = {"stokes_weight", "surface"}
-_FIELDS = {name for fields in _READ.values() for name in fields}
 
 
 class Packed(NamedTuple):
@@ -71,11 +58,6 @@ def unpacked(kept: Packed) -> Tensor:
     return values if kept.top.device.type == "cpu" and float(kept.top) == 1 else values.mul_(kept.top)
 
 
-def fields_read(weights: Weights) -> frozenset[str]:
-    """The fields of the priors that a stage's terms read."""
-    return frozenset(name for term, fields in _READ.items() if getattr(weights, term) for name in fields)
-
-
 def holds(entry: Entry, fields: frozenset[str]) -> bool:
     """Whether an entry has all that is read; of the normal and its candidates it has one."""
     missing = fields - entry.keys()
@@ -83,13 +65,11 @@ def holds(entry: Entry, fields: frozenset[str]) -> bool:
 
 
 def pack_priors(priors: ViewPriors, fields: Collection[str]) -> Entry:
-    """What terms read of the priors, and whatever this module does not know."""
+    """What terms read of the priors, and whatever no term is known to read."""
     entry = {}
     for name, values in vars(priors).items():
-        if isinstance(values, Tensor) and (name in fields or name not in _FIELDS | {"reliable"}):
-            entry[name] = packed(values[1:]) if name == "stokes" else packed(values)
-    for name in _MADE & set(fields):
-        entry[name] = packed(getattr(priors, name))
+        if isinstance(values, Tensor) and (name in fields or name not in Weights.known_priors()):
+            entry[name] = packed(values[1:]) if name == "stokes" else packed(values)  # no term reads S0
     if priors.candidates is not None:
         entry.pop("normal", None)  # each step chooses
     return entry
@@ -107,15 +87,13 @@ def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
     size = (camera.height, camera.width)
     for name in ("specular", "diffuse", "normal", "plane", "chromatic"):
         values.setdefault(name, nothing.expand(*size, 3))
-    for name in ("separated", "weight", "chromatic_weight", "reliable"):
+    for name in ("separated", "weight", "chromatic_weight", "stokes_weight", "surface"):
         values.setdefault(name, nothing.expand(size))
-    made = {name: values.pop(name) for name in _MADE & values.keys()}
     measured = values.pop("stokes", None)
     stokes = (
         nothing.expand(3, *size, 3)
         if measured is None
         else torch.nn.functional.pad(measured, (0, 0, 0, 0, 0, 0, 1, 0), value=torch.nan)
     )
-    priors = ViewPriors(camera=camera, stokes=stokes, settings=settings, **values)
-    vars(priors).update(made)  # they are cached there
-    return priors
+    shares = {"azimuth_share": settings.azimuth_share, "chromatic_share": settings.chromatic_share}
+    return ViewPriors(camera=camera, stokes=stokes, **values, **shares)  # type: ignore[arg-type]

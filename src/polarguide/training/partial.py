@@ -6,64 +6,10 @@ So the prediction can be compared with whatever was measured.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
-from polarguide.capture import View
-from polarguide.capture.exposures import analyzers, radiance_places
-from polarguide.color import srgb_encode
-from polarguide.shading.model import ShadingModel
-from polarguide.shading.result import RenderResult
 from polarguide.training.photometric import Photometric, photometric_terms
-from polarguide.training.recipe import Weights
-
-
-@dataclass(frozen=True, eq=False)
-class PartialView:
-    """What a view measured.
-
-    Attributes:
-        picture: [H, W, 3] linear: the mean of some of its exposures.
-        shown: the same as shown (sRGB), clipped.
-        mix: what ``picture`` measures beside S0/2, as an analyzer: [2], or [2, H, W] where it depends on the pixel;
-            None where it is S0/2.
-        intensities: [K, H, W, 3] linear, of the exposures behind a polarizer at a known angle.
-        analyzers: of these, [K, 2] or [K, 2, H, W].
-        reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or clips.
-    """
-
-    picture: Tensor
-    shown: Tensor
-    mix: Tensor | None
-    intensities: Tensor
-    analyzers: Tensor
-    reliable: Tensor
-
-    @classmethod
-    def of(cls, view: View, device: torch.device) -> PartialView:
-        """What a view measured, on a device."""
-        view = view.to(device)
-        values, exposures = view.intensities(), view.exposures
-        rays = view.camera.rays(device=device)
-        polarized = [k for k, e in enumerate(exposures) if e.angle is not None]
-        behind = analyzers([exposures[k] for k in polarized], rays, view.mount) if polarized else None
-        places = radiance_places(exposures)
-        averaged = list(places) or polarized or list(range(len(exposures)))
-        mix = None
-        if behind is not None and averaged == polarized and not (places and view.mount == "sensor"):
-            mix = behind.mean(dim=0)
-        picture = values[averaged].mean(dim=0)
-        return cls(
-            picture=picture,
-            shown=srgb_encode(picture.clamp(0, 1)),
-            mix=mix,
-            intensities=values[polarized],
-            analyzers=values.new_zeros(0, 2) if behind is None else behind,
-            reliable=(~(view.invalid | view.saturated)).float(),
-        )
+from polarguide.training.targets import Step
 
 
 def behind_analyzer(stokes: Tensor, analyzer: Tensor) -> Tensor:
@@ -76,17 +22,8 @@ def behind_analyzer(stokes: Tensor, analyzer: Tensor) -> Tensor:
     return (stokes[1] * cosine + stokes[2] * sine) / 2
 
 
-def partial_terms(
-    result: RenderResult,
-    view: PartialView,
-    weights: Weights,
-    *,
-    valid: Tensor | None,
-    ssim_weight: float,
-    shading: ShadingModel,
-    camera: Camera,
-) -> tuple[Tensor, Photometric]:
-    """The weighted photometric and polarization terms of a view, and the photometric one alone.
+def partial_terms(step: Step, photometric: float, polarization: float) -> tuple[Tensor, Photometric]:
+    """The weighted photometric and polarization terms of a view with ``StepTargets.partial``, and the photometric one.
 
     The photometric term compares what was measured with what the layers predict of it: S0/2 where that is measured,
     else the mean M of the intensities behind the analyzers. Beside it, in place of the Stokes term and with its weight,
@@ -96,26 +33,28 @@ def partial_terms(
     term. (With the rendered S0/2, held, in place of M, a rendering that is too bright would be explained by more light
     that its analyzer blocks, which makes it brighter.)
 
-    Where the weights have no Stokes term, or there are no layers to predict from, the picture counts as a photograph.
+    Without a weight of the polarization, or without layers to predict from, the picture counts as a photograph.
 
     Args:
-        result: the rendered layers. view: what was measured. weights: of the stage.
-        valid: [H, W] 1 where the photograph counts; None: everywhere.
-        ssim_weight: lambda of the image term. shading: of the stage. camera: of the view.
+        step: what the terms read. photometric, polarization: weights of the stage.
     """
+    result, shading, view = step.result, step.shading, step.targets.partial
+    assert view is not None
+
+    def compared(rendered: Tensor) -> Photometric:
+        return photometric_terms(rendered, view.shown, step.targets.valid, step.ssim_weight)
+
     layers = result.specular, result.diffuse, result.normal
     predicts = shading.reflects and all(layer is not None for layer in layers)
-    if not (weights.stokes and len(view.intensities) and predicts):
-        picture = photometric_terms(result.final, view.shown, valid, ssim_weight)
-        return weights.photometric * picture.loss, picture
-    stokes = shading.predicted_stokes(result, camera)
-    expected = result.final if view.mix is None else result.final + behind_analyzer(stokes, view.mix)
-    picture = photometric_terms(expected, view.shown, valid, ssim_weight)
+    if not (polarization and len(view.intensities) and predicts):
+        picture = compared(result.final)
+        return photometric * picture.loss, picture
+    stokes = shading.predicted_stokes(result, step.targets.camera)
+    picture = compared(result.final if view.mix is None else result.final + behind_analyzer(stokes, view.mix))
     common = 0.0 if view.mix is None else view.mix
     weight = view.reliable * (2 * view.picture.mean(dim=-1) + 0.01).rsqrt()
     distance = result.final.new_zeros(())
     for intensity, analyzer in zip(view.intensities, view.analyzers, strict=True):
         difference = 2 * (intensity - view.picture) - 2 * behind_analyzer(stokes, analyzer - common)
         distance = distance + (weight * difference.abs().mean(dim=-1)).mean()
-    total = weights.photometric * picture.loss + weights.stokes * distance / len(view.intensities)
-    return total, picture
+    return photometric * picture.loss + polarization * distance / len(view.intensities), picture

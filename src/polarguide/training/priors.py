@@ -7,85 +7,19 @@ polarization normals and the separation, and what comes out supervises the Gauss
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.capture.exposures import FOUR
 from polarguide.color import srgb_encode
 from polarguide.training.flat import Flat
 from polarguide.training.recipe import Candidates, Priors
+from polarguide.training.targets import ViewPriors, stokes_weight, surface_weight
 from polarguide.vectors import dot, unit
-
-
-@dataclass(frozen=True, eq=False)
-class ViewPriors:
-    """Targets of one view.
-
-    Attributes:
-        specular, diffuse: [H, W, 3] shown (sRGB) separated pictures, on the scale of S0/2.
-        separated: [H, W] weight of both: 1 where the separation is well conditioned.
-        normal: [H, W, 3] disambiguated polarization normal, world axes.
-        candidates: [H, W, K, 3] what each step chooses from in place of ``normal``, world axes; None: nothing.
-        plane: [H, W, 3] world normal of the plane of incidence that the AoLP gives.
-        weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
-        chromatic: [H, W, 3] normal from the polarization of color differences, world axes, or of a flat surface.
-        chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
-        camera: of the view.
-        stokes: [3, H, W, 3] as measured.
-        reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or clips.
-        settings: what they were computed with.
-    """
-
-    specular: Tensor
-    diffuse: Tensor
-    separated: Tensor
-    normal: Tensor
-    plane: Tensor
-    weight: Tensor
-    chromatic: Tensor
-    chromatic_weight: Tensor
-    camera: Camera
-    stokes: Tensor
-    reliable: Tensor
-    settings: Priors
-    candidates: Tensor | None = None
-
-    @cached_property
-    def stokes_weight(self) -> Tensor:
-        """[H, W] weight of S1 and S2: one over the root of S0, since their variance grows with S0 where light itself is
-        the noise.
-        """
-        return self.reliable * (self.stokes[0].mean(dim=-1) + 0.01).rsqrt()
-
-    @cached_property
-    def total(self) -> Tensor:
-        """What sums with ``weight`` are divided by: its sum, or the least share of the pixels."""
-        return _total(self.weight, self.settings.azimuth_share)
-
-    @cached_property
-    def chromatic_total(self) -> Tensor:
-        """What sums with ``chromatic_weight`` are divided by: its sum, or the least share of the pixels."""
-        return _total(self.chromatic_weight, self.settings.chromatic_share)
-
-    @cached_property
-    def separated_share(self) -> Tensor:
-        """The mean of ``separated``."""
-        return self.separated.mean()
-
-    @cached_property
-    def surface(self) -> Tensor:
-        """[H, W] weight of the agreement of normals and depth, in [0, 1]."""
-        if not self.settings.bright:
-            return self.weight
-        shown = optics.luminance(self.stokes)[0] / 2
-        return torch.maximum(self.weight, (shown / self.settings.bright).clamp(0, 1))
 
 
 class Unguided(NamedTuple):
@@ -171,76 +105,119 @@ def view_priors(
         settings: which candidates and which separation.
         refractive_index: of all surfaces, or [H, W] of each pixel.
         known: ``unguided`` of the view, where it is at hand; needed with the index of each pixel.
-        metal: [H, W] share of metals: where there are some, what holds for dielectrics alone does not count. None: no
-            metal.
-        flat: a flat surface, whose normal takes the place of the guide's and of the color differences' where the guide
-            is far from it; None: none.
+        metal: [H, W] share of metals, where what holds for dielectrics alone does not count; None: no metal.
+        flat: a flat surface, whose normal replaces the guide and the color differences where the guide is far from it.
     """
-    view = view.to(normal.device)
-    rays = view.camera.rays(device=normal.device)
+    view, rays = view.to(normal.device), view.camera.rays(device=normal.device)
     if known is None:
         assert not isinstance(refractive_index, Tensor)
         known = unguided(view, settings, refractive_index)
-    usable, degree, *found = known
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
-    guide, shown = guide_normals(view.camera.to_camera(normal), rays, settings.minimum_normal)
-    on_plane, astray = guide, torch.zeros_like(shown)
-    if flat is not None:
-        on_plane = view.camera.to_camera(flat.normal).expand_as(guide)
-        astray = flat.where & ~(shown & (dot(guide, on_plane) > math.cos(math.radians(settings.astray))))
-        guide, shown = torch.where(astray[..., None], on_plane, guide), shown | flat.where
-    nearest_to = guide
-    zenith, azimuth, certainty, colorful = found
-    if zenith is not None and azimuth is not None and certainty is not None and colorful is not None:
-        chromatic, chromatic_weight = facing(zenith, azimuth, guide, rays), certainty * shown
-        if settings.chromatic_within is not None:
-            near = _within(chromatic, guide, *settings.chromatic_within)
-            chromatic_weight = chromatic_weight * torch.maximum(near, colorful)
-        chromatic = torch.where(astray[..., None], on_plane, chromatic)
-        chromatic_weight = torch.maximum(chromatic_weight, astray.to(chromatic_weight))
-        nearest_to = torch.where(chromatic_weight[..., None] > 0, chromatic, guide)
+    guide = _guide(view, normal, flat, rays, settings)
+    nearest_to, by_color = guide.normal, _by_color(known, guide, settings, rays)
+    if by_color is not None:
+        nearest_to = torch.where(by_color[1][..., None] > 0, by_color[0], guide.normal)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
     chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal
-    if settings.separation == "paper":
-        zenith = optics.diffuse_zenith(optics.dolp(luminance), refractive_index)
-        layers = optics.paper_separation(stokes, zenith, refractive_index)
-        conditioned = ~view.saturated
-    else:
-        layers = optics.exact_separation(stokes, guide, rays, refractive_index)
-        conditioned = layers.conditioned & shown & ~view.saturated
-    plane = unit(torch.linalg.cross(rays, chosen))
-    weight = (degree / settings.full_dolp).clamp(max=1) * (usable if settings.live else usable & shown)
-    if certainty is not None:
-        # Nearly unpolarized light has no reliable AoLP; the slope among its colors may still have one.
-        better = (chromatic_weight > 0) & (degree < settings.chromatic_plane_dolp)
-        plane = torch.where(better[..., None], unit(torch.linalg.cross(rays, chromatic)), plane)
-        weight = torch.maximum(weight, chromatic_weight)
-    else:
-        chromatic, chromatic_weight = chosen, torch.zeros_like(weight)
+    layers = _separated(stokes, guide, settings, refractive_index, rays)
+    conditioned = layers.conditioned & ~view.saturated
+    counts = known.usable if settings.live else known.usable & guide.shown
+    weight = (known.degree / settings.full_dolp).clamp(max=1) * counts
+    chromatic, chromatic_weight = (chosen, torch.zeros_like(weight)) if by_color is None else by_color
+    weight = torch.maximum(weight, chromatic_weight)
     reliable = (~(view.invalid | view.saturated)).float()
     if metal is not None:
-        none, whole = settings.metal_share
-        body = 1 - ((metal - none) / (whole - none)).clamp(0, 1)
+        body, predicted = _without_metal(metal, luminance, guide.normal, rays, settings.metal_share)
         conditioned, chromatic_weight = conditioned * body, chromatic_weight * body
-        # Light that is polarized in the plane of incidence was so before it fell on a metal: nothing here predicts it.
-        fit = 1 - (1 - body) * (_across(luminance, guide, rays) < 0)
-        weight, reliable = weight * fit, reliable * fit
+        weight, reliable = weight * predicted, reliable * predicted
     return ViewPriors(
         specular=srgb_encode((layers.specular / 2).clamp(0, 1)),
         diffuse=srgb_encode((layers.diffuse / 2).clamp(0, 1)),
         separated=conditioned * (~view.invalid).float(),
         normal=view.camera.to_world(chosen),
-        plane=view.camera.to_world(plane),
+        plane=view.camera.to_world(
+            _plane(chosen, by_color, known.degree < settings.chromatic_plane_dolp, rays)
+        ),
         weight=weight,
         chromatic=view.camera.to_world(chromatic),
         chromatic_weight=chromatic_weight,
         camera=view.camera,
         stokes=stokes,
-        reliable=reliable,
-        settings=settings,
+        stokes_weight=stokes_weight(stokes, reliable),
+        surface=surface_weight(stokes, weight, settings.bright),
         candidates=view.camera.to_world(_normals(candidates)) if settings.live else None,
+        azimuth_share=settings.azimuth_share,
+        chromatic_share=settings.chromatic_share,
     )
+
+
+def _plane(chosen: Tensor, by_color: tuple[Tensor, Tensor] | None, faint: Tensor, rays: Tensor) -> Tensor:
+    """Normals [H, W, 3] of the planes of incidence, camera axes. faint: [H, W] bool, nearly unpolarized pixels."""
+    plane = unit(torch.linalg.cross(rays, chosen))
+    if by_color is None:
+        return plane
+    # Nearly unpolarized light has no reliable AoLP; the slope among its colors may still have one.
+    better = (by_color[1] > 0) & faint
+    return torch.where(better[..., None], unit(torch.linalg.cross(rays, by_color[0])), plane)
+
+
+def _without_metal(
+    metal: Tensor, luminance: Tensor, normal: Tensor, rays: Tensor, shares: tuple[float, float]
+) -> tuple[Tensor, Tensor]:
+    """Weights [H, W] of what holds for dielectrics alone, and of what is predicted of both, beside shares of metals.
+
+    Args:
+        shares: of metal, between which a pixel goes over from a dielectric to a metal.
+    """
+    none, whole = shares
+    body = 1 - ((metal - none) / (whole - none)).clamp(0, 1)
+    # Light that is polarized in the plane of incidence was so before it fell on a metal: nothing here predicts it.
+    return body, 1 - (1 - body) * (_across(luminance, normal, rays) < 0)
+
+
+class _Guide(NamedTuple):
+    """Normals [H, W, 3] of the guide, camera axes, and where they are known [H, W]; ``astray``, where those of a flat
+    surface, ``on_plane``, took their place.
+    """
+
+    normal: Tensor
+    shown: Tensor
+    on_plane: Tensor
+    astray: Tensor
+
+
+def _guide(view: View, normal: Tensor, flat: Flat | None, rays: Tensor, settings: Priors) -> _Guide:
+    guide, shown = guide_normals(view.camera.to_camera(normal), rays, settings.minimum_normal)
+    if flat is None:
+        return _Guide(guide, shown, guide, torch.zeros_like(shown))
+    on_plane = view.camera.to_camera(flat.normal).expand_as(guide)
+    astray = flat.where & ~(shown & (dot(guide, on_plane) > math.cos(math.radians(settings.astray))))
+    return _Guide(torch.where(astray[..., None], on_plane, guide), shown | flat.where, on_plane, astray)
+
+
+def _by_color(known: Unguided, guide: _Guide, settings: Priors, rays: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Normals [H, W, 3] of the color differences or of a flat surface, and their weight; None: not wanted."""
+    _, _, zenith, azimuth, certainty, colorful = known
+    if zenith is None or azimuth is None or certainty is None or colorful is None:
+        return None
+    chromatic, weight = facing(zenith, azimuth, guide.normal, rays), certainty * guide.shown
+    if settings.chromatic_within is not None:
+        near = _within(chromatic, guide.normal, *settings.chromatic_within)
+        weight = weight * torch.maximum(near, colorful)
+    chromatic = torch.where(guide.astray[..., None], guide.on_plane, chromatic)
+    return chromatic, torch.maximum(weight, guide.astray.to(weight))
+
+
+def _separated(
+    stokes: Tensor, guide: _Guide, settings: Priors, refractive_index: float | Tensor, rays: Tensor
+) -> optics.Separation:
+    """The layers as the recipe separates them, ``conditioned`` where the guide is known."""
+    if settings.separation == "paper":
+        zenith = optics.diffuse_zenith(optics.dolp(optics.luminance(stokes)), refractive_index)
+        return optics.paper_separation(stokes, zenith, refractive_index)
+    layers = optics.exact_separation(stokes, guide.normal, rays, refractive_index)
+    return layers._replace(conditioned=layers.conditioned & guide.shown)
 
 
 def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
@@ -258,10 +235,6 @@ def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
     """1 up to ``full`` degrees between unit normals [H, W, 3], 0 from ``none`` on; [H, W]."""
     off = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
     return ((none - off) / (none - full)).clamp(0, 1)
-
-
-def _total(weight: Tensor, share: float) -> Tensor:
-    return weight.sum().clamp(min=max(1.0, share * weight.numel()))
 
 
 def _noise(view: View) -> Tensor | float:

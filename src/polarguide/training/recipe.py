@@ -17,6 +17,7 @@ from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization
 from polarguide.shading.model import PLAIN, ShadingModel
 from polarguide.training.flat import FlatRules
+from polarguide.training.losses import Weights as Weights
 from polarguide.training.metals.rules import MetalRules
 
 Action = Literal["reset_opacity", "propagate_normals", "refresh_priors", "orient_normals"]
@@ -62,53 +63,6 @@ class Rounds:
         count = len(self.actions) * max(1, length // (apart * len(self.actions)))
         places = (round(turn * length / count) for turn in range(1, count))
         return {at: self.actions[k % len(self.actions)] for k, at in enumerate(places) if 0 < at < length}
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the loss terms; a term with weight 0 is not computed.
-
-    Attributes:
-        photometric: final picture against S0/2.
-        specular, diffuse: the two contributions against the separated pictures.
-        normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
-        azimuth: distance of the normal from the plane of incidence that the AoLP gives (azimuth alone).
-        chromatic: 1 - cosine with the normal from color differences, where these decide one.
-        stokes: S1 and S2 that the layers and the normal predict against the measured ones.
-        flatness: shortest scale of the Gaussians, in percent of the scene's extent.
-        consistency: alpha - cosine of the blended normal with that of the rendered depth.
-    """
-
-    photometric: float = 1.0
-    specular: float = 0.0
-    diffuse: float = 0.0
-    normal: float = 0.0
-    azimuth: float = 0.0
-    chromatic: float = 0.0
-    stokes: float = 0.0
-    flatness: float = 0.0
-    consistency: float = 0.0
-
-    @property
-    def priors(self) -> bool:
-        """Whether a term compares with the priors of a view."""
-        layers = self.specular, self.diffuse, self.stokes
-        return any((*layers, self.normal, self.azimuth, self.chromatic))
-
-    @property
-    def normals(self) -> bool:
-        """Whether a term reads the rendered normals."""
-        return any((self.normal, self.azimuth, self.chromatic, self.stokes, self.consistency))
-
-    @property
-    def depth(self) -> bool:
-        """Whether a term looks at the rendered depth."""
-        return self.consistency > 0
-
-    @property
-    def layers(self) -> bool:
-        """Whether a term looks at the layers one by one."""
-        return any((self.specular, self.diffuse, self.stokes))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,11 @@ class Position:
 
 
 class Schedule:
-    """The stages of a recipe laid over a number of steps."""
+    """The stages of a recipe laid over a number of steps.
+
+    In a training so short that a stage has no step, its ``on_enter`` happens with that of the next one; the last stage
+    always has a step.
+    """
 
     def __init__(self, recipe: Recipe, steps: int) -> None:
         self.recipe = recipe
@@ -29,7 +33,7 @@ class Schedule:
         self._starts: list[int] = []
         share = 0.0
         for stage in recipe.stages:
-            self._starts.append(round(share * steps))
+            self._starts.append(min(round(share * steps), steps - 1))
             share += stage.fraction
         ends = (*self._starts[1:], steps)
         self._turns = [
@@ -42,7 +46,9 @@ class Schedule:
         index = max(i for i, start in enumerate(self._starts) if start <= step)
         stage, since = self.recipe.stages[index], step - self._starts[index]
         if since == 0:
-            return Position(stage, stage.on_enter)
+            begun = zip(self.recipe.stages, self._starts, strict=True)
+            entered = (action for each, start in begun if start == step for action in each.on_enter)
+            return Position(stage, tuple(dict.fromkeys(entered)))
         due = [r.action for r in stage.repeats if since % self.period(r) == 0]
         turn = self._turns[index].get(since)
         return Position(stage, (turn, *due) if turn else tuple(due))

@@ -17,6 +17,9 @@ from polarguide.gaussians.initialize import far_away, initial_parameters
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings
 
+ANGLE_COLUMNS = 8
+"""Values of a fitted polarizer angle, see ``angles.fit.FittedAngle``, and whether there was anything to fit."""
+
 
 class Environment(Trained):
     """The learned light: named parameters with their own Adam state.
@@ -56,7 +59,8 @@ class TrainingState:
         statistics: of the density control.
         frozen: copy of the Gaussians from which the present priors were computed; None before the first refresh.
         opacity_frozen_until: first step at which opacities train again (after a normal propagation).
-        angles: what was found of polarizers, see ``Polarizers``; None: nothing yet.
+        angles: [F, P, ``ANGLE_COLUMNS``] float64, F fits of the polarizers of P pictures, see ``angles.polarizers``;
+            None: nothing yet.
     """
 
     step: int

@@ -68,7 +68,11 @@ class ViewStore:
         return found
 
     def drop(self, kind: str, view: str | None = None) -> None:
-        """Forget the entries of a kind, or one of them; their places in the file are used again."""
+        """Forget the entries of a kind, or one of them.
+
+        An entry that is made again takes its old place in the file if it still fits there. A larger one is put at the
+        end, and its old place stays empty: entries only grow when a stage reads more than the one before.
+        """
         for key in [key for key in self._held if key[0] == kind and view in (None, key[1])]:
             self.in_memory -= _size(self._held.pop(key))
         for key, place in self._places.items():

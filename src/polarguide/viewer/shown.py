@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from polarguide.angles.trainer import AngleTrainer
 from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.neural.model import FieldModel
@@ -17,10 +18,9 @@ from polarguide.raster.interface import Rasterize
 from polarguide.rendering.relight import RELIT_RESOLUTION, turned_cubemap
 from polarguide.runs.families import AnyTrainer
 from polarguide.runs.opened import OpenedRun
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
-from polarguide.training.trainer import Trainer
 
 FIELD_SHARE = 4
 """A field is shown with so many times fewer pixels each way: it takes seconds for a picture of full size."""
@@ -88,11 +88,9 @@ class Shown:
             gaussians,
             camera,
             self.rasterize,
-            sh_degree=self.sh_degree,
+            RenderRequest(self.sh_degree, depth=depth, at_median_depth=surface),
             shading=self.shading,
             light=self.light if turn is None else self._turned(turn),
-            depth=depth,
-            surface=surface,
         ).to("cpu")
 
     def _turned(self, turn: Tensor) -> Light:
@@ -150,7 +148,7 @@ def shown_training(trainer: AnyTrainer) -> Scenery:
         model = FieldModel(trainer.state, trainer.recipe, trainer.state.field.distances.device, trained=False)
         status = f"{trainer.recipe.name}, step {trainer.state.step:,} of {steps:,}"
         return ShownField(model, f"{status}; shown at a quarter of the size")
-    assert isinstance(trainer, Trainer)
+    assert isinstance(trainer, AngleTrainer)
     state = trainer.state
     stage = trainer.schedule.at(min(state.step, steps - 1)).stage
     progress = f"step {state.step:,} of {steps:,} ({stage.name})"

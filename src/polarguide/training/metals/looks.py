@@ -12,7 +12,7 @@ from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.raster import Rasterize
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.metal import any_nonzero
 from polarguide.shading.model import Parameters
 from polarguide.shading.splatting import splats
@@ -61,7 +61,7 @@ def shares(gaussians: Parameters, view: View, target: Tensor, rasterize: Rasteri
 def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
     """Sums [N, 11] over a view's pixels: 1, S0, P, the polarization at 45 degrees to it and the cosine."""
     device = gaussians["means"].device
-    normal = render(gaussians, view.camera, rasterize, sh_degree=0).normal
+    normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
     assert normal is not None
     view = view.to(device)
     rays = view.camera.rays(device=device)

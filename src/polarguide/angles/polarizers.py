@@ -12,12 +12,13 @@ from statistics import median
 import torch
 from torch import Tensor
 
+from polarguide.angles.fit import fit_angle
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
-from polarguide.training.angle_fit import fit_angle
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings
+from polarguide.training.state import ANGLE_COLUMNS
 
 FIRST, EVERY, LAST = 0.5, 0.05, 0.65
 """Shares of all steps at which unknown angles are fitted: earlier, what is believed of them would confirm itself, and
@@ -77,7 +78,6 @@ REMEDY = (
     "the pictures as ordinary photographs: prepare them with --angles none."
 )
 """What to do where most angles are doubtful."""
-COLUMNS = 8
 Predict = Callable[[View], Tensor]
 """Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
 
@@ -178,6 +178,9 @@ class Polarizers:
             angles are sought where the training begins again after it; 0: it does not.
         table: what was found before, [F, P, 8] float64: what each ``fit`` gave; None: nothing.
 
+    Attributes:
+        beliefs: the exposures that a training goes by, by the name of the view; of views that were fitted.
+
     Raises:
         ValueError: the table has another number of rows.
     """
@@ -206,7 +209,7 @@ class Polarizers:
             raise ValueError(f"angles of {table.shape[1]} pictures, not {len(self._places)}")
         self.table = table
         self.ignored = not uses and any(not view.measures_radiance for view in scene.train_views)
-        self._believed = self._beliefs()
+        self.beliefs = self._beliefs()
 
     def due(self, step: int) -> bool:
         """Whether angles are to be fitted before a step; none is once all fits have been made."""
@@ -235,8 +238,12 @@ class Polarizers:
 
     def believed(self, view: View) -> View:
         """A view with what is believed of its exposures."""
-        exposures = self._believed.get(view.name)
+        exposures = self.beliefs.get(view.name)
         return view if exposures is None or exposures == view.exposures else view.with_exposures(exposures)
+
+    def resolved(self, scene: Scene) -> Scene:
+        """A scene with what is believed of its exposures."""
+        return replace(scene, views=tuple(self.believed(view) for view in scene.views))
 
     def fit(self, predict: Predict) -> Tensor:
         """Fit all angles.
@@ -258,14 +265,13 @@ class Polarizers:
                 if fitted is not None:
                     row = [*dataclasses.astuple(fitted), 1.0]
                 rows.append(row)
-        return torch.tensor(rows, dtype=torch.float64).reshape(-1, COLUMNS)
+        return torch.tensor(rows, dtype=torch.float64).reshape(-1, ANGLE_COLUMNS)
 
     def take(self, table: Tensor) -> set[str]:
         """Go by a table of all fits [F, P, 8] from now on; the names of the views of which it changes the beliefs."""
         self.table = table
-        before, self._believed = self._believed, self._beliefs()
-        names = before.keys() | self._believed.keys()
-        return {name for name in names if before.get(name) != self._believed.get(name)}
+        before, self.beliefs = self.beliefs, self._beliefs()
+        return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
 
     def judgments(self) -> list[Judgment]:
         """What is said and believed of each picture; empty before the first fit."""
@@ -291,7 +297,7 @@ class Polarizers:
     def _judged(self, fit: Tensor) -> list[Judgment]:
         """What one fit [P, 8] says of each picture."""
         rows = [
-            Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: COLUMNS - 1])
+            Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: ANGLE_COLUMNS - 1])
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
         ]
         offs = [abs(row.off) for row in rows if row.tells and row.said.angle is not None]

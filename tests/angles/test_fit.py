@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
+from polarguide.angles.fit import FLOOR, fit_angle
 from polarguide.camera import Camera
 from polarguide.optics import Mount
-from polarguide.training.angle_fit import FLOOR, fit_angle
 
 HEIGHT, WIDTH = 48, 64
 EYE = torch.eye(3, dtype=torch.float64)

@@ -11,6 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from polarguide.angles.polarizers import AGAIN, DISAGREE, Polarizers, mean_angle
+from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene, View
 from polarguide.capture.angle_table import read_table
 from polarguide.capture.exposures import FOUR, Exposure
@@ -20,10 +22,8 @@ from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.angles import report_polarizers
 from polarguide.runs.defaults import resolve
 from polarguide.training.checked import refuse_foreign
-from polarguide.training.polarizers import AGAIN, DISAGREE, Polarizers, mean_angle
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer
 from tests.helpers.heard import Heard
 from tests.helpers.tiny import make_scene
 
@@ -256,8 +256,8 @@ def test_exposure_times_are_found() -> None:
     assert gains["v1"] == pytest.approx(1.0, abs=0.01)
 
 
-def trained(scene: Scene, until: int, state: TrainingState | None = None) -> Trainer:
-    trainer = Trainer(
+def trained(scene: Scene, until: int, state: TrainingState | None = None) -> AngleTrainer:
+    trainer = AngleTrainer(
         scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU, state
     )
     trainer.run(lambda report: None, until=until)
@@ -268,7 +268,7 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
     scene = select_exposures(WHOLE, "unknown")
     reports: list[StepReport] = []
     settings = resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES)
-    trainer = Trainer(scene, STOKES, settings, CPU)
+    trainer = AngleTrainer(scene, STOKES, settings, CPU)
     first, second = round(0.65 * STEPS), round(AGAIN[-1] * STEPS)
     search = first + second
     assert (trainer.begins_again, trainer.total) == (True, STEPS + search)
@@ -280,26 +280,26 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
     assert len(trainer.polarizers.table) == 4 + len(AGAIN)
 
     # After the searches it is a training that has been told these angles, and keeps to them.
-    state = Trainer(scene, STOKES, settings, CPU).state
+    state = AngleTrainer(scene, STOKES, settings, CPU).state
     state.angles = trainer.polarizers.table
-    told = Trainer(scene, STOKES, settings, CPU, state)
+    told = AngleTrainer(scene, STOKES, settings, CPU, state)
     told.run(lambda report: None)
     ours, theirs = trainer.state.tensors(), told.state.tensors()
     assert all(torch.equal(values, theirs[name]) for name, values in ours.items())
 
-    alongside = Trainer(scene, STOKES, dataclasses.replace(settings, begin_again=False), CPU)
+    alongside = AngleTrainer(scene, STOKES, dataclasses.replace(settings, begin_again=False), CPU)
     assert alongside.total == STEPS
     alongside.run(lambda report: None)
     assert not torch.equal(alongside.state.gaussians["means"], trainer.state.gaussians["means"])
 
 
 def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.training.polarizers.SEARCH_STEPS", 20)
-    monkeypatch.setattr("polarguide.training.trainer.SEARCH_SIZE", 16)
+    monkeypatch.setattr("polarguide.angles.polarizers.SEARCH_STEPS", 20)
+    monkeypatch.setattr("polarguide.angles.trainer.SEARCH_SIZE", 16)
     scene = select_exposures(WHOLE, "unknown")
     width = scene.views[0].camera.width
     assert width > 16
-    trainer = Trainer(
+    trainer = AngleTrainer(
         scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
     )
     assert trainer.total == STEPS + 13 + 19
@@ -323,7 +323,7 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
     assert trainer.polarizers.believed(view).codes is view.codes
     # On a schedule that tells nothing of a search, known angles are looked at three times.
     scene = select_exposures(WHOLE, "one")
-    known = Trainer(
+    known = AngleTrainer(
         scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
     )
     assert [step for step in range(STEPS) if known.polarizers.due(step)] == [8, 12, 20]
@@ -332,7 +332,7 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("exposures", ["one", "four", "none"])
 def test_where_all_angles_are_known_nothing_begins_again(exposures: str) -> None:
     scene = select_exposures(WHOLE, exposures)  # type: ignore[arg-type]
-    trainer = Trainer(
+    trainer = AngleTrainer(
         scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
     )
     assert (trainer.begins_again, trainer.total) == (False, STEPS)

@@ -1,0 +1,176 @@
+"""What a step compares a rendering with: the data of one view, as objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.camera import Camera
+from polarguide.capture import View
+from polarguide.capture.exposures import analyzers, radiance_places
+from polarguide.color import srgb_encode
+from polarguide.shading.model import ShadingModel
+from polarguide.shading.result import RenderResult
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPriors:
+    """Polarization targets of one view.
+
+    Attributes:
+        specular, diffuse: [H, W, 3] separated pictures as displayed (sRGB), on the scale of S0/2.
+        separated: [H, W] weight of both: 1 where the separation is well conditioned.
+        normal: [H, W, 3] disambiguated polarization normal, world axes.
+        plane: [H, W, 3] world normal of the plane of incidence that the AoLP gives.
+        weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
+        chromatic: [H, W, 3] normal from the polarization of color differences, world axes, or of a flat surface.
+        chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
+        camera: of the view.
+        stokes: [3, H, W, 3] as measured.
+        stokes_weight: [H, W] weight of S1 and S2, see ``stokes_weight``.
+        surface: [H, W] weight of the agreement of normals and depth, see ``surface_weight``.
+        candidates: [H, W, K, 3] normals of which each step chooses one in place of ``normal``, world axes; None: none.
+        azimuth_share, chromatic_share: least share of the pixels over which the terms on directions are averaged.
+    """
+
+    specular: Tensor
+    diffuse: Tensor
+    separated: Tensor
+    normal: Tensor
+    plane: Tensor
+    weight: Tensor
+    chromatic: Tensor
+    chromatic_weight: Tensor
+    camera: Camera
+    stokes: Tensor
+    stokes_weight: Tensor
+    surface: Tensor
+    candidates: Tensor | None = None
+    azimuth_share: float = 0.0
+    chromatic_share: float = 0.0
+
+    @cached_property
+    def total(self) -> Tensor:
+        """Divisor of sums with ``weight``: its sum, or the least share of the pixels."""
+        return _total(self.weight, self.azimuth_share)
+
+    @cached_property
+    def chromatic_total(self) -> Tensor:
+        """Divisor of sums with ``chromatic_weight``: its sum, or the least share of the pixels."""
+        return _total(self.chromatic_weight, self.chromatic_share)
+
+
+def _total(weight: Tensor, share: float) -> Tensor:
+    return weight.sum().clamp(min=max(1.0, share * weight.numel()))
+
+
+def stokes_weight(stokes: Tensor, reliable: Tensor) -> Tensor:
+    """Weight [H, W] of S1 and S2: one over the root of S0, since their variance grows with S0 where light itself is the
+    noise.
+
+    Args:
+        stokes: [3, H, W, 3] as measured. reliable: [H, W] 1 where the measurement counts, 0 where not.
+    """
+    return reliable * (stokes[0].mean(dim=-1) + 0.01).rsqrt()
+
+
+def surface_weight(stokes: Tensor, weight: Tensor, bright: float) -> Tensor:
+    """Weight [H, W] of the agreement of normals and depth, in [0, 1].
+
+    Args:
+        stokes: [3, H, W, 3] as measured. weight: [H, W] of the polarization normal.
+        bright: S0/2 from which on the agreement counts fully; 0: it counts as much as the polarization normal.
+    """
+    if not bright:
+        return weight
+    radiance = optics.luminance(stokes)[0] / 2
+    return torch.maximum(weight, (radiance / bright).clamp(0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class PartialView:
+    """What a view measured whose pictures do not determine the Stokes vector.
+
+    Attributes:
+        picture: [H, W, 3] linear: the mean of some of its exposures.
+        shown: the same as displayed (sRGB), clipped.
+        mix: what ``picture`` measures beside S0/2, as an analyzer: [2], or [2, H, W] where it depends on the pixel;
+            None where it is S0/2.
+        intensities: [K, H, W, 3] linear, of the exposures behind a polarizer at a known angle.
+        analyzers: of these, [K, 2] or [K, 2, H, W].
+        reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or clips.
+    """
+
+    picture: Tensor
+    shown: Tensor
+    mix: Tensor | None
+    intensities: Tensor
+    analyzers: Tensor
+    reliable: Tensor
+
+    @classmethod
+    def of(cls, view: View, device: torch.device) -> PartialView:
+        """What a view measured, on a device."""
+        view = view.to(device)
+        values, exposures = view.intensities(), view.exposures
+        rays = view.camera.rays(device=device)
+        polarized = [k for k, e in enumerate(exposures) if e.angle is not None]
+        behind = analyzers([exposures[k] for k in polarized], rays, view.mount) if polarized else None
+        places = radiance_places(exposures)
+        averaged = list(places) or polarized or list(range(len(exposures)))
+        mix = None
+        if behind is not None and averaged == polarized and not (places and view.mount == "sensor"):
+            mix = behind.mean(dim=0)
+        picture = values[averaged].mean(dim=0)
+        return cls(
+            picture=picture,
+            shown=srgb_encode(picture.clamp(0, 1)),
+            mix=mix,
+            intensities=values[polarized],
+            analyzers=values.new_zeros(0, 2) if behind is None else behind,
+            reliable=(~(view.invalid | view.saturated)).float(),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StepTargets:
+    """What a step compares the rendering of one view with.
+
+    Attributes:
+        camera: of the view.
+        picture: [H, W, 3] the photograph as displayed (sRGB).
+        valid: [H, W] 1 where the photograph counts; None: everywhere.
+        empty: [H, W] 1 where the view shows nothing; None: not known.
+        partial: the measurements of a view that does not determine the Stokes vector; None: it does.
+        priors: polarization targets; None: no term of the stage reads them, or the view has none.
+    """
+
+    camera: Camera
+    picture: Tensor
+    valid: Tensor | None = None
+    empty: Tensor | None = None
+    partial: PartialView | None = None
+    priors: ViewPriors | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What the loss terms of one step read.
+
+    Attributes:
+        result: the rendered layers. targets: what they are compared with.
+        shading: of the stage, for the run's refractive index.
+        log_scales: [N, 3] of the Gaussians. extent: of the scene.
+        ssim_weight: lambda of the image terms.
+    """
+
+    result: RenderResult
+    targets: StepTargets
+    shading: ShadingModel
+    log_scales: Tensor
+    extent: float
+    ssim_weight: float = 0.2
