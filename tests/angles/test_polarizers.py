@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from polarguide.angles.polarizers import AGAIN, DISAGREE, Polarizers, mean_angle
+from polarguide.angles.polarizers import Polarizers, mean_angle
 from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene, View
 from polarguide.capture.angle_table import read_table
@@ -21,6 +21,7 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.angles import report_polarizers
 from polarguide.runs.defaults import resolve
+from polarguide.training.angle_rules import AngleRules
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
@@ -31,6 +32,7 @@ STOKES = RECIPES["polarguide-stokes"]
 WHOLE = make_scene()
 TRUTH = {view.name: view.stokes() for view in WHOLE.views}
 STEPS = 40
+RULES = AngleRules()
 CPU = choose_backend("cpu")
 
 
@@ -87,16 +89,16 @@ def test_recipes_without_the_term_ignore_angles() -> None:
 
 
 def test_the_mean_of_fits_goes_by_what_each_is_sure_of() -> None:
-    assert mean_angle([10.0, 20.0], [5.0, 5.0]) == pytest.approx((15.0, 5.0), abs=0.1)
-    mean, scatter = mean_angle([175.0, 5.0, 0.0], [2.0, 2.0, 2.0])
+    assert mean_angle([10.0, 20.0], [5.0, 5.0], RULES.least_spread) == pytest.approx((15.0, 5.0), abs=0.1)
+    mean, scatter = mean_angle([175.0, 5.0, 0.0], [2.0, 2.0, 2.0], RULES.least_spread)
     assert (mean + 90) % 180 == pytest.approx(90.0)
     assert scatter == pytest.approx(5 * math.sqrt(2 / 3), abs=0.1)
     # Three vague fits that are across, and a sure one later.
-    mean, scatter = mean_angle([130.0, 130.0, 130.0, 40.0], [12.0, 12.0, 12.0, 1.5])
+    mean, scatter = mean_angle([130.0, 130.0, 130.0, 40.0], [12.0, 12.0, 12.0, 1.5], RULES.least_spread)
     assert mean == pytest.approx(40.0)
-    assert scatter > DISAGREE
+    assert scatter > RULES.disagree
     # Surer than a degree is as sure as a degree.
-    assert mean_angle([0.0, 20.0], [1.0, 0.01])[0] == pytest.approx(10.0)
+    assert mean_angle([0.0, 20.0], [1.0, 0.01], RULES.least_spread)[0] == pytest.approx(10.0)
 
 
 def test_pictures_whose_fits_do_not_agree_are_named(tmp_path: Path) -> None:
@@ -269,7 +271,7 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
     reports: list[StepReport] = []
     settings = resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES)
     trainer = AngleTrainer(scene, STOKES, settings, CPU)
-    first, second = round(0.65 * STEPS), round(AGAIN[-1] * STEPS)
+    first, second = round(0.65 * STEPS), round(RULES.again[-1] * STEPS)
     search = first + second
     assert (trainer.begins_again, trainer.total) == (True, STEPS + search)
     trainer.run(reports.append)
@@ -277,7 +279,7 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
     assert [report.done for report in reports] == [*range(1, STEPS + search + 1)]
     assert trainer.done == trainer.total
     assert trainer.polarizers.table is not None
-    assert len(trainer.polarizers.table) == 4 + len(AGAIN)
+    assert len(trainer.polarizers.table) == 4 + len(RULES.again)
 
     # After the searches it is a training that has been told these angles, and keeps to them.
     state = AngleTrainer(scene, STOKES, settings, CPU).state
@@ -294,13 +296,14 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
 
 
 def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.angles.polarizers.SEARCH_STEPS", 20)
-    monkeypatch.setattr("polarguide.angles.trainer.SEARCH_SIZE", 16)
+    quick = dataclasses.replace(
+        STOKES, angle_rules=dataclasses.replace(RULES, search_steps=20, search_size=16)
+    )
     scene = select_exposures(WHOLE, "unknown")
     width = scene.views[0].camera.width
     assert width > 16
     trainer = AngleTrainer(
-        scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
+        scene, quick, resolve(TrainSettings(steps=STEPS, background="scene"), scene, quick), CPU
     )
     assert trainer.total == STEPS + 13 + 19
     looked_at = set[int]()
@@ -379,6 +382,6 @@ def test_the_fits_of_the_latest_search_hold() -> None:
     polarizers.take(first.repeat(4, 1, 1))
     assert (polarizers.ended, polarizers.settled) == (1, False)
     assert [judgment.angle for judgment in polarizers.judgments()] == pytest.approx([10.0] * len(fit))
-    polarizers.take(torch.cat((first.repeat(4, 1, 1), second.repeat(len(AGAIN), 1, 1))))
+    polarizers.take(torch.cat((first.repeat(4, 1, 1), second.repeat(len(RULES.again), 1, 1))))
     assert polarizers.settled
     assert [judgment.angle for judgment in polarizers.judgments()] == pytest.approx([30.0] * len(fit))

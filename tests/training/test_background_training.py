@@ -13,8 +13,7 @@ from polarguide.raster import Backend, choose_backend, rasterize_reference
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.shading.visibility import LEAST_PIXELS, touched_pixels
-from polarguide.training import losses as losses_of_steps
-from polarguide.training.losses import coverage_loss
+from polarguide.training.losses import Weights, coverage_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import first_state
@@ -94,17 +93,17 @@ def test_coverage_counts_empty_pixels_alone() -> None:
     assert float(coverage_loss(alpha.detach(), torch.zeros(2, 2))) == 0
 
 
-def test_a_step_is_pulled_to_emptiness_where_the_background_is_black(
-    black_scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_is_pulled_to_emptiness_where_the_background_is_black(black_scene: Scene) -> None:
     """The loss of the first step, with and without the term on coverage, where masks leave Gaussians outside."""
     mask = torch.zeros(black_scene.views[0].codes.shape[1:3], dtype=torch.bool)
     mask[9:11, 11:13] = True
     masked = replace(black_scene, views=tuple(replace(view, mask=mask) for view in black_scene.views))
     losses = []
-    for weight in (0.0, losses_of_steps.COVERAGE):
-        monkeypatch.setattr(losses_of_steps, "COVERAGE", weight)
-        losses.append(float(trainer(masked, "black").step().measured[2]))
+    recipe = RECIPES["3dgs"]
+    assert isinstance(recipe, Recipe)
+    for weight in (0.0, Weights().coverage):
+        stages = tuple(replace(s, weights=replace(s.weights, coverage=weight)) for s in recipe.stages)
+        losses.append(float(trainer(masked, "black", replace(recipe, stages=stages)).step().measured[2]))
     assert losses[1] > losses[0]
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 import torch
@@ -16,63 +16,13 @@ from polarguide.angles.fit import fit_angle
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
+from polarguide.training.angle_rules import AngleRules
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import ANGLE_COLUMNS
 
-FIRST, EVERY, LAST = 0.5, 0.05, 0.65
-"""Shares of all steps at which unknown angles are fitted: earlier, what is believed of them would confirm itself, and
-later, what the model has made of them meanwhile does. Their mean holds.
-"""
-CHECKS = (0.2, 0.3, 0.5)
-"""Shares of all steps at which known angles are compared with the pictures, where none is unknown. Early, the model
-predicts little; late, colors and surfaces have bent to what was specified. So each fit counts by how well its other
-pictures agree. Half size, 1,500 steps: of six wrong angles of 63 (45 or 90 degrees off), one, three and five
-contradict, five in all, and no right one.
-"""
-SEARCH_STEPS = 900
-"""Steps of the schedule by which unknown angles are sought, where the training begins again after it. Longer is not
-better: what is flat and mirrors, such as water, bends to explain its reflections without polarization.
-"""
-SEARCH_SIZE = 160
-"""Pixels of the longer side of the pictures to seek them in, at most."""
-AGAIN = (0.5, 0.65, 0.8, 0.95)
-"""Shares of the same schedule at which they are fitted in a second search, which goes by what the first one found: most
-was right, so that the model learns from it, and predicts better for the others than what they were fitted to first. A
-third search found nothing more on two scenes.
-"""
-LEAST_SPREAD = 1.0
-"""Degrees of spread under which a fit counts no more for having less."""
-WEAK = 0.22
-"""Modulation under which an angle is not relied on. Predictions that are wrong in places take some of it away, so that
-a picture through a filter seldom has all of it; half of it is usual when angles are first fitted.
-"""
-VAGUE = 15.0
-"""Spread (degrees) from which on a picture does not tell its angle."""
-LOST = 45.0
-"""Spread (degrees) from which on a fitted angle is not even the best guess. Up to 30 degrees of error such a guess is
-nearer to the picture than a photograph without a filter would be; on the table of a test scene spreads of 20 to 60
-degrees had errors under 20, mostly.
-"""
-DISAGREE = 10.0
-"""Scatter (degrees) of the fits of one picture from which on they do not agree."""
-CONTRADICTS = 20.0
-"""Degrees between the specified angle and the fitted one from which on they contradict each other, if that is also
-three times the spread and three standard deviations of what all pictures are off. Less costs little, and rings are read
-to a few degrees.
-"""
 TO_DEVIATION = 1.4826
 """Standard deviation of normal errors over the median of their absolute values."""
-LOCKED = 0.1
-"""Spread of the logarithms of fitted gains up to which exposures are taken to have been the same: the first fit has
-0.03 to 0.07 for such, and automatic exposure of 0.3 stops each way 0.13.
-"""
-FEWEST = 4
-"""Pictures from which a spread of gains is told."""
-POOR = 0.95
-"""From which ``Judgment.unexplained`` on a picture may well be at another angle. On four test scenes, two seeds, every
-picture that was over 45 degrees off exceeded it, and at most five others of 63 did; it was set by one of these seeds.
-"""
 REMEDY = (
     "Note the angle of each shot; or take three or four shots of each view at known angles, from a tripod; or treat "
     "the pictures as ordinary photographs: prepare them with --angles none."
@@ -95,6 +45,7 @@ class Judgment:
         usual: median of what the telling pictures of the same fit are ``off``: how well the model predicts any.
         unexplained: misfit of the last of all fits over the median of all pictures, times that over the misfit across:
             large where the picture is explained worse than others are, and hardly better than by a turned polarizer.
+        rules: by which it is judged.
     """
 
     view: str
@@ -111,16 +62,17 @@ class Judgment:
     scatter: float = 0.0
     unexplained: float = 0.0
     usual: float = 0.0
+    rules: AngleRules = field(default_factory=AngleRules, repr=False)
 
     @property
     def unfiltered(self) -> bool:
         """Whether it was taken without a filter, as it looks."""
-        return self.modulation + self.doubt < WEAK
+        return self.modulation + self.doubt < self.rules.weak
 
     @property
     def vague(self) -> bool:
         """Whether the picture does not tell its angle."""
-        return (self.spread > VAGUE or self.modulation < WEAK) and not self.unfiltered
+        return (self.spread > self.rules.vague or self.modulation < self.rules.weak) and not self.unfiltered
 
     @property
     def tells(self) -> bool:
@@ -130,17 +82,17 @@ class Judgment:
     @property
     def guesses(self) -> bool:
         """Whether its angle is worth believing where nothing else is known."""
-        return self.spread <= LOST and self.modulation >= WEAK
+        return self.spread <= self.rules.lost and self.modulation >= self.rules.weak
 
     @property
     def unsettled(self) -> bool:
         """Whether it tells an angle, and the fits do not agree on which."""
-        return self.tells and self.scatter > DISAGREE
+        return self.tells and self.scatter > self.rules.disagree
 
     @property
     def poorly_explained(self) -> bool:
         """Whether it tells an angle, and may well be at another all the same."""
-        return self.tells and self.unexplained > POOR
+        return self.tells and self.unexplained > self.rules.poor
 
     @property
     def off(self) -> float:
@@ -152,7 +104,7 @@ class Judgment:
         """Degrees that a picture has to be ``off`` to contradict what is said: more than others are, since where all
         are off, the model is what is wrong. From 90 on, nothing contradicts.
         """
-        return max(CONTRADICTS, 3 * self.spread, 3 * TO_DEVIATION * self.usual)
+        return max(self.rules.contradicts, 3 * self.spread, 3 * TO_DEVIATION * self.usual)
 
     @property
     def contradicts(self) -> bool:
@@ -197,11 +149,12 @@ class Polarizers:
             if exposure.filtered
         ]
         self._unknown = any(not view.exposures[k].known for view, k in self._places)
-        times = [FIRST] if self._unknown else [*CHECKS]
-        while self._unknown and times[-1] + EVERY <= LAST + 1e-9:
-            times.append(times[-1] + EVERY)
+        rules = self._rules = recipe.angle_rules
+        times = [rules.first] if self._unknown else [*rules.checks]
+        while self._unknown and times[-1] + rules.every <= rules.last + 1e-9:
+            times.append(times[-1] + rules.every)
         length = search if search and self._unknown else steps
-        rounds = (times, AGAIN) if search and self._unknown else (times,)
+        rounds = (times, rules.again) if search and self._unknown else (times,)
         self._rounds = [
             sorted({round(share * length) for share in shares}) for shares in rounds if self._places
         ]
@@ -286,7 +239,7 @@ class Polarizers:
             judgment = replace((telling or rows)[-1], unexplained=poor)
             if telling:
                 angles, spreads = [row.angle for row in telling], [row.spread for row in telling]
-                angle, scatter = mean_angle(angles, spreads)
+                angle, scatter = mean_angle(angles, spreads, self._rules.least_spread)
                 few = len(telling) < len(rows) / 2
                 judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)
             if wrong := [row for row in rows if row.contradicts]:
@@ -300,6 +253,7 @@ class Polarizers:
             Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: ANGLE_COLUMNS - 1])
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
         ]
+        rows = [replace(row, rules=self._rules) for row in rows]
         offs = [abs(row.off) for row in rows if row.tells and row.said.angle is not None]
         usual = median(offs) if offs else 0.0
         return [replace(row, usual=usual) for row in rows]
@@ -326,11 +280,11 @@ class Polarizers:
         last = zip(self._places, self.table[-1], strict=True)
         rows = [row for (view, k), row in last if not view.exposures[k].known]
         gains = [float(row[1]) for row in rows if row[-1]]
-        if len(gains) < FEWEST:
+        if len(gains) < self._rules.fewest:
             return None
         middle = median(gains)
         spread = TO_DEVIATION * median(abs(math.log(gain / middle)) for gain in gains)
-        return middle if spread > LOCKED else None
+        return middle if spread > self._rules.locked else None
 
     def _beliefs(self) -> dict[str, tuple[Exposure, ...]]:
         believed: dict[str, list[Exposure]] = {}
@@ -346,9 +300,9 @@ def predicts_filters(recipe: Recipe) -> bool:
     return recipe.shading.reflects and any(stage.weights.stokes > 0 for stage in recipe.stages)
 
 
-def search_steps(settings: ResolvedSettings) -> int:
+def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
     """Steps of the schedule by which unknown angles are sought before a training begins; 0: it does not begin again."""
-    return min(SEARCH_STEPS, settings.steps) if settings.begin_again else 0
+    return min(recipe.angle_rules.search_steps, settings.steps) if settings.begin_again else 0
 
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
@@ -362,13 +316,14 @@ def _belief(judgment: Judgment, common: float | None) -> Exposure:
     return found_exposure(said, judgment.angle, gain)
 
 
-def mean_angle(angles: Sequence[float], spreads: Sequence[float]) -> tuple[float, float]:
-    """Mean of angles in degrees that count modulo 180, each by one over its spread in degrees, and their scatter.
+def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: float) -> tuple[float, float]:
+    """Mean of angles in degrees that count modulo 180, each by one over its spread in degrees, but not
+    more than by one over ``least_spread``, and their scatter.
 
     The scatter is half the circular standard deviation of the doubled angles, sqrt(-2 log R) with R the length of their
     mean (Mardia and Jupp, Directional Statistics, 2.3), in degrees.
     """
-    weights = [1 / max(spread, LEAST_SPREAD) for spread in spreads]
+    weights = [1 / max(spread, least_spread) for spread in spreads]
     doubled = [math.radians(2 * angle) for angle in angles]
     sine = sum(weight * math.sin(angle) for weight, angle in zip(weights, doubled, strict=True))
     cosine = sum(weight * math.cos(angle) for weight, angle in zip(weights, doubled, strict=True))

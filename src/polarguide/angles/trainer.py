@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from polarguide.angles.polarizers import SEARCH_SIZE, Polarizers, search_steps
+from polarguide.angles.polarizers import Polarizers, search_steps
 from polarguide.capture import Scene, View
 from polarguide.capture.smaller import smaller
 from polarguide.raster import Backend
@@ -63,12 +63,15 @@ class AngleTrainer:
         Args:
             state: that it goes on from; None: from the beginning. table: of all fits so far.
         """
-        settings, search = self.settings, search_steps(self.settings)
+        settings, search = self.settings, search_steps(self.recipe, self.settings)
         self.polarizers = Polarizers(self.scene, self.recipe, settings.steps, table, search)
         self._searches = self.begins_again and not self.polarizers.settled
         scene, store, warn = self.scene, self._store, self._warn
         if self._searches:
-            scene, settings = smaller(scene, SEARCH_SIZE), replace(settings, steps=search)
+            scene, settings = (
+                smaller(scene, self.recipe.angle_rules.search_size),
+                replace(settings, steps=search),
+            )
             self.polarizers = Polarizers(scene, self.recipe, search, table, search)
             store, warn = None, lambda _: None
         elif self.begins_again:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.angles.polarizers import LAST, REMEDY, Judgment, Polarizers
+from polarguide.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.capture import Scene
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.view import View, listed
@@ -118,7 +118,7 @@ def find_shots(
         return ShotFindings(why="No picture was taken through a filter.", unfiltered=True)
     recipe = recipe_named(RECIPE)
     assert isinstance(recipe, Recipe)
-    blind, total = untold(scene), math.ceil(steps / LAST)
+    blind, total = untold(scene), math.ceil(steps / recipe.angle_rules.last)
     until = Polarizers(blind, recipe, total).search + 1  # angles are fitted when a step begins
     state = short_run(
         blind,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from polarguide.angles.polarizers import SEARCH_SIZE, Polarizers, search_steps
+from polarguide.angles.polarizers import Polarizers, search_steps
 from polarguide.capture import Scene
 from polarguide.raster import Backend
 from polarguide.runs.memory import in_gigabytes
@@ -86,9 +86,9 @@ def _search_share(scene: Scene, recipe: Recipe, settings: ResolvedSettings) -> f
     """What the search for unknown angles adds, over the time of all steps: as many as there are pixels."""
     if not settings.begin_again:
         return 0.0
-    steps = Polarizers(scene, recipe, settings.steps, search=search_steps(settings)).search
+    steps = Polarizers(scene, recipe, settings.steps, search=search_steps(recipe, settings)).search
     camera = scene.train_views[0].camera
-    shrunk = math.ceil(max(camera.width, camera.height) / SEARCH_SIZE)
+    shrunk = math.ceil(max(camera.width, camera.height) / recipe.angle_rules.search_size)
     return steps / settings.steps / shrunk**2
 
 

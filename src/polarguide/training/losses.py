@@ -34,9 +34,6 @@ from polarguide.training.photometric import photometric_loss, photometric_terms
 from polarguide.training.targets import Step, ViewPriors
 from polarguide.vectors import dot, unit
 
-# Weight of ``coverage_loss``.
-COVERAGE = 0.1
-
 
 def term(*priors: str, rendered: tuple[str, ...] = (), optional: bool = False, default: float = 0.0) -> float:
     """A weight, with what its term reads.
@@ -65,6 +62,7 @@ class Weights:
         stokes: S1 and S2 that the layers and the normal predict against the measured ones.
         flatness: shortest scale of the Gaussians, in percent of the scene's extent.
         consistency: alpha - cosine of the blended normal with that of the rendered depth.
+        coverage: alpha of the pixels that show nothing, where nothing is behind the subject.
     """
 
     photometric: float = term(default=1.0)
@@ -76,6 +74,7 @@ class Weights:
     stokes: float = term("stokes", "stokes_weight", rendered=("normal", "layers"))
     flatness: float = term()
     consistency: float = term("surface", rendered=("normal", "depth"), optional=True)
+    coverage: float = term(default=0.1)
 
     @property
     def priors(self) -> bool:
@@ -312,7 +311,11 @@ def flatness_term(step: Step, weights: Weights) -> Tensor | None:
 def coverage_term(step: Step, weights: Weights) -> Tensor | None:
     """The weighted alpha of the pixels that show nothing."""
     empty = step.targets.empty
-    return None if empty is None else COVERAGE * coverage_loss(step.result.alpha, empty)
+    return (
+        None
+        if empty is None or not weights.coverage
+        else weights.coverage * coverage_loss(step.result.alpha, empty)
+    )
 
 
 def normal_terms(step: Step, weights: Weights) -> Tensor:

@@ -16,6 +16,7 @@ from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization
 from polarguide.shading.model import PLAIN, ShadingModel
+from polarguide.training.angle_rules import AngleRules
 from polarguide.training.flat import FlatRules
 from polarguide.training.losses import Weights as Weights
 from polarguide.training.metals.rules import MetalRules
@@ -228,6 +229,7 @@ class Recipe(Method):
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         metals: share of all steps between which refreshes look for metals, where the shading knows them.
         metal_rules: how.
+        angle_rules: how polarizer angles are fitted and judged.
         coarse: which steps look at smaller pictures.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
@@ -245,6 +247,7 @@ class Recipe(Method):
     oriented: bool = False
     metals: tuple[float, float] = (0.4, 0.72)
     metal_rules: MetalRules = field(default_factory=MetalRules)
+    angle_rules: AngleRules = field(default_factory=AngleRules)
     coarse: Coarse = field(default_factory=Coarse)
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)
     ssim_weight: float = 0.2
