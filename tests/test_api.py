@@ -230,6 +230,17 @@ def test_a_changed_recipe_is_warned_of_on_opening(copy: Path) -> None:
     edit(copy, recipe_data=data | {"ssim_weight": 0.875})
     with pytest.warns(polarguide.PolarguideWarning, match="other values of the recipe"):
         polarguide.open_run(copy)
+    data["stages"][1]["weights"]["flatness"] = 0.875
+    edit(copy, recipe_data=data)
+    with pytest.warns(polarguide.PolarguideWarning, match="other values of the recipe"):
+        polarguide.open_run(copy)
+
+
+def test_a_run_whose_version_recorded_fewer_constants_opens_in_silence(copy: Path) -> None:
+    data = json.loads((copy / CONFIGURATION).read_text())["recipe_data"]
+    del data["metal_rules"], data["priors"]["flat_rules"], data["stages"][1]["weights"]["coverage"]
+    edit(copy, recipe_data=data)
+    assert "Gaussians" in repr(polarguide.open_run(copy))
 
 
 @pytest.mark.parametrize("place", ["", "settings"])

@@ -116,7 +116,8 @@ def test_resume_with_another_scene(refused, tmp_path: Path, demo_scene: Path, tr
 
 
 @pytest.mark.parametrize(
-    "place", ["ssim_weight", "metal_rules.begin", "priors.flat_rules.least", "propagation.rest"]
+    "place",
+    ["ssim_weight", "metal_rules.begin", "angle_rules.weak", "priors.flat_rules.least", "propagation.rest"],
 )
 def test_resume_after_a_constant_of_the_recipe_changed_names_it(
     refused, tmp_path: Path, demo_scene: Path, trained: Path, short, place: str

@@ -370,6 +370,9 @@ def _first_difference(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
     if isinstance(a, dict) and isinstance(b, dict):
         key = next(key for key in {**a, **b} if a.get(key) != b.get(key))
         return _first_difference(f"{name}.{key}", a.get(key), b.get(key))
+    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        place = next(place for place, (x, y) in enumerate(zip(a, b, strict=True)) if x != y)
+        return _first_difference(f"{name}.{place}", a[place], b[place])
     return name, a, b
 
 

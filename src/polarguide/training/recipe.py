@@ -299,9 +299,10 @@ class Recipe(Method):
         return plain
 
 
-def _differs(now: Mapping[str, Any], then: Mapping[str, Any]) -> bool:
-    """Whether one of the values of ``then`` is another now."""
-    return any(
-        _differs(now.get(key) or {}, value) if isinstance(value, dict) else now.get(key) != value
-        for key, value in then.items()
-    )
+def _differs(now: Any, then: Any) -> bool:
+    """Whether one of the values of ``then``, plain JSON, is another now; what it does not have counts for nothing."""
+    if isinstance(then, dict):
+        return not isinstance(now, dict) or any(_differs(now.get(key), value) for key, value in then.items())
+    if isinstance(then, list) and isinstance(now, list) and len(now) == len(then):
+        return any(map(_differs, now, then))
+    return bool(now != then)
