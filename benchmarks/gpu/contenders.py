@@ -16,6 +16,7 @@ from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.training.losses import Weights
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
@@ -104,7 +105,7 @@ class Ours:
             torch.rand(len(gaussians), 8, device=gaussians["means"].device),
         )
         splats = Splats(*(t.detach().requires_grad_() for t in inputs))
-        shown = trainer._sizes.feed(trainer.state.step).shown(view).picture
+        shown = trainer._feed.targets(trainer.state.step, view, Weights(), None).picture
         prediction = shown.clone().requires_grad_()
 
         def raster() -> None:

@@ -18,7 +18,7 @@ SMALL = ["--downscale", "8", "--threads", "1"]
 def test_steps_of_recipes() -> None:
     assert chosen_steps(("5000",)) == (5000, {})
     assert chosen_steps(("5000", "gnerp=10000")) == (5000, {"gnerp": 10000})
-    assert chosen_steps(("gnerp:circular=7",)) == (5000, {"gnerp:circular": 7})
+    assert chosen_steps(("gnerp:circular=7",)) == (None, {"gnerp:circular": 7})
 
 
 @pytest.mark.parametrize("words", [("5000", "3000"), ("gnerp=",), ("gnerp=1", "gnerp=2"), ("many",), ("-5",)])

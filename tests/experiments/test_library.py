@@ -43,7 +43,8 @@ def test_a_comparison_and_an_ablation_share_runs(
         options=OPTIONS,
         reporter=messages,
     )
-    assert messages.said == ["runs: 1, of them finished before: 0", "done  demo, 3dgs-dr, seed 0"]
+    index = "demo: refractive index 1.5, as scene.json says"
+    assert messages.said == [index, "runs: 1, of them finished before: 0", "done  demo, 3dgs-dr, seed 0"]
     assert read_results(tmp_path / "results.json") == results
     (run,) = results["runs"]
     assert (run["state"], run["error"]) == ("done", None)

@@ -147,7 +147,7 @@ def test_what_is_found_once_of_all_views_is_not_forecast_for_each(
 ) -> None:
     clock = 0.0
 
-    def slow(views: object, index: float) -> dict[str, Flat]:
+    def slow(views: object, index: float, rules: object) -> dict[str, Flat]:
         nonlocal clock
         clock += 1000.0
         return {}

@@ -135,7 +135,7 @@ def test_the_point_cloud_says_what_metals_are(tmp_path: Path) -> None:
     torch.testing.assert_close(read["reflectance"], expected)
     torch.testing.assert_close(read["roughness"], torch.sigmoid(state.gaussians["roughness_logits"]).detach())
     # Ordinary viewers show what the metals mirror, not the base color that does not count.
-    directions = spread_directions(12)
+    directions = spread_directions(12).float()
     shown = shown_colors(state, shading, directions)
     state.gaussians.overwrite("sh_dc", state.gaussians["sh_dc"] + 1.0)
     after = shown_colors(state, shading, directions)
@@ -255,7 +255,7 @@ def test_what_becomes_a_metal_looks_as_before() -> None:
     assert torch.equal(convert(values, fresh, torch.full((COUNT, 3), 0.8)), fresh)
     texels = torch.full((6, RESOLUTION, RESOLUTION, 3), -1.0)
     mirror_base(values, texels, fresh, torch.exp)
-    toward = spread_directions(40)
+    toward = spread_directions(40).float()
     normals = shortest_axis_normals(
         values["means"], values["quaternions"], values["log_scales"], torch.zeros(3), None
     ).detach()

@@ -77,7 +77,7 @@ def test_a_killed_rank_ends_all_and_the_run_goes_on_alone(
             demo_scene,
             out,
             recipe="3dgs",
-            settings=polarguide.TrainSettings(STEPS, views_per_step=0),
+            settings=polarguide.TrainSettings(STEPS),
             session=SessionOptions(threads=1),
             reading=SceneOptions(downscale=4),
             resume=True,

@@ -87,7 +87,7 @@ def priors(
         run=run,
         views=None if views == "test" else views,
         threshold=threshold,
-        memory=memory or None,
+        memory=memory,
     )
     if downscale != 1:
         raise PolarguideError(
