@@ -32,7 +32,6 @@ from polarguide.neural.recipe import NeuralRecipe
 from polarguide.neural.state import FieldState
 from polarguide.options import Transfer
 from polarguide.records import LARGEST_RECORD, decode
-from polarguide.runs.memory import MemoryPlan
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings
@@ -60,8 +59,6 @@ class RunConfiguration:
         downscale: side of the averaged pixel boxes. transfer: how the files were read.
         device: what it trained on. version: of the program.
         test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
-        memory: how the training last stayed within its memory, which its result does not depend on; None in runs of the
-            first versions.
     """
 
     scene: Annotated[str, msgspec.Meta(min_length=1)]
@@ -74,7 +71,6 @@ class RunConfiguration:
     device: str
     version: str = __version__
     test_views: tuple[str, ...] | None = None
-    memory: MemoryPlan | None = None
 
     @classmethod
     def of(
@@ -83,7 +79,6 @@ class RunConfiguration:
         recipe: Method,
         settings: ResolvedSettings,
         device: torch.device,
-        memory: MemoryPlan | None = None,
     ) -> RunConfiguration:
         """What is recorded of a training."""
         return cls(
@@ -96,7 +91,6 @@ class RunConfiguration:
             transfer="srgb" if scene.transfer == "srgb" else "linear",
             device=str(device),
             test_views=scene.test_names,
-            memory=memory,
         )
 
     def save(self, run: Path) -> None:

@@ -122,7 +122,7 @@ def train(
             reporter.warn(f"{idle} of {ranks.world} processes have no view to look at")
         if settings.background == "auto" and resolved.background == "black" and leads:
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
-        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device, plan)
+        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device)
         state = None
         if resume:
             if leads:

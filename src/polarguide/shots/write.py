@@ -119,7 +119,7 @@ def write_view_maps(
     options: ShotOptions | None = None,
     *,
     formats: Collection[str] = FORMATS,
-    refractive_index: float = 1.5,
+    refractive_index: float | None = None,
     reporter: Reporter = SILENT,
 ) -> dict[str, Path]:
     """Write all maps of views of a scene, a folder for each; returns the folders by name.
