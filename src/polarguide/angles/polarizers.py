@@ -250,10 +250,12 @@ class Polarizers:
     def _judged(self, fit: Tensor) -> list[Judgment]:
         """What one fit [P, 8] says of each picture."""
         rows = [
-            Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: ANGLE_COLUMNS - 1])
+            replace(
+                Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: ANGLE_COLUMNS - 1]),
+                rules=self._rules,
+            )
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
         ]
-        rows = [replace(row, rules=self._rules) for row in rows]
         offs = [abs(row.off) for row in rows if row.tells and row.said.angle is not None]
         usual = median(offs) if offs else 0.0
         return [replace(row, usual=usual) for row in rows]

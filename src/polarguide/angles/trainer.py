@@ -68,10 +68,8 @@ class AngleTrainer:
         self._searches = self.begins_again and not self.polarizers.settled
         scene, store, warn = self.scene, self._store, self._warn
         if self._searches:
-            scene, settings = (
-                smaller(scene, self.recipe.angle_rules.search_size),
-                replace(settings, steps=search),
-            )
+            scene = smaller(scene, self.recipe.angle_rules.search_size)
+            settings = replace(settings, steps=search)
             self.polarizers = Polarizers(scene, self.recipe, search, table, search)
             store, warn = None, lambda _: None
         elif self.begins_again:

@@ -17,7 +17,7 @@ from polarguide.files import atomic, in_utf8, make_folder, require_inside, write
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
 from polarguide.shots.catalog import KINDS
-from polarguide.shots.develop import check_files, require_four_pictures
+from polarguide.shots.develop import check_files
 from polarguide.shots.exposures import (
     ExposureSet,
     find_shots,
@@ -126,16 +126,14 @@ def write_view_maps(
 
     Args:
         views: with pictures at 0, 45, 90 and 135 degrees; what is written is of these, as they are.
-        out, options, formats, refractive_index, reporter: as for ``write_shots``; of the options ``full_well``,
-            ``read_noise`` and ``snr`` apply.
+        formats: some of ``FORMATS``; ``check_formats`` is the caller's, before work begins.
+        out, options, refractive_index, reporter: as for ``write_shots``; of the options ``full_well``, ``read_noise``
+            and ``snr`` apply.
 
     Raises:
         PolarguideError: a view has other pictures, or an option is wrong.
     """
     options = (options or ShotOptions()).checked()
-    check_formats(formats)
-    for view in views:
-        require_four_pictures(view)
     folders: dict[str, Path] = {}
     with reporter.track("maps", len(views)) as advance:
         for number, view in enumerate(views, 1):
