@@ -393,7 +393,7 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
             name, a, b = _first_difference(field, a, b)
             raise PolarguideError(
                 f"{out}/{CONFIGURATION} ({name})",
-                expected=json.dumps(a, default=str)[:120],
-                found=json.dumps(b, default=str)[:120],
+                expected="none recorded" if a is None else json.dumps(a, default=str)[:120],
+                found="none" if b is None else json.dumps(b, default=str)[:120],
                 remedy="Resume with the same scene, options and program version, or train into a new folder.",
             )
