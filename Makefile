@@ -18,7 +18,8 @@
 #   PYTEST='-n 0 -k name'  options of the tests, which run on all cores, at most 8
 
 PYTHON ?= python3
-PYTEST ?= -n auto --maxprocesses 8 --dist loadfile
+# In the order of the files: sorted by their number of tests, as is the default, the longest ones come last, one by one.
+PYTEST ?= -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 VENV := .venv
 BIN := $(VENV)/bin

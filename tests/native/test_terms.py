@@ -128,7 +128,7 @@ SINGLE = [
 
 
 def names(weights: Weights) -> str:
-    return "+".join(f.name for f in fields(weights)[1:] if getattr(weights, f.name))
+    return "+".join(f.name for f in fields(weights) if getattr(weights, f.name) != f.default)
 
 
 def step(result: RenderResult, priors: ViewPriors, shading: ShadingModel = SHADING) -> Step:

@@ -248,7 +248,9 @@ def test_every_term_reads_targets_and_layers_that_there_are() -> None:
         assert {*weight.metadata["rendered"]} <= {"normal", "depth", "layers"}, weight.name
         assert alone.normals == ("normal" in weight.metadata["rendered"]), weight.name
         # Priors are made for whoever needs them, and the agreement with the depth does without.
-        assert alone.priors == (weight.name not in ("photometric", "flatness", "consistency")), weight.name
+        assert alone.priors == (weight.name not in ("photometric", "flatness", "consistency", "coverage")), (
+            weight.name
+        )
 
 
 def test_few_polarized_pixels_pull_no_harder_than_many(priors: ViewPriors) -> None:
