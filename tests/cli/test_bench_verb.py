@@ -14,9 +14,9 @@ from polarguide.installation import install_extra
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--scenes", "cup"], "--scenes: expected scenes of the development half"),
+        (["--scenes", "rough"], "--scenes: expected scenes of the development half"),
         (["--scenes", "cat"], "--scenes: expected one of figure, kit, car, water"),
-        (["--held-back", "--scenes", "kit"], "--scenes: expected one of cup, metals-b"),
+        (["--held-back", "--scenes", "kit"], "--scenes: expected one of metals-b, ceramic-b"),
         (["--threads", "0"], "--threads: expected 1 or more"),
         (["--jobs", "-1"], "--jobs: expected 0 or more"),
     ],

@@ -133,6 +133,18 @@ def test_resume_after_a_constant_of_the_recipe_changed_names_it(
     assert f"(recipe_data.{place}): expected 0.875, found {json.dumps(value)}" in line
 
 
+def test_resume_with_another_version_of_the_program(
+    refused, tmp_path: Path, demo_scene: Path, trained: Path, short
+) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    path = tmp_path / "run" / CONFIGURATION
+    data = json.loads(path.read_text())
+    data["version"] += "7"
+    path.write_text(json.dumps(data))
+    line = refused("train", demo_scene, "--out", tmp_path / "run", "--resume", *short)
+    assert f'(version): expected "{data["version"]}"' in line
+
+
 @pytest.mark.parametrize("verb", ["eval", "render"])
 def test_a_folder_that_is_no_run(refused, tmp_path: Path, verb: str) -> None:
     for folder in (tmp_path, tmp_path / "none"):
