@@ -387,7 +387,8 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
             remedy="The stages of a training are shares of its steps, so that it cannot be made longer or shorter: "
             f"give --steps {old.settings.steps}, or train with --steps {new.settings.steps} into a new folder.",
         )
-    for field in ("version", "scene_digest", "recipe", "recipe_data", "settings", "downscale", "transfer", "test_views"):
+    # All but where the scene lies and the device decide the result.
+    for field in sorted(old.__annotations__.keys() - {"scene", "device"}):
         a, b = getattr(old, field), getattr(new, field)
         if a != b and a is not None:
             name, a, b = _first_difference(field, a, b)
