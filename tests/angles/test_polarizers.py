@@ -14,8 +14,7 @@ from torch import Tensor
 from polarguide.angles.polarizers import Polarizers, mean_angle
 from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene, View
-from polarguide.capture.angle_table import read_table
-from polarguide.capture.exposures import FOUR, Exposure
+from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, recipe_named

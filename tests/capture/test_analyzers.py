@@ -12,8 +12,7 @@ import pytest
 from made_sensor import COLORS, MadeSensor, made_sensor, true_calibration
 
 from polarguide.capture.sensor.analyzer_file import read_analyzers, write_analyzers
-from polarguide.capture.sensor.analyzer_matrices import correction_matrices
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration, correction_matrices, spread_to_cells
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES

@@ -13,9 +13,8 @@ import torch
 
 from polarguide import PolarguideError
 from polarguide.capture import load_scene
-from polarguide.capture.angle_table import read_table, table_text
-from polarguide.capture.exposures import FOUR, Exposure
-from polarguide.capture.filter.single_shots import find_single_shots
+from polarguide.capture.exposures import FOUR, Exposure, read_table, table_text
+from polarguide.capture.filter.shots import find_single_shots
 from polarguide.inspection.capture import read_capture
 from polarguide.polarizer import malus, stokes_of_four
 from tests.helpers.tiny_capture import NAMES, TinyCapture, write_picture, write_tiny_capture

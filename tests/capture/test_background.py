@@ -11,7 +11,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera, look_at
 from polarguide.capture import Scene, View
-from polarguide.capture.background import empty_pixels, has_black_background, mask_background
+from polarguide.capture.variants import empty_pixels, has_black_background, mask_background
 from polarguide.errors import PolarguideError
 
 WIDTH, HEIGHT = 40, 30

@@ -11,8 +11,7 @@ import pycolmap
 import pytest
 
 from polarguide.capture.colmap import sfm
-from polarguide.capture.colmap.chance import connected_views, log_false_alarms
-from polarguide.capture.colmap.sfm import NotConnectedError, reconstruct
+from polarguide.capture.colmap.sfm import NotConnectedError, connected_views, log_false_alarms, reconstruct
 from polarguide.progress import SILENT
 
 WIDTH, HEIGHT, COUNT = 64, 48, 80

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from camera_files import COLOR, MONO, behind, busy_light, mosaic, smooth_light, write_mosaic
 
-from polarguide.capture.sensor.color_filters import SIDE, color_filters
+from polarguide.capture.sensor.pattern import SIDE, color_filters
 from polarguide.errors import PolarguideError
-from polarguide.preparation.mosaic_samples import sample_blocks
+from polarguide.preparation.mosaic_source import sample_blocks
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

@@ -15,7 +15,7 @@ from tiny_capture import HEIGHT, WIDTH, TinyCapture, encode_srgb
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import load_scene
 from polarguide.capture.exposures import Exposure
-from polarguide.capture.smaller import SmallerViews, smaller
+from polarguide.capture.variants import SmallerViews, smaller
 
 
 def slow_boxes(values: np.ndarray, factor: int) -> list[list[np.ndarray]]:

@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 
 from polarguide.capture.datasets import open_dataset
-from polarguide.capture.formats.arrays import BROKEN, read_array, read_arrays, unpacked
+from polarguide.capture.formats.arrays import BROKEN, read_array, read_arrays, read_radiance, unpacked
 from polarguide.capture.formats.integrity import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_stored
-from polarguide.capture.formats.radiance import read_radiance
-from polarguide.capture.objects import objects_of
+from polarguide.capture.ground_truth import objects_of
 from polarguide.capture.pose_files import read_pose_file
 from polarguide.errors import PolarguideError
 

@@ -16,12 +16,11 @@ from hostile_files import deflated_tiff, exr, header, two_sizes_hdr
 from tiny_capture import NAMES, TinyCapture, write_tiny_capture
 
 from polarguide.capture import load_scene, view_reader
-from polarguide.capture.formats.headers import read_picture, stated_size
 from polarguide.capture.formats.integrity import declared_size
-from polarguide.capture.formats.pictures import decode_stored
+from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_size
 from polarguide.capture.memory import KEPT, READ, SHARE
 from polarguide.errors import PolarguideError
-from polarguide.preparation.mosaic_files import WORKED
+from polarguide.preparation.mosaic_source import WORKED
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.shots import ShotOptions, read_shot
@@ -171,7 +170,7 @@ def test_a_tiff_is_not_read_whole_for_its_size(
     (start,) = struct.unpack_from("<Q" if big else "<I", data, at)
     struct.pack_into("<Q" if big else "<I", data, at, len(data))
     path.write_bytes(bytes(data) + bytes(data[start : start + 400]))
-    monkeypatch.setattr("polarguide.capture.formats.headers.open", lambda p, mode: Counted(p), raising=False)
+    monkeypatch.setattr("polarguide.capture.formats.pictures.open", lambda p, mode: Counted(p), raising=False)
     assert stated_size(path) == (900, 700)
     assert sum(read) < 2000
 

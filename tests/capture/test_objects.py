@@ -10,7 +10,7 @@ import pytest
 from tiny_capture import HEIGHT, WIDTH, TinyCapture
 
 from polarguide.capture import load_scene
-from polarguide.capture.objects import Material
+from polarguide.capture.ground_truth import Material
 from polarguide.errors import PolarguideError
 
 CUP = {

@@ -11,7 +11,7 @@ import pytest
 from dataset_files import HEIGHT, INNER, WIDTH, idr_cameras, poses
 
 from polarguide.camera import Camera
-from polarguide.capture.colmap.write import colmap_camera
+from polarguide.capture.colmap.files import colmap_camera
 from polarguide.capture.pose_files import read_pose_file
 from polarguide.errors import PolarguideError
 from polarguide.export.cameras import write_transforms

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from polarguide.capture.relative_exposures import exposures_of_points, reconciled
+from polarguide.preparation.exposure_table import exposures_of_points, reconciled
 
 
 def made(pictures: int, points: int, seed: int, *, share: float = 0.5) -> tuple[np.ndarray, np.ndarray]:

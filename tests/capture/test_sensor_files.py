@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from camera_files import COLOR, MONO, pack, write_mosaic
 
-from polarguide.capture.sensor.packing import PACKINGS, packed_size, unpack
-from polarguide.capture.sensor.pattern import sensor_pattern
-from polarguide.capture.sensor.radiometry import estimate_levels, unusable_samples
-from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic
+from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, unusable_samples
+from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, packed_size, read_mosaic, unpack
 from polarguide.errors import PolarguideError
 
 

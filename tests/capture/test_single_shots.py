@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
-from polarguide.capture.filter.exif_exposure import read_taken, taken
-from polarguide.capture.filter.single_shots import split_name
-from polarguide.capture.polarizer_angles import Angle, angle_labels, turned
+from polarguide.capture.exposures import Angle, angle_labels, turned
+from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken, taken
+from polarguide.capture.filter.shots import split_name
 from polarguide.polarizer import malus
 from polarguide.synth.filter_shots import FilterShot, behind_filter, exif_tags, filter_jpeg
 from polarguide.synth.sensor import Sensor

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from polarguide.camera import Camera
-from polarguide.capture.unseen_points import unseen_points
+from polarguide.capture.colmap.model import unseen_points
 
 STILL = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
 CAMERA = Camera(24, 20, 30.0, 30.0, 12.0, 10.0, *STILL)

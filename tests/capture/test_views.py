@@ -16,11 +16,9 @@ from tiny_capture import HEIGHT, WIDTH, ideal_intensities, write_tiny_capture
 
 from polarguide.capture import Scene, View, load_scene
 from polarguide.capture import box_filter as boxes
-from polarguide.capture.background import mask_background
 from polarguide.capture.exposures import FOUR
-from polarguide.capture.loader import Loader
-from polarguide.capture.smaller import SmallerViews
-from polarguide.capture.variants import select_exposures
+from polarguide.capture.variants import SmallerViews, mask_background, select_exposures
+from polarguide.capture.view import Loader
 from polarguide.errors import PolarguideError
 from polarguide.options import Exposures
 from polarguide.training.priors import view_priors
@@ -112,7 +110,7 @@ def test_a_changed_view_loads_its_pictures_when_they_are_read(
     held, stored = (masked_scene(tmp_path / "s", hold=hold).train_views for hold in (True, False))
     decoded = counted(monkeypatch, cv2, "imdecode")
     averaged = counted(monkeypatch, boxes, "mean_codes")
-    monkeypatch.setattr("polarguide.capture.smaller.mean_codes", boxes.mean_codes)
+    monkeypatch.setattr("polarguide.capture.variants.mean_codes", boxes.mean_codes)
     views = SmallerViews(stored, 2) if small else stored
     found = CHANGES[name](views[0])
     assert not decoded
@@ -134,7 +132,7 @@ def test_the_pictures_of_a_view_are_made_once_for_its_priors(
     views = SmallerViews(stored, 2) if small else stored
     decoded = counted(monkeypatch, cv2, "imdecode")
     averaged = counted(monkeypatch, boxes, "mean_codes")
-    monkeypatch.setattr("polarguide.capture.smaller.mean_codes", boxes.mean_codes)
+    monkeypatch.setattr("polarguide.capture.variants.mean_codes", boxes.mean_codes)
     for count, view in enumerate(views[:2], 1):
         normal = torch.tensor([0.0, 0.0, -1.0]).expand(view.camera.height, view.camera.width, 3)
         view_priors(view, normal, Priors(), 1.5)

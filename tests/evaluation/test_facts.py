@@ -8,7 +8,7 @@ import pytest
 import torch
 from known_scene import known_scene
 
-from polarguide.capture.objects import Material, SceneObject
+from polarguide.capture.ground_truth import Material, SceneObject
 from polarguide.evaluation.facts import SceneFacts
 
 

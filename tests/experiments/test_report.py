@@ -20,7 +20,7 @@ from browsers import chromium
 from comparison_records import part, results, run, unfinished
 
 from polarguide.capture import GroundTruth, Scene
-from polarguide.capture.objects import Material, SceneObject
+from polarguide.capture.ground_truth import Material, SceneObject
 from polarguide.experiments.curves import Curve, curves_svg, read_curve, smoothed, ticks
 from polarguide.experiments.forms import sections
 from polarguide.experiments.report import _ground_truth_tile, report_html

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import GroundTruth, Scene, View
-from polarguide.capture.objects import Material, SceneObject
+from polarguide.capture.ground_truth import Material, SceneObject
 
 HEIGHT, WIDTH = 20, 26
 OBJECTS = (

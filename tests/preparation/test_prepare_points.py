@@ -14,8 +14,8 @@ from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
 from polarguide.capture.colmap import triangulate as points_module
-from polarguide.capture.colmap.visual_hull import sample_visual_hull
-from polarguide.capture.colmap.write import PosedCamera, write_cameras
+from polarguide.capture.colmap.files import PosedCamera, write_cameras
+from polarguide.capture.colmap.triangulate import sample_visual_hull
 from polarguide.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

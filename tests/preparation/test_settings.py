@@ -15,8 +15,8 @@ from camera_files import write_mosaics
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.datasets import DATASETS
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES
-from polarguide.capture.sensor.packing import PACKINGS
 from polarguide.capture.sensor.pattern import SENSORS
+from polarguide.capture.sensor.raw_file import PACKINGS
 from polarguide.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings

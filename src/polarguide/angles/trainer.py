@@ -10,7 +10,7 @@ from torch import Tensor
 
 from polarguide.angles.polarizers import Polarizers, search_steps
 from polarguide.capture import Scene, View
-from polarguide.capture.smaller import smaller
+from polarguide.capture.variants import smaller
 from polarguide.raster import Backend
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import ShadingModel

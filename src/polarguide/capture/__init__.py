@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polarguide.capture.colmap.model import ColmapModel, read_model
+    from polarguide.capture.ground_truth import GroundTruth
     from polarguide.capture.reader import load_scene
-    from polarguide.capture.view import GroundTruth, Scene, View
+    from polarguide.capture.view import Scene, View
 
 _MODULES = {
     "ColmapModel": "colmap.model",
-    "GroundTruth": "view",
+    "GroundTruth": "ground_truth",
     "Scene": "view",
     "View": "view",
     "load_scene": "reader",

@@ -9,8 +9,7 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from polarguide.capture.angle_table import TABLE, Line, read_table
-from polarguide.capture.exposures import FOUR, Exposure
+from polarguide.capture.exposures import FOUR, TABLE, Exposure, Line, read_table
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.view import ANGLES, listed, unknown_view
 from polarguide.errors import PolarguideError

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from polarguide.capture.formats.headers import stated_size
+from polarguide.capture.formats.pictures import stated_size
 from polarguide.capture.layout import Layout
 from polarguide.errors import PolarguideError
 from polarguide.system import free_memory

@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polarguide.capture.colmap.write import PosedCamera
-from polarguide.capture.datasets.cameras import checked_pose, pinhole_camera, read_projections
+from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.datasets.dataset import checked_pose, pinhole_camera, read_projections
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
-from polarguide.capture.formats.pictures import read_file
 from polarguide.errors import PolarguideError
+from polarguide.files import read_file
 from polarguide.numerals import decimal
 from polarguide.records import read_record
 

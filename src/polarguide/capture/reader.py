@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 
 from polarguide.camera import Camera
 from polarguide.capture import checks
-from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unused_poses
+from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
 from polarguide.capture.exposures import FOUR
 from polarguide.capture.formats.pictures import TRANSFERS
+from polarguide.capture.ground_truth import GroundTruth, objects_of
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.memory import check_memory, stated_size
 from polarguide.capture.metadata import held_out, indices_of, mount_of, refractive_index_of
-from polarguide.capture.objects import objects_of
 from polarguide.capture.split import chosen_views, far_from_training, held_out_band
-from polarguide.capture.unseen_points import unseen_points
-from polarguide.capture.view import GroundTruth, Scene, listed
+from polarguide.capture.view import Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, ViewFiles, check_materials, read_view
 from polarguide.errors import PolarguideError
 from polarguide.options import Split, check_choice

@@ -1,20 +1,129 @@
-"""A scene with fewer pictures of each view, computed from four: what ``compare --exposures`` trains on."""
+"""Scenes made of a scene: on black, with fewer pictures of each view, or with smaller ones."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.ndimage import label
 from torch import Tensor
 
 from polarguide import optics
+from polarguide.camera import seen_at
+from polarguide.capture.box_filter import agreed, every, maximum, mean_codes
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
-from polarguide.capture.view import FULL_CODE, Scene, View
+from polarguide.capture.view import FULL_CODE, Latest, Loader, Scene, View
 from polarguide.errors import PolarguideError
 from polarguide.options import EXPOSURES, Exposures, check_choice
 from polarguide.polarizer import ANGLES
+
+BLACK = 0.005
+"""Linear S0/2 up to which a pixel is black: a little over one step of 8 bits, which is what noise and rounding leave of
+no light."""
+BLACK_EDGE = 0.95
+"""Share of a picture's outermost pixels that are black where there is nothing behind the subject."""
+BLACK_VIEWS = 0.9
+"""Share of the views whose edge has to be black."""
+GROWN = 3
+"""Pixels by which a subject is grown before what is outside counts as empty: edges are blended."""
+INSIDE = 0.8
+"""A point belongs to the subject if it is in the mask in this share of the pictures that see it."""
+
+
+def black_pixels(view: View) -> Tensor:
+    """Where the photograph shows no light, [H, W] bool, on the CPU: what *black* means wherever pictures are judged.
+
+    It is the mean over the color channels and 3 x 3 pixels that is compared, so that noise does not lighten a pixel.
+    """
+    picture = view.photograph().cpu().mean(dim=-1).numpy()
+    return torch.from_numpy(np.asarray(cv2.blur(picture, (3, 3)) <= BLACK))
+
+
+def has_black_background(views: Sequence[View]) -> bool:
+    """Whether nothing is behind the subject: the edges of nearly all pictures are black, see ``BLACK_EDGE``."""
+    black = sum(_black_edge(view) for view in views)
+    return bool(views) and black >= BLACK_VIEWS * len(views)
+
+
+def empty_pixels(view: View) -> Tensor:
+    """Where a picture of a subject before black shows nothing, [H, W] bool.
+
+    That is outside its mask, where it has one; elsewhere the black that reaches the edge of the picture, so that a dark
+    spot of the subject is not taken for a hole. The subject is grown by ``GROWN`` pixels.
+    """
+    if view.mask is not None:
+        subject = view.mask.cpu().numpy()
+    else:
+        black = _black(view)
+        regions, _ = label(black)
+        outside = np.unique(np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]]))
+        subject = ~np.isin(regions, outside[outside > 0])
+    return torch.from_numpy(~_grown(subject, GROWN))
+
+
+def mask_background(scene: Scene) -> Scene:
+    """The scene with black pictures outside the masks, and with the points of the subject only.
+
+    Raises:
+        PolarguideError: a view has no mask, or no point lies in the masks.
+    """
+    views = []
+    for view in scene.views:
+        if view.mask is None:
+            raise PolarguideError(
+                scene.root / "masks",
+                expected="a mask of every view for --background masked",
+                found=f"none of view {view.name}",
+                remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
+            )
+        views.append(view.masked())
+    # The masks of test views tell training nothing.
+    inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])
+    if len(scene.points) and not bool(inside.any()):
+        raise PolarguideError(
+            scene.root / "masks",
+            expected="masks with points of the COLMAP model in them",
+            found=f"none of {len(scene.points)} points",
+            remedy="White is the subject there: invert the masks, or choose another background.",
+        )
+    return replace(
+        scene, views=tuple(views), points=scene.points[inside], point_colors=scene.point_colors[inside]
+    )
+
+
+def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
+    """Which points [M, 3] lie in the grown masks of most of the pictures that they fall into, [M] bool."""
+    seen, inside = torch.zeros(len(points)), torch.zeros(len(points))
+    for view in views:
+        assert view.mask is not None
+        mask = torch.from_numpy(_grown(view.mask.cpu().numpy(), GROWN))
+        pixel, _, within = seen_at(points.double() - view.camera.center, view.camera)
+        seen += within
+        inside += within & mask[pixel]
+    return (seen > 0) & (inside >= INSIDE * seen)
+
+
+def _black(view: View) -> NDArray[np.bool_]:
+    """Where the picture is black, [H, W]; pixels marked as invalid count as black."""
+    return (black_pixels(view) | view.invalid.cpu()).numpy()
+
+
+def _black_edge(view: View) -> bool:
+    black = _black(view)
+    edge = np.concatenate([black[0], black[-1], black[1:-1, 0], black[1:-1, -1]])
+    return bool(edge.mean() >= BLACK_EDGE) and not bool(black.all())
+
+
+def _grown(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disk) > 0)
+
 
 THREE = (0.0, 60.0, 120.0)
 EVERY = 4
@@ -119,3 +228,77 @@ _CHANGES: dict[str, Change] = {
     "sparse": lambda view, place: view if place % EVERY == 0 else None,
     "none": _plain,
 }
+
+
+def smaller_view(view: View, factor: int, latest: Latest) -> View:
+    """A view averaged over boxes of pixels, as if it had been read so; its codes are made when they are read.
+
+    Codes are averaged; they are linear, so Stokes vectors are averaged, and angles never are. A pixel is invalid or
+    saturated where any pixel of its box is; it belongs to the mask or to a material where all are. Incomplete boxes at
+    the right and bottom are dropped. The view has no ground truth.
+
+    Args:
+        view: the whole view. factor: side of the boxes in pixels. latest: where the codes of a view in memory stay.
+    """
+    whole = view.pictures
+
+    def averaged(codes: Tensor) -> Tensor:
+        return torch.from_numpy(np.stack([mean_codes(picture, factor) for picture in codes.numpy()]))
+
+    def boxed(flags: Tensor, reduce: Callable[[NDArray[Any], int], NDArray[Any]]) -> Tensor:
+        return torch.from_numpy(reduce(flags.numpy(), factor))
+
+    return replace(
+        view,
+        camera=view.camera.downscaled(factor),
+        pictures=whole.then(averaged)
+        if isinstance(whole, Loader)
+        else Loader(lambda: averaged(whole), latest),
+        invalid=boxed(view.invalid, maximum),
+        saturated=boxed(view.saturated, maximum),
+        mask=None if view.mask is None else boxed(view.mask, every),
+        truth=None,
+        materials=None if view.materials is None else boxed(view.materials.int(), agreed).to(torch.uint8),
+    )
+
+
+class SmallerViews(Sequence[View]):
+    """Views averaged over boxes of pixels, each made at its first use."""
+
+    def __init__(self, views: Sequence[View], factor: int) -> None:
+        self._views, self._factor = views, factor
+        self._made: dict[int, View] = {}
+        self._latest = Latest()
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, place):  # type: ignore[no-untyped-def]
+        """The view at a place, or those of a slice."""
+        if isinstance(place, slice):
+            return [self[k] for k in range(*place.indices(len(self)))]
+        place = range(len(self))[place]
+        if place not in self._made:
+            self._made[place] = smaller_view(self._views[place], self._factor, self._latest)
+        return self._made[place]
+
+    def __iter__(self) -> Iterator[View]:
+        return (self[k] for k in range(len(self)))
+
+
+def smaller(scene: Scene, longest: int) -> Scene:
+    """The training views averaged until none has a side longer than ``longest`` pixels, see ``smaller_view``.
+
+    It has neither masks nor ground truth, nor the views that are held out.
+
+    Returns:
+        The scene itself where its pictures are small enough.
+    """
+    views = scene.train_views
+    size = max(max(view.camera.width, view.camera.height) for view in views)
+    factor = math.ceil(size / longest)
+    if factor == 1:
+        return scene
+    small = (smaller_view(view, factor, Latest()) for view in views)
+    held = (replace(view, pictures=view.codes, mask=None, subject_only=False) for view in small)
+    return replace(scene, views=tuple(held), test_names=())

@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,35 +21,54 @@ from polarguide.capture.exposures import (
     measure_radiance,
     radiance_places,
 )
-from polarguide.capture.loader import Loader
-from polarguide.capture.objects import SceneObject
+from polarguide.capture.ground_truth import GroundTruth, SceneObject
 from polarguide.errors import PolarguideError
 from polarguide.optics import Mount
 from polarguide.polarizer import ANGLES as ANGLES
 
-FULL_CODE = 65535
-"""The code of linear intensity 1."""
+T = TypeVar("T")
 
 
-@dataclass(frozen=True, eq=False)
-class GroundTruth:
-    """Ground truth of a view. Any field may be None.
+class Latest:
+    """Room for one value: the last one that any of the loaders which share it made."""
 
-    Attributes:
-        normal: unit surface normals in the world, zero where there is no surface, [H, W, 3] float32.
-        depth: camera z in world units, 0 where there is no surface or it is not known, [H, W] float32.
-        mask: foreground, [H, W] bool.
-        specular, diffuse: first-surface lobes as linear S0, in the exposure of the pictures, [H, W, 3]
-            float32. Pictures are S0 / 2, so compare rendered layers with half of these.
-        object_ids: which object each pixel shows, as ``SceneObject.id``; 0 for none, or several, [H, W] int32.
+    def __init__(self) -> None:
+        self.kept: tuple[object, Any] | None = None
+
+
+class Loader(Generic[T]):
+    """Makes a value when it is called.
+
+    Views are worked on one after the other, and each is read several times. So the last value stays in ``latest``, and
+    those of all other views take no memory.
+
+    Args:
+        make: makes the value. latest: shared by all loaders of a scene.
+        derived: whether ``make`` calls another loader of ``latest``, which clears it where it has to.
     """
 
-    normal: Tensor | None = None
-    depth: Tensor | None = None
-    mask: Tensor | None = None
-    specular: Tensor | None = None
-    diffuse: Tensor | None = None
-    object_ids: Tensor | None = None
+    def __init__(self, make: Callable[[], T], latest: Latest, *, derived: bool = False) -> None:
+        self._make, self._latest, self._derived = make, latest, derived
+
+    def __call__(self) -> T:
+        """The value."""
+        kept = self._latest.kept
+        if kept is not None and kept[0] is self:
+            return kept[1]
+        del kept  # so that its memory can be taken for the next
+        if not self._derived:
+            self._latest.kept = None
+        value = self._make()
+        self._latest.kept = self, value
+        return value
+
+    def then(self, change: Callable[[T], T]) -> Loader[T]:
+        """A loader of the value after a change."""
+        return Loader(lambda: change(self()), self._latest, derived=True)
+
+
+FULL_CODE = 65535
+"""The code of linear intensity 1."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from polarguide.camera import Camera
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
 from polarguide.capture.exposures import Exposure
-from polarguide.capture.formats.headers import read_picture
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import (
     MATERIAL_REMEDY,
@@ -27,14 +26,13 @@ from polarguide.capture.formats.pictures import (
     decode_materials,
     decode_picture,
     linear_codes,
-    read_file,
+    read_picture,
 )
-from polarguide.capture.ground_truth import read_ground_truth
+from polarguide.capture.ground_truth import GroundTruth, read_ground_truth
 from polarguide.capture.layout import Layout
-from polarguide.capture.loader import Latest, Loader
-from polarguide.capture.view import GroundTruth, View
+from polarguide.capture.view import Latest, Loader, View
 from polarguide.errors import PolarguideError
-from polarguide.files import LARGEST_FILE
+from polarguide.files import LARGEST_FILE, read_file
 from polarguide.optics import Mount
 from polarguide.records import LARGEST_RECORD
 

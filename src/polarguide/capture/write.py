@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.polarizer_angles import Angle, angle_labels
+from polarguide.capture.exposures import Angle, angle_labels
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.files import make_folder, write_whole
 

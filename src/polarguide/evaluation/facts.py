@@ -11,8 +11,8 @@ from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.capture.background import black_pixels
-from polarguide.capture.objects import SceneObject
+from polarguide.capture.ground_truth import SceneObject
+from polarguide.capture.variants import black_pixels
 from polarguide.capture.view import listed
 
 EXTENT = 1.1

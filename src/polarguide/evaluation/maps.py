@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.capture.objects import SceneObject
+from polarguide.capture.ground_truth import SceneObject
 from polarguide.color import shown
 from polarguide.evaluation.measures import LEAST_POLARIZED
 from polarguide.evaluation.metrics import Selection, decibels, normal_angles_deg

@@ -12,7 +12,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
 from polarguide.capture import View
-from polarguide.capture.objects import METAL_CLASSES
+from polarguide.capture.ground_truth import METAL_CLASSES
 from polarguide.evaluation.facts import SceneFacts, outside
 from polarguide.evaluation.metrics import Selection, has_direction, reflective_mask, window_centers
 

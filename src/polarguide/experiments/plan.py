@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from polarguide import __version__
 from polarguide.capture import View
-from polarguide.capture.background import black_pixels, mask_background
+from polarguide.capture.variants import black_pixels, mask_background
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.record import read_metrics

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.capture.objects import METAL_CLASSES
+from polarguide.capture.ground_truth import METAL_CLASSES
 from polarguide.evaluation.metrics import normal_angles_deg
 from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.curves import COLORS, Curve, curves_svg, dash, read_curve

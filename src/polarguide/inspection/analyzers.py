@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
-from polarguide.capture.colmap.undistort import Geometry, undistortion
-from polarguide.capture.colmap.write import MODELS
+from polarguide.capture.colmap.files import MODELS
+from polarguide.capture.colmap.poses import Geometry, undistortion
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.view import FULL_CODE

@@ -16,12 +16,12 @@ from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.exposures import FOUR, Exposure
-from polarguide.capture.formats.headers import read_picture
-from polarguide.capture.formats.pictures import decode_picture, read_file
+from polarguide.capture.formats.pictures import decode_picture, read_picture
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import applied_calibration, indices_of, refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
+from polarguide.files import read_file
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import LARGEST_RECORD
 

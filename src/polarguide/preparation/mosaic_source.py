@@ -12,24 +12,170 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_gains, oriented, pair_ratio
-from polarguide.capture.colmap.undistort import Geometry
+from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.layout import index_files
+from polarguide.capture.memory import require_memory, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import spread_to_cells
-from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
-from polarguide.capture.sensor.pattern import tiled
-from polarguide.capture.sensor.radiometry import Levels, estimate_levels, unusable_samples
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
+from polarguide.capture.sensor.pattern import (
+    SENSORS,
+    SIDE,
+    Levels,
+    Pattern,
+    estimate_levels,
+    require_kind,
+    sensor_pattern,
+    tiled,
+    unusable_samples,
+)
+from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.write import EXACT, Rounding, rounding_of
 from polarguide.errors import PolarguideError
-from polarguide.preparation.mosaic_files import MosaicFiles
-from polarguide.preparation.mosaic_samples import block_intensities, gray_world, sample_blocks
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
+
+SMALLEST = 16
+"""Pixels of the shorter side of a mosaic."""
+WORKED = {"quarter": 16, "half": 60, "full": 240}
+"""Bytes that a pixel of the sensor takes at least while a mosaic is developed, by the mode of demosaicing."""
+
+
+class MosaicFiles:
+    """How the mosaics of one sensor are read.
+
+    Attributes:
+        pattern: of the top-left pixel that is left after ``cut``.
+        crop: columns and rows that ``cut`` takes off.
+    """
+
+    def __init__(self, settings: PrepareSettings) -> None:
+        """Take sensor, region, packing and dark frame from the settings.
+
+        Raises:
+            PolarguideError: the sensor is not named.
+        """
+        if settings.sensor is None:
+            raise PolarguideError(
+                "--sensor",
+                expected=f"the sensor of raw mosaics: {', '.join(SENSORS)}",
+                found="none",
+                remedy="Name it; color (MYR) and monochrome (MZR) sensors have different patterns.",
+            )
+        self._settings = settings
+        self._raw = RawFormat(settings.width, settings.height, settings.packing)
+        pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
+        self.crop = pattern.cell_corner()
+        self.pattern = pattern.shifted(*self.crop)
+
+    def read(self, path: Path) -> NDArray[Any]:
+        """The stored values of a whole mosaic, [H, W].
+
+        Raises:
+            PolarguideError: the file cannot be read, is too small, or does not fit into memory when it is developed.
+        """
+        worked, raw = WORKED[self._settings.demosaic], self._raw
+        remedy = "Give a region of the sensor, or choose --demosaic half or quarter."
+        if path.suffix.lower() != ".raw":
+            require_memory_of_each([path], worked, "a mosaic", remedy=remedy)
+        elif raw.width is not None and raw.height is not None:
+            what = f"a mosaic of {raw.width}x{raw.height}"
+            require_memory(path, worked * raw.width * raw.height, what, remedy=remedy)
+        return read_mosaic(path, self._raw, least=SMALLEST)
+
+    def container(self, path: Path, values: NDArray[Any]) -> int:
+        """Bits that a pixel takes in the file."""
+        return self._raw.container(path, values.dtype)
+
+    def require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
+        """Refuse mosaics of the other kind of sensor: nothing later would tell."""
+        assert self._settings.sensor is not None
+        require_kind(self._settings.sensor, blocks, levels)
+
+    def cut(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Crop to whole cells."""
+        values = values[self.crop[1] :, self.crop[0] :]
+        return np.ascontiguousarray(values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2])
+
+    def dark(self, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+        """The dark frame, cut like the mosaics."""
+        if self._settings.dark_frame is None:
+            return None
+        dark = read_mosaic(self._settings.dark_frame, self._raw)
+        if dark.shape != shape:
+            raise PolarguideError(
+                self._settings.dark_frame,
+                expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
+                found=f"{dark.shape[1]}x{dark.shape[0]}",
+                remedy="Take it with the same region and settings, the lens covered.",
+            )
+        return self.cut(dark).astype(np.float32)
+
+
+_BLOCKS = 1024
+
+
+def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
+    """A regular subset of a mosaic's blocks, [N, size, size]."""
+    rows, columns = values.shape[0] // size, values.shape[1] // size
+    grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
+    found = grid.swapaxes(1, 2).reshape(-1, size, size)
+    return found[:: max(1, len(found) // _BLOCKS)].copy()
+
+
+def block_intensities(
+    samples: list[NDArray[Any]],
+    levels: Levels,
+    floor: NDArray[np.float32] | None,
+    pattern: Pattern,
+    matrices: NDArray[np.float32] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Intensities at the centers of blocks: by angle [4, N], by color [3, N], and whether each is usable [N].
+
+    Samples of different angles lie beside one another; weights that interpolate all of them to the center of a
+    block of two periods keep gradients of the picture out of the ratio of the pair sums.
+
+    Args:
+        samples: ``sample_blocks`` of two periods from each mosaic.
+        levels: of the capture.
+        floor: ``sample_blocks`` of the dark frame, or None.
+        pattern: of the mosaics.
+        matrices: [4, 4, ...]: ``sample_blocks`` of the corrections of cells, in blocks of one period, or None.
+    """
+    values = np.concatenate(samples)
+    dark = None if floor is None else np.tile(floor, (len(samples), 1, 1))
+    linear = levels.linear(values, dark).astype(np.float64)
+    period = pattern.period
+    if matrices is not None:
+        cells = linear.reshape(len(samples), -1, period, 2, period, 2)
+        planes = [cells[..., row, :, column].copy() for row, column in np.ndindex(2, 2)]
+        for index, (row, column) in enumerate(np.ndindex(2, 2)):
+            done = sum(matrices[index, other] * plane for other, plane in enumerate(planes))
+            cells[..., row, :, column] = done
+    rising = (np.arange(period) + 0.5) / period
+    tent = np.concatenate([rising, rising[::-1]])
+    weighted = linear * tent[:, None] * tent
+    places = np.tile(pattern.angles, (2, 2))
+    # The weights of one angle and color add up to 1 a sample of the period.
+    angles = np.stack([weighted[:, places == angle].sum(axis=1) for angle in ANGLES])
+    angles *= 4 / period**2
+    colors = np.ones((3, len(values)))
+    if pattern.colors is not None:
+        filters = np.tile(pattern.colors, (2, 2))
+        colors = np.stack([weighted[:, filters == c].sum(axis=1) for c in range(3)]) / [[4], [8], [4]]
+    base = levels.black if dark is None else dark
+    usable = (values < levels.saturation).all(axis=(1, 2)) & (values > base).any(axis=(1, 2))
+    return angles, colors, np.asarray(usable)
+
+
+def gray_world(colors: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Gains that make the mean of [3, N] colors gray; green keeps its own."""
+    mean = np.maximum(colors.mean(axis=1) if colors.size else np.ones(3), 1e-6)
+    return float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2])
+
 
 CALIBRATED_IMBALANCE = 0.01
 """Of the pair sums of a calibrated sensor; more is a sign of another camera's calibration."""

@@ -7,14 +7,12 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
-from polarguide.capture.angle_table import TABLE
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets import detect_dataset, open_dataset
-from polarguide.capture.datasets.pisr import SENSOR as PISR_SENSOR
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
-from polarguide.capture.filter.single_shots import folders_of_angles, split_name
-from polarguide.capture.formats.headers import stated_size
-from polarguide.capture.formats.pictures import SUFFIXES
+from polarguide.capture.datasets.readers import PISR_SENSOR
+from polarguide.capture.exposures import TABLE
+from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots, folders_of_angles, split_name
+from polarguide.capture.formats.pictures import SUFFIXES, stated_size
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
@@ -22,13 +20,10 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
-from polarguide.preparation.filter_source import FilterSource
+from polarguide.preparation.filter_source import FilterSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
-from polarguide.preparation.object_masks import MaskedSource
 from polarguide.preparation.settings import PrepareSettings, check_format
-from polarguide.preparation.singles_source import SinglesSource
-from polarguide.preparation.source import Source
-from polarguide.preparation.stokes_source import StokesSource
+from polarguide.preparation.source import MaskedSource, Source, StokesSource
 
 
 def open_source(root: Path, settings: PrepareSettings) -> Source:

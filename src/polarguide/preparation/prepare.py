@@ -16,19 +16,17 @@ import numpy as np
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.colmap.poses import Poses
+from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError
-from polarguide.capture.colmap.undistort import Geometry
 from polarguide.capture.filter.exif import TURNS
 from polarguide.capture.view import ANGLES, listed
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing
 from polarguide.preparation.exposure_table import write_exposure_table
-from polarguide.preparation.folder import PARTIAL, SCENE, SFM, SceneFolder
+from polarguide.preparation.folder import PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
 from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
-from polarguide.preparation.working_folder import PHOTOGRAPHS, Workshop
 from polarguide.progress import Reporter
 from polarguide.records import option_name
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from polarguide.capture.formats.radiance import read_radiance
+from polarguide.capture.formats.arrays import read_radiance
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.files import atomic, in_utf8
 from polarguide.options import PathLike

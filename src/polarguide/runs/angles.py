@@ -7,8 +7,7 @@ from pathlib import Path
 
 from polarguide.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.capture import Scene
-from polarguide.capture.angle_table import TABLE, table_text
-from polarguide.capture.exposures import Exposure
+from polarguide.capture.exposures import TABLE, Exposure, table_text
 from polarguide.capture.layout import find_layout
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from polarguide.capture import Scene
-from polarguide.capture.background import has_black_background
+from polarguide.capture.variants import has_black_background
 from polarguide.errors import PolarguideError
 from polarguide.neural.recipe import NeuralRecipe
 from polarguide.options import index_of

@@ -21,8 +21,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from polarguide.capture import View
-from polarguide.capture.background import black_pixels
 from polarguide.capture.exposures import analyzers
+from polarguide.capture.variants import black_pixels
 from polarguide.capture.view import listed
 from polarguide.color import srgb_encode
 from polarguide.files import write_text

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene, read_model
-from polarguide.capture.background import mask_background
 from polarguide.capture.layout import find_layout
-from polarguide.capture.variants import select_exposures
+from polarguide.capture.variants import mask_background, select_exposures
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
 from polarguide.presentation import Presentation, read_presentation

@@ -15,9 +15,8 @@ from typing import Any
 import torch
 
 from polarguide.capture import Scene
-from polarguide.capture.background import mask_background
 from polarguide.capture.layout import refuse_scene
-from polarguide.capture.variants import select_exposures
+from polarguide.capture.variants import mask_background, select_exposures
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.files import check_out, make_folder
 from polarguide.options import PathLike, SceneOptions, SessionOptions

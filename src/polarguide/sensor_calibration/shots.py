@@ -12,13 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.layout import describe_contents, index_files
-from polarguide.capture.sensor.color_filters import SIDE, require_kind
-from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
-from polarguide.capture.sensor.radiometry import Levels, estimate_levels
+from polarguide.capture.sensor.pattern import (
+    SIDE,
+    Levels,
+    Pattern,
+    estimate_levels,
+    require_kind,
+    sensor_pattern,
+)
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
-from polarguide.preparation.mosaic_samples import sample_blocks
+from polarguide.preparation.mosaic_source import sample_blocks
 from polarguide.progress import Reporter
 from polarguide.sensor_calibration.settings import CalibrateSettings
 

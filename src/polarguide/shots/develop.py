@@ -13,24 +13,25 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, balancing_gains, oriented, pair_ratio
 from polarguide.capture.exposures import FOUR, analyzers
-from polarguide.capture.filter.align import align_shots, estimate_shifts
+from polarguide.capture.filter.develop import (
+    align_shots,
+    decide_transfer,
+    estimate_shifts,
+    linear_intensities,
+)
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import read_shots, require_four_shots
-from polarguide.capture.filter.transfer import decide_transfer, linear_intensities
 from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.memory import KEPT, READ, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
-from polarguide.capture.sensor.color_filters import SIDE
 from polarguide.capture.sensor.demosaic import demosaic
-from polarguide.capture.sensor.pattern import SENSOR_SIZE, tiled
-from polarguide.capture.sensor.radiometry import estimate_levels, unusable_samples
+from polarguide.capture.sensor.pattern import SENSOR_SIZE, SIDE, estimate_levels, tiled, unusable_samples
 from polarguide.capture.view import ANGLES, FULL_CODE, View
 from polarguide.capture.view_reader import read_view
 from polarguide.errors import PolarguideError
 from polarguide.files import require_file
-from polarguide.preparation.mosaic_files import MosaicFiles
-from polarguide.preparation.mosaic_samples import block_intensities, sample_blocks
+from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Map, NoiseModel
 from polarguide.shots.noise import estimated_noise, given_noise, interpolation_factors

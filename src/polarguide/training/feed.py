@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import View
-from polarguide.capture.background import empty_pixels
-from polarguide.capture.smaller import SmallerViews
+from polarguide.capture.variants import SmallerViews, empty_pixels
 from polarguide.color import srgb_encode
 from polarguide.raster import Backend
 from polarguide.shading.gbuffer import RenderRequest, render

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from polarguide.capture.colmap.write import PosedCamera, colmap_camera
+from polarguide.capture.colmap.files import PosedCamera, colmap_camera
 from polarguide.capture.write import write_png
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, writing

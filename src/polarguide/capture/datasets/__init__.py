@@ -3,13 +3,15 @@
 from pathlib import Path
 
 from polarguide.capture.datasets.dataset import Dataset
-from polarguide.capture.datasets.gnerp import open_gnerp
-from polarguide.capture.datasets.neisf import open_neisf
-from polarguide.capture.datasets.nersp import open_nersp
-from polarguide.capture.datasets.pandora import open_pandora
-from polarguide.capture.datasets.phygap import CAMERAS as PHYGAP_CAMERAS
-from polarguide.capture.datasets.phygap import open_phygap
-from polarguide.capture.datasets.pisr import open_pisr
+from polarguide.capture.datasets.readers import (
+    PHYGAP_CAMERAS,
+    open_gnerp,
+    open_neisf,
+    open_nersp,
+    open_pandora,
+    open_phygap,
+    open_pisr,
+)
 
 DATASETS = {
     "pandora": ("images_stokes/",),

@@ -29,6 +29,8 @@ MOST_BIG_ENTRIES = 4096
 _MOST_SCANS = 200
 """Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not."""
 _MOST_PICTURES = 1000
+LARGEST_PIXELS = 150_000_000
+"""More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
 _SUBFILE, _OLD_SUBFILE, _PHOTOMETRIC = 254, 255, 262
 _NO_PICTURE, _REDUCED = 1 | 4, 2
 """A smaller copy, or a mask of transparency; a smaller copy as the older tag has it."""

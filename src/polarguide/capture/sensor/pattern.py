@@ -1,9 +1,9 @@
-"""The pattern of polarizers and color filters of a sensor."""
+"""A sensor's pattern of polarizers and color filters, its radiometric levels, and whether samples fit either."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,3 +85,171 @@ def sensor_pattern(sensor: str) -> Pattern:
     if not SENSORS[sensor]:
         return Pattern(_CELL.copy(), None)
     return Pattern(np.tile(_CELL, (2, 2)), np.kron(_BAYER, np.ones((2, 2), int)))
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Radiometric levels of a capture, in stored values.
+
+    Attributes:
+        bits: bits of a sensor value.
+        white: the value that becomes linear 1.
+        saturation: the value from which a sample counts as saturated.
+        black: the value without light.
+        gamma: exponent of the stored values: stored = linear ^ gamma.
+    """
+
+    bits: int
+    white: int
+    saturation: int
+    black: float
+    gamma: float = 1.0
+
+    def linear(self, values: NDArray[Any], dark: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """(value - black) / (white - black), made linear, float32; noise below black stays negative.
+
+        Args:
+            values: [..., H, W] stored values.
+            dark: dark frame in stored values, in the same shape; it takes the place of the black level pixel by pixel.
+        """
+        floor = np.float32(self.black) if dark is None else dark
+        shown = ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(np.float32)
+        if self.gamma == 1.0:
+            return shown
+        return np.asarray(np.copysign(np.abs(shown) ** np.float32(1 / self.gamma), shown))
+
+
+def estimate_levels(
+    largest: int, used: int, container: int, *, bits: int | None, black: float, saturation: int | None
+) -> Levels:
+    """Estimate the full scale of a capture.
+
+    Without ``bits``: 8 in 8-bit files; in 16-bit files 12 if no value exceeds 4095 (the sensors' converters
+    have 12 bits), else 16. Values whose low bits are never used (12 bits shifted to the top of 16) end at the
+    last value that can occur.
+
+    Args:
+        largest: the largest stored value of the capture.
+        used: bitwise or of all stored values.
+        container: bits of the files' values, or of a packed pixel.
+        bits: bits of a sensor value, or None.
+        black: black level in stored values.
+        saturation: stored value at which the sensor saturates, or None for full scale.
+
+    Raises:
+        PolarguideError: a value exceeds the range, or the levels are not in order.
+    """
+    if bits is None:
+        bits = 12 if container == 16 and largest < 4096 else container
+    if largest >= 1 << bits:
+        raise PolarguideError(
+            "--bits",
+            expected=f"values below {1 << bits} for {bits} bits",
+            found=str(largest),
+            remedy="Give the number of bits that the files really use.",
+        )
+    white = (1 << bits) - 1
+    unused = (used & -used).bit_length() - 1 if used else 0
+    if bits == 16 and 0 < unused <= 8:
+        white -= (1 << unused) - 1
+    top = white if saturation is None else saturation
+    if not 0 <= black < top <= white:
+        raise PolarguideError(
+            "--black-level" if not 0 <= black < white else "--saturation",
+            expected=f"0 <= black level < saturation <= {white}",
+            found=f"black level {black:g}, saturation {top}",
+            remedy=f"Give both in stored values, for {bits} bits.",
+        )
+    return Levels(bits, white, top, float(black))
+
+
+def unusable_samples(
+    values: NDArray[Any], levels: Levels, dark: NDArray[np.float32] | None = None
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Saturated and dark samples of a mosaic that starts with a whole polarizer cell.
+
+    A sample is saturated from ``levels.saturation`` up. It is dark if it was cut off at 0 below a black level,
+    or if none of the four samples of its 2x2 cell exceeds black: then there is no light whose polarization
+    could be told. One angle at black beside brighter ones is kept, for that is what a surface at Brewster's
+    angle looks like.
+
+    Args:
+        values: [H, W] stored values, H and W even.
+        levels: of the capture.
+        dark: dark frame in stored values, [H, W].
+
+    Returns:
+        Two masks [H, W].
+    """
+    height, width = values.shape
+    floor = np.float32(levels.black) if dark is None else dark
+    lit = (values > floor).reshape(height // 2, 2, width // 2, 2).any(axis=(1, 3))
+    black = np.repeat(np.repeat(~lit, 2, axis=0), 2, axis=1)
+    if levels.black > 0 or dark is not None:
+        black |= (values == 0) & (floor > 0)
+    return np.asarray(values >= levels.saturation), black
+
+
+Kind = Literal["color", "monochrome"]
+SIDE = 8
+"""Pixels along a block that is looked at: 4 x 4 cells of polarizers."""
+_FEWEST = 100
+_DIFFERENT, _EQUAL = 0.02, 0.006
+"""Median second differences of cells as a share of their mean: filters make them, chance does not."""
+_STRONGER, _ALIKE, _SMALL = 1.5, 1.35, 0.004
+"""Ratios of typical differences, across filters to within one; differences that count as none."""
+
+
+def color_filters(blocks: NDArray[Any], saturation: float, floor: float = 0.0) -> Kind | None:
+    """Whether 2x2 cells of polarizers lie behind a Bayer pattern of color filters.
+
+    The sum over a cell's four angles is that of the light, whatever its polarization. In a Bayer pattern two of four
+    cells are green, along one diagonal, and those along the other take turns in red and blue: second differences,
+    which leave the gradients of the picture out, are then large in the same way everywhere. Without filters they are
+    small, alike along both diagonals, and have no sign.
+
+    Args:
+        blocks: stored values [N, 8, 8] that begin with a cell.
+        saturation: the value from which a sample is saturated. floor: the value without light.
+
+    Returns:
+        None where the samples do not tell: too few, too dark, or gray light on balanced filters.
+    """
+    lit = (blocks < saturation).all(axis=(1, 2))
+    cells = blocks[lit].reshape(-1, 4, 2, 4, 2).sum(axis=(2, 4), dtype=np.float64) - 4 * floor
+    mean = cells.mean(axis=(1, 2))
+    # A cell in the noise of the read-out says nothing.
+    bright = mean > 4 * (saturation - floor) / 200
+    if bright.sum() < _FEWEST:
+        return None
+    c = cells[bright] / mean[bright, None, None]
+    down = c[:, 0, 0] - 2 * c[:, 1, 1] + c[:, 2, 2]
+    up = c[:, 0, 3] - 2 * c[:, 1, 2] + c[:, 2, 1]
+    across = c[:, 0, 0] + c[:, 1, 1] - c[:, 0, 1] - c[:, 1, 0]
+    signed = max(abs(float(np.median(difference))) / 2 for difference in (down, up, across))
+    least, most = sorted(float(np.median(np.abs(difference))) for difference in (down, up))
+    spread = max(most, float(np.median(np.abs(across)))) / max(least, _SMALL)
+    if signed > _DIFFERENT and spread > _STRONGER:
+        return "color"
+    return "monochrome" if signed < _EQUAL and spread < _ALIKE else None
+
+
+def require_kind(sensor: str, blocks: NDArray[Any], levels: Levels) -> None:
+    """Refuse mosaics of the other kind of sensor: nothing later would tell.
+
+    Args:
+        sensor: its name, a key of ``SENSORS``. blocks: as for ``color_filters``. levels: of the stored values.
+
+    Raises:
+        PolarguideError: the samples say that it is another one.
+    """
+    found = color_filters(blocks, levels.saturation, levels.black)
+    if found is None or (found == "color") == SENSORS[sensor]:
+        return
+    other = next(name for name, colored in SENSORS.items() if colored != SENSORS[sensor])
+    raise PolarguideError(
+        "--sensor",
+        expected=f"mosaics of {sensor}, a {'color' if SENSORS[sensor] else 'monochrome'} sensor",
+        found="no sign of color filters" if SENSORS[sensor] else "the Bayer pattern of color filters",
+        remedy=f"Use --sensor {other}, or that of your camera with this pattern.",
+    )

@@ -1,0 +1,360 @@
+"""The readers of published datasets, a function each."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.datasets.dataset import (
+    Dataset,
+    StokesImage,
+    cameras_of_views,
+    checked_intrinsics,
+    checked_pose,
+    distorted_camera,
+    first_picture_size,
+    masks_beside,
+    missing_entry,
+    not_as_published,
+    numbered_views,
+    pinhole_camera,
+    read_mask,
+    read_projections,
+    require_files,
+    require_same_shape,
+    stokes_dataset,
+)
+from polarguide.capture.formats.arrays import (
+    array_kind,
+    array_size,
+    finite_numbers,
+    read_array,
+    read_arrays,
+    read_exr_channels,
+)
+from polarguide.capture.formats.pictures import (
+    SUFFIXES,
+    decode_picture,
+    decode_stored,
+    linear_codes,
+    read_picture,
+)
+from polarguide.capture.layout import index_files
+from polarguide.capture.view import FULL_CODE
+from polarguide.records import read_record
+
+_PANDORA_PARTS = ("s0", "s0p1", "s0p2")
+_PANDORA_STEM = re.compile(r"(?P<view>\d{1,6})_(?P<part>s0|s0p1|s0p2)")
+
+
+def open_pandora(root: Path) -> Dataset:
+    """Find the files and read the cameras.
+
+    Raises:
+        PolarguideError: one is missing, or the cameras are invalid.
+    """
+    folder, cameras_file = root / "images_stokes", root / "cameras.npz"
+    matches = [_PANDORA_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
+    views = sorted({match["view"] for match in matches if match is not None})
+    files = {view: [folder / f"{view}_{part}.hdr" for part in _PANDORA_PARTS] for view in views}
+    masks = masks_beside(root)
+    pictures = index_files(root / "images", SUFFIXES)
+    first = 0 if any(int(view) == 0 for view in views) else 1
+    size = first_picture_size(pictures, root / "images") if views else (1, 1)
+    found = {i: pinhole_camera(size, *camera) for i, camera in read_projections(cameras_file).items()}
+    numbers = {view: int(view) - first for view in views}
+    cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
+    notes = (f"Files count from {first}, cameras from 0.",)
+    return stokes_dataset(
+        "pandora", _PANDORA_PARTS, files, _stokes, cameras_file, cameras, masks, notes=notes
+    )
+
+
+def _stokes(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    total, plus1, plus2 = planes
+    return np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)
+
+
+_NERSP_PARTS = ("s0", "s1", "s2")
+_NERSP_CAMERAS = ("cameras.npz", "cameras_new.npz", "cameras_sphere.npz")
+_PICTURES = ("image", "images", "I-sum", "I_sum")
+
+
+def open_nersp(root: Path) -> Dataset:
+    """Find the files and read the cameras.
+
+    Raises:
+        PolarguideError: one is missing, or the cameras are invalid.
+    """
+    cameras_file = next(
+        (root / name for name in _NERSP_CAMERAS if (root / name).exists()), root / _NERSP_CAMERAS[0]
+    )
+    numbers = numbered_views({stem for part in _NERSP_PARTS for stem in index_files(root / part, (".npy",))})
+    files = {view: [root / part / f"{view}.npy" for part in _NERSP_PARTS] for view in numbers}
+    folder = next((root / name for name in _PICTURES if (root / name).is_dir()), root / _PICTURES[0])
+    pictures = index_files(folder, SUFFIXES)
+    maps = index_files(root / "input_azimuth_maps", (".png",))
+    size = first_picture_size(pictures, folder) if numbers else (1, 1)
+    found = {i: pinhole_camera(size, *camera) for i, camera in read_projections(cameras_file).items()}
+    cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
+    masks, read = (maps, _last_channel) if maps else (masks_beside(root), read_mask)
+    return stokes_dataset(
+        "nersp", _NERSP_PARTS, files, _halved, cameras_file, cameras, masks, read_mask=read, sense="cw"
+    )
+
+
+def _halved(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    return planes / np.float32(2)
+
+
+def _last_channel(path: Path) -> NDArray[np.bool_]:
+    pixels = decode_stored(path, read_picture(path))
+    return np.asarray((pixels if pixels.ndim == 2 else pixels[..., -1]) > 0)
+
+
+_NEISF_PARTS = ("images_s0", "images_s1", "images_s2")
+_NEISF_STEM = re.compile(r"img_(\d{1,6})")
+
+
+def open_neisf(root: Path) -> Dataset:
+    """Find the files and read the cameras.
+
+    Raises:
+        PolarguideError: one is missing, or the cameras are invalid.
+    """
+    matches = [
+        _NEISF_STEM.fullmatch(stem) for part in _NEISF_PARTS for stem in index_files(root / part, (".exr",))
+    ]
+    numbers = {match[0]: int(match[1]) for match in matches if match is not None}
+    files = {view: [root / part / f"{view}.exr" for part in _NEISF_PARTS] for view in numbers}
+    cameras_file = root / "poses_bounds.npy"
+    cameras = cameras_of_views(cameras_file, numbers, _llff_cameras(cameras_file), "row ")
+    masks = masks_beside(root)
+    note = "The sense of NeISF's angles is not stated by its release: taken as counter-clockwise (--sense cw if not)."
+    return stokes_dataset(
+        "neisf", _NEISF_PARTS, files, lambda planes: planes, cameras_file, cameras, masks, notes=(note,)
+    )
+
+
+def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
+    """Row -> camera; rows count from 1 like the files."""
+    rows = read_array(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
+        raise not_as_published(path, "an array N x 17 of poses and bounds (LLFF)", array_size(rows))
+    cameras = {}
+    for index, row in enumerate(rows):
+        where = f"{path} (row {index})"
+        down, right, back, center, inner = finite_numbers(where, row[:15], ((15,),)).reshape(3, 5).T
+        height, width, focal = inner
+        if not (1 <= height <= 1e5 and 1 <= width <= 1e5 and focal > 0):
+            found = f"{height:g}, {width:g} and {focal:g}"
+            raise not_as_published(where, "height, width and focal length in pixels", found)
+        # OpenCV's axes: right, down, forward.
+        axes = np.column_stack([np.stack([right, down, -back]), np.zeros(3)])
+        rotation, _ = checked_pose(where, axes)
+        middle = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        size = round(width), round(height)
+        cameras[index + 1] = pinhole_camera(size, middle, rotation, -rotation @ center)
+    return cameras
+
+
+_SHAPES = ((3, 4), (4, 4))
+
+
+def open_gnerp(root: Path, *, transfer: str) -> Dataset:
+    """Find the files and read the cameras.
+
+    Args:
+        root: the folder.
+        transfer: how the pictures are encoded: "linear", "srgb", or "auto", which takes "srgb".
+
+    Raises:
+        PolarguideError: one is missing, or the cameras are invalid.
+    """
+    transfer = "srgb" if transfer == "auto" else transfer
+    pictures = index_files(root / "images", SUFFIXES)
+    numbers = numbered_views(set(pictures))
+    angles, degrees = ({view: root / part / f"{view}.npy" for view in numbers} for part in ("aop", "dop"))
+    require_files(angles, "AoP")
+    require_files(degrees, "DoP")
+    masks = masks_beside(root)
+    cameras_file = root / "cameras.json"
+    size = (
+        first_picture_size({view: pictures[view] for view in numbers}, root / "images") if numbers else (1, 1)
+    )
+
+    def read_stokes(view: str) -> StokesImage:
+        stored = decode_picture(pictures[view], read_picture(pictures[view]))
+        aop, dop = (_plane(files[view], stored.shape, pictures[view]) for files in (angles, degrees))
+        s0 = 2 * linear_codes(stored, transfer).astype(np.float32) / np.float32(FULL_CODE)
+        stokes = [s0, s0 * (dop * np.cos(2 * aop))[..., None], s0 * (dop * np.sin(2 * aop))[..., None]]
+        return np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2))
+
+    used = [files[view] for view in numbers for files in (pictures, angles, degrees)]
+    return Dataset(
+        name="gnerp",
+        views=sorted(numbers),
+        paths=[*used, *masks.values(), cameras_file],
+        cameras=cameras_of_views(cameras_file, numbers, _gnerp_cameras(cameras_file, size), "w2c_mat_"),
+        read_stokes=read_stokes,
+        masks=masks,
+        notes=(
+            "AoP and DoP have one channel and are shared by R, G and B.",
+            f"The pictures were taken as {transfer}"
+            + (" and made linear before Stokes vectors were formed (--transfer says otherwise)."
+               if transfer == "srgb" else "."),
+        ),
+    )  # fmt: skip
+
+
+def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32]:
+    """Numbers [H, W] from a file with [H, W] or [H, W, 1]."""
+    plane = read_array(path)
+    if plane.ndim == 3 and plane.shape[2] == 1:
+        plane = plane[..., 0]
+    if plane.ndim != 2 or plane.dtype.kind != "f":
+        raise not_as_published(path, "floating-point numbers of one channel", array_kind(plane))
+    require_same_shape(path, plane.shape, shape, like)
+    return np.asarray(plane, np.float32)
+
+
+def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
+    """Number -> camera, from ``w2c_mat_<i>`` and ``intrinsic``, or ``intrinsic_<i>`` where there is one."""
+    content: dict[str, Any] = read_record(path, dict[str, Any])
+    cameras = {}
+    for key, value in content.items():
+        match = re.fullmatch(r"w2c_mat_(\d{1,6})", key)
+        if match is None:
+            continue
+        inner_key = f"intrinsic_{match[1]}" if f"intrinsic_{match[1]}" in content else "intrinsic"
+        if inner_key not in content:
+            raise missing_entry(path, inner_key, content)
+        where = f"{path} ({inner_key})"
+        inner = finite_numbers(where, content[inner_key], ((3, 3), *_SHAPES))[:3, :3]
+        pose = checked_pose(f"{path} ({key})", finite_numbers(f"{path} ({key})", value, _SHAPES))
+        cameras[int(match[1])] = pinhole_camera(size, checked_intrinsics(where, inner), *pose)
+    if not cameras:
+        raise missing_entry(path, "w2c_mat_<i>", content)
+    return cameras
+
+
+PHYGAP_CAMERAS = "camera_params.npz"
+_CHANNELS = tuple(tuple(f"S{part}.{color}" for color in "RGB") for part in range(3))
+
+
+def open_phygap(root: Path) -> Dataset:
+    """Find the files and read the cameras.
+
+    Raises:
+        PolarguideError: one is missing, or the cameras are invalid.
+    """
+    folder = next(
+        (root / name for name in ("images_full", "images") if (root / name).is_dir()), root / "images_full"
+    )
+    files = index_files(folder, (".exr",))
+    numbers = numbered_views(set(files))
+    path = root / PHYGAP_CAMERAS
+    arrays = read_arrays(path)
+    for key in ("intrinsics", "extrinsics", "image_width", "image_height"):
+        if key not in arrays:
+            raise missing_entry(path, key, arrays)
+    inner = checked_intrinsics(f"{path} (intrinsics)", finite_numbers(path, arrays["intrinsics"], ((3, 3),)))
+    poses = arrays["extrinsics"]
+    if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)):
+        raise not_as_published(f"{path} (extrinsics)", "matrices N x 4 x 4", array_size(poses))
+    sides = [finite_numbers(f"{path} ({key})", arrays[key], ((),)) for key in ("image_width", "image_height")]
+    if not all(1 <= side <= 1e5 for side in sides):
+        found = " and ".join(f"{float(side):g}" for side in sides)
+        raise not_as_published(f"{path} (image_width, image_height)", "a size in pixels", found)
+    size = (int(sides[0]), int(sides[1]))
+    cameras = {}
+    for number, pose in enumerate(poses):
+        where = f"{path} (extrinsics {number})"
+        rigid = checked_pose(where, finite_numbers(where, pose, ((3, 4), (4, 4))))
+        cameras[number] = pinhole_camera(size, inner, *rigid)
+
+    def read_stokes(view: str) -> StokesImage:
+        s0, s1, s2 = read_exr_channels(files[view], _CHANNELS)
+        stokes: Any = np.stack([s0, -s1, -s2])
+        return stokes, np.zeros(s0.shape[:2], bool)
+
+    masks = masks_beside(root)
+    return Dataset(
+        name="phygap",
+        views=sorted(numbers),
+        paths=[*(files[view] for view in numbers), *masks.values(), path],
+        cameras=cameras_of_views(path, numbers, cameras, "extrinsics "),
+        read_stokes=read_stokes,
+        masks=masks,
+        notes=("Angles of Mitsuba count from the vertical of the picture: turned by 90 degrees.",),
+    )
+
+
+PISR_SENSOR: Final = "IMX250MYR"
+_PISR_SIZE = (1224, 1024)
+"""Size that ``camera_matrix`` was made for."""
+_PISR_CAMERAS = ("cameras_sphere.npz", "cameras.npz")
+
+
+def open_pisr(root: Path) -> Dataset:
+    """Find the files and read the cameras.
+
+    Raises:
+        PolarguideError: one is missing, or the cameras are invalid.
+    """
+    files = index_files(root / "raw", (".npy",))
+    numbers = numbered_views(set(files))
+    cameras_file = next(
+        (root / name for name in _PISR_CAMERAS if (root / name).exists()), root / _PISR_CAMERAS[0]
+    )
+    inner_file = root / "intrinsics.npz"
+    intrinsics = read_arrays(inner_file)
+    for key in ("camera_matrix", "dist_coeffs"):
+        if key not in intrinsics:
+            raise missing_entry(inner_file, key, intrinsics)
+    where = f"{inner_file} (camera_matrix)"
+    inner = checked_intrinsics(where, finite_numbers(where, intrinsics["camera_matrix"], ((3, 3),)))
+    coefficients = intrinsics["dist_coeffs"]
+    cameras = {
+        number: distorted_camera(f"{inner_file} (dist_coeffs)", _PISR_SIZE, inner, coefficients, pose)
+        for number, (_, *pose) in read_projections(cameras_file).items()
+    }
+    masks = masks_beside(root)
+    gamma = _gamma(root)
+    note = f"Stored values are the light to the power of {gamma:g} (gamma file): undone."
+    return Dataset(
+        name="pisr",
+        views=sorted(numbers),
+        paths=[*files.values(), *masks.values(), inner_file, cameras_file, *_gamma_files(root)],
+        cameras=cameras_of_views(cameras_file, numbers, cameras, "world_mat_"),
+        read_stokes=None,
+        masks=masks,
+        mosaics=root / "raw",
+        gamma=gamma,
+        notes=(note,) if gamma != 1 else (),
+    )
+
+
+def _gamma_files(root: Path) -> list[Path]:
+    return sorted(path for path in root.iterdir() if path.name.startswith("gamma"))
+
+
+def _gamma(root: Path) -> float:
+    """The number in the name of the gamma file; 1 without one."""
+    files = _gamma_files(root)
+    if not files:
+        return 1.0
+    try:
+        gamma = float(files[0].name.removeprefix("gamma").removesuffix(".txt"))
+    except ValueError:
+        gamma = math.nan
+    if len(files) > 1 or not 0.2 <= gamma <= 5:
+        expected = "one file called gamma<number>.txt with a number from 0.2 to 5"
+        raise not_as_published(root, expected, ", ".join(path.name for path in files))
+    return gamma
