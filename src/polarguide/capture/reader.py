@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -91,21 +90,25 @@ def load_scene(
         PolarguideError: a file of the capture cannot be used; the message names it and the remedy.
     """
     root = Path(path)
-    _check_downscale(downscale)
+    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
+        raise PolarguideError(
+            "downscale",
+            expected="a whole number from 1 up",
+            found=repr(downscale),
+            remedy="1 keeps the full size.",
+        )
     check_transfer(transfer)
     layout = find_layout(root)
     names = select_views(layout, views)
     model = read_model(root)
     files = Files()
-    for file in model.files:
+    for file in (*model.files, *([layout.table] if layout.table is not None else [])):
         files.read(file)
     tests, stray = _held_out(root / "split.json", files, layout, model, split, test_views)
     about = files.read_if_there(root / "scene.json")
     index = refractive_index_of(root / "scene.json", about)
     indices = indices_of(root / "scene.json", about)
     mount = mount_of(root / "scene.json", about)
-    if layout.table is not None:
-        files.read(layout.table)
     for name in names:
         # Missing poses and pictures of another size are found before a picture is decoded.
         camera = model.camera(name)
@@ -118,9 +121,9 @@ def load_scene(
     stored = read_views(layout, names, model, **how)  # type: ignore[arg-type]
     for item in stored.data:
         files.digests.update(item.digests)
-    untold = [item.name for item in stored.data if item.invalid.all()]
+    without_pixels = [item.name for item in stored.data if item.invalid.all()]
     counted = {item.name for item in stored.data} - (set(tests) if views is None else set())
-    if counted and counted <= set(untold):
+    if counted and counted <= set(without_pixels):
         raise PolarguideError(
             root / "invalid",
             expected="at least one pixel to train on that is not invalid",
@@ -139,9 +142,7 @@ def load_scene(
         *layout.warnings,
         *model.warnings,
         *stray,
-        *_untold(untold, len(stored.data)),
-        *_alike(layout, stored.data),
-        *_copied(layout, stored.data),
+        *_content_warnings(layout, stored, without_pixels),
         *unseen_points(model.points, [camera for camera in stored.cameras if camera is not None]),
         *_pose_warnings(model, layout.names, stored.data),
     ]
@@ -155,7 +156,7 @@ def load_scene(
         refractive_index=index,
         downscale=downscale,
         transfer=transfer,
-        digest=_digest_all(root, files),
+        digest=files.digest(root),
         warnings=(*warnings, *_picture_warnings(stored, transfer)),
         objects=objects_of(root / "scene.json", about) if told_apart else (),
         indices=indices,
@@ -265,29 +266,54 @@ def check_transfer(transfer: str) -> None:
         )
 
 
-def _check_downscale(downscale: int) -> None:
-    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
-        raise PolarguideError(
-            "downscale",
-            expected="a whole number from 1 up",
-            found=repr(downscale),
-            remedy="1 keeps the full size.",
-        )
-
-
 def _largest_value(data: Sequence[ViewData]) -> int:
     """The largest value of the views' common type, 255 or 65535."""
-    kinds = {item.peak.dtype for item in data}
-    if len(kinds) > 1:
-        few = next(item.name for item in data if item.peak.dtype == np.uint8)
-        many = next(item.name for item in data if item.peak.dtype == np.uint16)
+    first = {item.peak.dtype.itemsize: item.name for item in reversed(data)}
+    if len(first) > 1:
         raise PolarguideError(
             "pictures",
             expected="one number of bits for all views",
-            found=f"8 bits in view {few} and 16 in view {many}",
+            found=f"8 bits in view {first[1]} and 16 in view {first[2]}",
             remedy="Export all pictures alike.",
         )
-    return int(np.iinfo(kinds.pop()).max)
+    return int(np.iinfo(data[0].peak.dtype).max)
+
+
+def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -> list[str]:
+    """Warnings about views whose pictures say nothing, or are those of another.
+
+    Args:
+        layout: the files. stored: the views. invalid: those without a pixel to use.
+    """
+
+    def is_gray(picture: NDArray[np.uint16]) -> bool:
+        return bool(picture.any()) and bool((picture == picture[..., :1]).all())
+
+    count, same_file = len(stored.data), []
+    views: dict[tuple[str, ...], list[str]] = {}
+    for item in stored.data:
+        digests = tuple(item.digests[path] for path in layout.files(item.name))
+        if item.peak.any():
+            views.setdefault(digests, []).append(item.name)
+            if len(digests) > 1 and len(set(digests)) == 1:  # light without polarization has noise, too
+                same_file.append(item.name)
+    # Views that are black altogether are counted by their exposure.
+    black = [item.name for item in stored.data if len({bool(picture.any()) for picture in item.codes}) > 1]
+    gray = [item.name for item in stored.data if any(map(is_gray, item.codes))]
+    copies = "; ".join(listed(names) for names in [n for n in views.values() if len(n) > 1][:3])
+    table = (
+        (invalid, "are invalid at every pixel ({}): they tell nothing. White is invalid in invalid/: invert the "
+         "pictures, or remove them."),
+        (same_file, "have the same file at all angles ({}): they look unpolarized. Copy those of the other angles."),
+        (black, "have pictures that are black throughout ({})."),
+        (gray if len(gray) < count else [], "have gray pictures among others in color ({})."),
+    )  # fmt: skip
+    found = [f"{len(n)} of {count} views {text.format(listed(n))}" for n, text in table if n]
+    if copies:
+        found.append(
+            f"Views have the same pictures ({copies}). Copy those of the other views, or leave them out."
+        )
+    return found
 
 
 def _picture_warnings(stored: StoredViews, transfer: str) -> list[str]:
@@ -296,71 +322,7 @@ def _picture_warnings(stored: StoredViews, transfer: str) -> list[str]:
     blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in stored.data]
     largest = max(int(item.peak.max()) for item in stored.data)
     warnings = checks.exposure_warnings(names, stored.measures, blown, largest, stored.largest_value)
-    warnings += _odd_pictures(stored)
     return warnings + checks.polarization_warnings(names, stored.measures, transfer)
-
-
-def _odd_pictures(stored: StoredViews) -> list[str]:
-    """Warnings about black pictures, and about single gray pictures among those in color."""
-
-    def is_gray(picture: NDArray[np.uint16]) -> bool:
-        return bool(picture.any()) and bool((picture == picture[..., :1]).all())
-
-    count = len(stored.data)
-    # Views that are black altogether are counted by their exposure.
-    black = [item.name for item in stored.data if len({bool(picture.any()) for picture in item.codes}) > 1]
-    gray = [item.name for item in stored.data if any(map(is_gray, item.codes))]
-    warnings = []
-    if black:
-        warnings.append(
-            f"{len(black)} of {count} views have pictures that are black throughout ({listed(black)})."
-        )
-    if gray and len(gray) < count:
-        warnings.append(
-            f"{len(gray)} of {count} views have gray pictures among others in color ({listed(gray)})."
-        )
-    return warnings
-
-
-def _untold(names: list[str], count: int) -> list[str]:
-    """The warning about views that tell nothing."""
-    if not names:
-        return []
-    listing = f"{len(names)} of {count} views are invalid at every pixel ({listed(names)})"
-    return [
-        f"{listing}: they tell nothing. White is invalid in invalid/: invert the pictures, or remove them."
-    ]
-
-
-def _alike(layout: Layout, data: Sequence[ViewData]) -> list[str]:
-    """The warning about views whose angles are all one file: light without polarization has noise, too."""
-    names = [
-        item.name
-        for item in data
-        if item.peak.any()
-        and len(paths := layout.files(item.name)) > 1
-        and len({item.digests[path] for path in paths}) == 1
-    ]
-    if not names:
-        return []
-    listing = (
-        f"The pictures at all angles are the same file in {len(names)} of {len(data)} views ({listed(names)})"
-    )
-    return [f"{listing}: they look unpolarized. Copy those of the other angles."]
-
-
-def _copied(layout: Layout, data: Sequence[ViewData]) -> list[str]:
-    """The warning about views whose pictures are the same files: two places never look alike to the last bit."""
-    views: dict[tuple[str, ...], list[str]] = {}
-    for item in data:
-        if item.peak.any():
-            digests = tuple(item.digests[path] for path in layout.files(item.name))
-            views.setdefault(digests, []).append(item.name)
-    copies = [names for names in views.values() if len(names) > 1]
-    if not copies:
-        return []
-    listing = "; ".join(listed(names) for names in copies[:3])
-    return [f"Views have the same pictures ({listing}). Copy those of the other views, or leave them out."]
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:
@@ -376,10 +338,3 @@ def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[View
             "resized, wrong if they were cropped."
         )
     return warnings
-
-
-def _digest_all(root: Path, files: Files) -> str:
-    lines = sorted(
-        f"{path.relative_to(root).as_posix()} {digest}\n" for path, digest in files.digests.items()
-    )
-    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,13 @@ class Files:
     def _noted(self, path: Path, data: bytes) -> bytes:
         self.digests[path] = hashlib.sha256(data).hexdigest()
         return data
+
+    def digest(self, root: Path) -> str:
+        """SHA-256 over names in ``root`` and contents of all files that were read."""
+        lines = sorted(
+            f"{path.relative_to(root).as_posix()} {digest}\n" for path, digest in self.digests.items()
+        )
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
 
     def read_if_there(self, path: Path) -> bytes | None:
         """The bytes of a JSON file, or None if there is no such file."""
@@ -187,18 +194,12 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         )
     channels = [pixels[..., channel] for pixels in raw for channel in range(3)]
     peak = functools.reduce(np.maximum, channels)
-    invalid, mask, ground_truth = np.zeros((height, width), bool), None, None
-    if name in layout.invalid:
-        invalid = _read_mask(files, layout.invalid[name], (height, width), any_value=True)
-    if name in layout.masks:
-        mask = _read_mask(files, layout.masks[name], (height, width), any_value=False)
-    materials = None
-    if name in layout.materials:
-        path = layout.materials[name]
-        data = files.picture(path)
-        require_size(path, data, (height, width))
-        materials = decode_materials(path, data)
-        _require_same(path, (materials.shape[1], materials.shape[0]), (height, width))
+    ground_truth = None
+    any_value = functools.partial(decode_mask, any_value=True)
+    invalid = _read_beside(files, layout.invalid, name, (height, width), any_value)
+    half_of_maximum = functools.partial(decode_mask, any_value=False)
+    mask = _read_beside(files, layout.masks, name, (height, width), half_of_maximum)
+    materials = _read_beside(files, layout.materials, name, (height, width), decode_materials)
     if name in layout.ground_truth:
         path = layout.ground_truth[name]
         ground_truth = read_ground_truth(path, files.read(path), size=(height, width), factor=factor)
@@ -209,7 +210,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         peak=boxes.maximum(peak, factor),
         black=boxes.maximum(np.asarray(peak == 0), factor),
         histogram=np.sum([checks.top_histogram(pixels) for pixels in raw], axis=0),
-        invalid=boxes.maximum(invalid, factor),
+        invalid=boxes.maximum(np.zeros((height, width), bool) if invalid is None else invalid, factor),
         mask=None if mask is None else boxes.every(mask, factor),
         ground_truth=ground_truth,
         digests=files.digests,
@@ -287,21 +288,30 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
         PolarguideError: size or depth differs.
     """
     if (picture.shape, picture.dtype) != (first.shape, first.dtype):
+        own, expected = (
+            f"{p.shape[1]}x{p.shape[0]} with {p.dtype.itemsize * 8} bits" for p in (picture, first)
+        )
         raise PolarguideError(
             path,
-            expected=f"{_kind(first)} like {'/'.join(first_path.parts[-2:])}",
-            found=_kind(picture),
+            expected=f"{expected} like {'/'.join(first_path.parts[-2:])}",
+            found=own,
             remedy="Export the pictures of a view alike.",
         )
 
 
-def _read_mask(files: Files, path: Path, size: tuple[int, int], *, any_value: bool) -> NDArray[np.bool_]:
+def _read_beside(
+    files: Files,
+    folder: Mapping[str, Path],
+    name: str,
+    size: Sequence[int],
+    decode: Callable[[Path, bytes], NDArray[Any]],
+) -> NDArray[Any] | None:
+    """The picture of a view in a folder beside its pictures, which has their size; None where there is none."""
+    if name not in folder:
+        return None
+    path = folder[name]
     data = files.picture(path)
     require_size(path, data, size)
-    mask = decode_mask(path, data, any_value=any_value)
-    _require_same(path, (mask.shape[1], mask.shape[0]), size)  # of a format whose header says nothing
-    return mask
-
-
-def _kind(picture: NDArray[Any]) -> str:
-    return f"{picture.shape[1]}x{picture.shape[0]} with {picture.dtype.itemsize * 8} bits"
+    pixels = decode(path, data)
+    _require_same(path, (pixels.shape[1], pixels.shape[0]), size)  # of a format whose header says nothing
+    return pixels

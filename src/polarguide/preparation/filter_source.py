@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polarguide.capture.calibration import (
     LARGEST_IMBALANCE,
@@ -32,11 +35,11 @@ from polarguide.capture.filter.develop import (
 )
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken
 from polarguide.capture.filter.shots import (
+    Shots,
     SingleShot,
     find_shots,
     find_single_shots,
     list_shots,
-    read_shots,
     read_stack,
     require_four_shots,
 )
@@ -50,19 +53,100 @@ from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 _JUDGED_VIEWS = 8
-_WORKED = 4 * 3 * (2 + 2 + 4 + 4 + 4)
-"""Bytes for each pixel of four shots: as stored and stacked, linear, aligned, turned."""
+_WORKED = 3 * (2 + 2 + 4 + 4 + 4)
+"""Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written."""
+_JPEG = (".jpg", ".jpeg")
+_RAW = "Transfer linear: camera raw, developed without tone curve, alike for all shots."
 
 
-class FilterSource(Source):
+class ShotsSource(Source):
+    """Shots of an ordinary camera through a polarizing filter: what four a view and single ones have in common."""
+
+    cameras = None
+
+    def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: PrepareSettings) -> None:
+        """Use the shots of each view, in their order; ``paths`` are all files that are read.
+
+        Raises:
+            PolarguideError: white balance or transfer do not fit the files.
+        """
+        self._settings, self._of_view = settings, views
+        self.paths, self.views = paths, sorted(views)
+        self._shots = [path for view in self.views for path in views[view]]
+        self._white = development_of(self._shots, settings)
+
+    def _require_memory(self, what: str) -> None:
+        """Refuse shots of a view that do not fit into memory, by their headers alone; ``what`` is for messages.
+
+        Raises:
+            PolarguideError: the largest is too large.
+        """
+        pixel = max(map(len, self._of_view.values())) * _WORKED
+        remedy = "Make the pictures smaller, all by the same factor."
+        require_memory_of_each(self._shots, pixel, what, remedy=remedy)
+
+    def _rounding(self, transfer: str, smallest: float) -> Rounding:
+        """What codes are rounded to: by the steps of 8-bit values, which grow with sRGB's; none for 16 bits."""
+        first = self._shots[:1]
+        if self._settings.precision == "full" or read_stack(first, self._white).pictures.dtype != np.uint8:
+            return EXACT
+        return rounding_of_bytes(transfer, smallest)
+
+    def _linear(self, view: str, transfer: str, *, align: bool) -> _Linear:
+        """The shots of a view: validity, transfer, and shifts where there are four to align."""
+        shots = read_stack(self._of_view[view], self._white)
+        linear, bad = linear_intensities(shots.pictures, transfer), shots.clipped | shots.dark
+        shifts, notes = [Shift(0.0, 0.0, True)] * len(linear), []
+        if align:
+            shifts = estimate_shifts(linear)
+            linear, bad = align_shots(linear, bad, shifts)
+            notes = shift_notes(view, shifts)
+        return _Linear(shots, linear, np.asarray(bad.any(axis=0)), shifts, notes)
+
+    def _developed(
+        self,
+        found: _Linear,
+        upright: NDArray[np.float32],
+        record: dict[str, Any],
+        angles: Sequence[Angle] = ANGLES,
+    ) -> DevelopedView:
+        """The view of pictures [K, H, W, 3] that are turned for display, with a record of the measurements beside."""
+        height, width = upright.shape[1:3]
+        shots = found.shots
+        return DevelopedView(
+            intensities=np.ascontiguousarray(upright),
+            invalid=np.ascontiguousarray(apply_orientation(found.invalid, shots.orientation)),
+            geometry=Geometry((width, height), (0, 0), 1, (width, height)),
+            record={
+                "orientation": shots.orientation,
+                **record,
+                "clipped_share": round(float(shots.clipped.any(axis=0).mean()), 6),
+                "dark_share": round(float(shots.dark.mean()), 6),
+                "invalid_share": round(float(found.invalid.mean()), 6),
+            },
+            angles=angles,
+            notes=tuple(found.notes),
+        )
+
+
+@dataclass
+class _Linear:
+    """Linear shots of a view [K, H, W, 3], unusable pixels [H, W], shifts, and notes for the user."""
+
+    shots: Shots
+    linear: NDArray[np.float32]
+    invalid: NDArray[np.bool_]
+    shifts: list[Shift]
+    notes: list[str]
+
+
+class FilterSource(ShotsSource):
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
     needs = ("transfer", "scale")
-    cameras = None
 
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
-        self._settings = settings
         shots = find_shots(root, nested=True)
         require_four_shots(root, shots)
         unused = [path.name for path in list_shots(root, nested=True)[1]]
@@ -70,107 +154,65 @@ class FilterSource(Source):
         if unused:
             found = f"{root} has pictures without an angle in their names, or at other angles than 0, 45, 90 and 135"
             warnings.warn(f"{found}, which are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
-        self._files = dict(sorted(shots.items()))
-        self.views = list(self._files)
-        self.paths = [files[angle] for files in self._files.values() for angle in ANGLES]
-        self._raw = [path for path in self.paths if is_camera_raw(path)]
-        self._white = development_of(self.paths, settings)
-
-    def _require_memory(self) -> None:
-        """Refuse shots that do not fit into memory, from their headers alone.
-
-        Raises:
-            PolarguideError: the largest is too large.
-        """
-        remedy = "Make the pictures smaller, all by the same factor."
-        require_memory_of_each(self.paths, _WORKED, "four shots", remedy=remedy)
+        views = {view: [files[angle] for angle in ANGLES] for view, files in sorted(shots.items())}
+        super().__init__([path for files in views.values() for path in files], views, settings)
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """The transfer of the capture, from a few views spread over it."""
-        self._require_memory()
+        self._require_memory("four shots")
         asked = self._settings
-        notes: list[str] = []
+        gains, notes = asked.calibration.gains, []
         transfer: str = asked.transfer
-        if transfer == "auto" and len(self._raw) == len(self.paths):
+        if transfer == "auto" and all(map(is_camera_raw, self.paths)):
             transfer = "linear"
-            notes.append("Transfer linear: camera raw, developed without tone curve, alike for all shots.")
+            notes.append(_RAW)
         if transfer == "auto":
-            step = max(1, math.ceil(len(self._files) / _JUDGED_VIEWS))
+            step = max(1, math.ceil(len(self.views) / _JUDGED_VIEWS))
             judged = []
             for view in self.views[::step]:
-                judged.append(read_shots(self._files[view], self._white))
+                judged.append(read_stack(self._of_view[view], self._white))
                 advance(len(judged) * step)
-            suffix = self.paths[0].suffix.lower()
-            decision = decide_transfer(judged, jpeg=suffix in (".jpg", ".jpeg"))
+            decision = decide_transfer(judged, jpeg=self.paths[0].suffix.lower() in _JPEG)
             transfer = decision.transfer
             notes.append(f"Transfer {decision.reason}.")
-        if asked.calibration.gains is not None:
-            scale = min(1.0, *asked.calibration.gains)
-        else:
-            # One scale for all shots, with room for the largest gain that is corrected.
-            scale = math.sqrt(1.0 - LARGEST_IMBALANCE) if asked.gains == "auto" else 1.0
-            notes += [UNIDENTIFIED] if asked.gains == "auto" else []
-        scale /= asked.calibration.peak
-        return {
-            "transfer": transfer,
-            "scale": scale,
-            "rounding": self._rounding(transfer, scale),
-            "notes": notes,
-        }
-
-    def _rounding(self, transfer: str, scale: float) -> Rounding:
-        """What codes are rounded to: by the steps of 8-bit values, which grow with sRGB's; none for 16 bits."""
-        stored = read_shots(self._files[self.views[0]], self._white).pictures
-        if self._settings.precision == "full" or stored.dtype != np.uint8:
-            return EXACT
-        gains = self._settings.calibration.gains
-        smallest = scale / (max(gains) if gains is not None else 1.0 / math.sqrt(1.0 - LARGEST_IMBALANCE))
-        return rounding_of_bytes(transfer, smallest)
+        # One scale for all shots, with room for the largest gain that is corrected.
+        room = math.sqrt(1.0 - LARGEST_IMBALANCE)
+        if gains is None and asked.gains == "auto":
+            notes.append(UNIDENTIFIED)
+        scale = (min(1.0, *gains) if gains is not None else room if asked.gains == "auto" else 1.0) / (
+            asked.calibration.peak
+        )
+        smallest = scale / (max(gains) if gains is not None else 1.0 / room)
+        rounding = self._rounding(transfer, smallest)
+        return {"transfer": transfer, "scale": scale, "rounding": rounding, "notes": notes}
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the four shots: validity, transfer, shifts, gains, the sense of the angles, then the turn."""
         asked = self._settings
-        shots = read_shots(self._files[view], self._white)
-        linear, bad = linear_intensities(shots.pictures, measured["transfer"]), shots.clipped | shots.dark
-        shifts, notes = [Shift(0.0, 0.0, True)] * 4, []
-        if asked.align:
-            shifts = estimate_shifts(linear)
-            linear, bad = align_shots(linear, bad, shifts)
-            notes = shift_notes(view, shifts)
-        invalid = np.asarray(bad.any(axis=0))
-        ratio = pair_ratio(linear.mean(axis=3), ~invalid)
+        found = self._linear(view, measured["transfer"], align=asked.align)
+        ratio = pair_ratio(found.linear.mean(axis=3), ~found.invalid)
         gains = asked.calibration.gains or UNIT_GAINS
         if asked.calibration.gains is None and asked.gains == "auto":
-            found = balancing_gains(ratio)
-            gains = found or UNIT_GAINS
-            if found is None:
-                said = (
+            balance = balancing_gains(ratio)
+            gains = balance or UNIT_GAINS
+            if balance is None:
+                why = (
                     "is too dark to measure"
                     if ratio is None
                     else f"is off by {ratio - 1:+.1%}, too much for gains"
                 )
-                notes.append(f"{view}: (I0 + I90)/(I45 + I135) {said}; not corrected.")
+                found.notes.append(f"{view}: (I0 + I90)/(I45 + I135) {why}; not corrected.")
         factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
-        linear = oriented(linear * factors[:, None, None, None], asked.calibration)
-        turned = np.stack([apply_orientation(picture, shots.orientation) for picture in linear])
-        upright = np.ascontiguousarray(oriented(turned, orientation_calibration(shots.orientation)))
-        height, width = upright.shape[1:3]
-        return DevelopedView(
-            intensities=upright,
-            invalid=np.ascontiguousarray(apply_orientation(invalid, shots.orientation)),
-            geometry=Geometry((width, height), (0, 0), 1, (width, height)),
-            record={
-                "orientation": shots.orientation,
-                "shifts": [[shift.x, shift.y] for shift in shifts],
-                "shifts_corrected": [shift.corrected for shift in shifts],
-                "pair_ratio": ratio,
-                "gains": list(gains),
-                "clipped_share": round(float(shots.clipped.any(axis=0).mean()), 6),
-                "dark_share": round(float(shots.dark.mean()), 6),
-                "invalid_share": round(float(invalid.mean()), 6),
-            },
-            notes=tuple(notes),
-        )
+        linear = oriented(found.linear * factors[:, None, None, None], asked.calibration)
+        code = found.shots.orientation
+        turned = np.stack([apply_orientation(picture, code) for picture in linear])
+        record = {
+            "shifts": [[shift.x, shift.y] for shift in found.shifts],
+            "shifts_corrected": [shift.corrected for shift in found.shifts],
+            "pair_ratio": ratio,
+            "gains": list(gains),
+        }
+        return self._developed(found, oriented(turned, orientation_calibration(code)), record)
 
 
 def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[float, float, float]:
@@ -209,17 +251,11 @@ def shift_notes(view: str, shifts: list[Shift]) -> list[str]:
     return notes
 
 
-_WORKED_SINGLE = 3 * (2 + 2 + 4 + 4 + 4)
-"""Bytes for each pixel of a shot: as stored and stacked, linear, turned, written."""
-_JPEG = (".jpg", ".jpeg")
-
-
-class SinglesSource(Source):
+class SinglesSource(ShotsSource):
     """Photographs of one camera through a linear polarizer that was turned between them, or without one."""
 
     needs = ("transfer", "scale", "light")
     kind = "singles"
-    cameras = None
 
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
         """Find the photographs and their angles.
@@ -227,15 +263,14 @@ class SinglesSource(Source):
         Raises:
             PolarguideError: one has no angle, or the settings do not fit the files.
         """
-        self._root, self._settings = root, settings
         shots, tables = find_single_shots(root, settings.angles)
-        self._shots: dict[str, list[SingleShot]] = {}
+        self._root = root
+        self._singles: dict[str, list[SingleShot]] = {}
         for shot in shots:
-            self._shots.setdefault(shot.view, []).append(shot)
-        self.views = sorted(self._shots)
-        self._pictures = [shot.path for view in self.views for shot in self._shots[view]]
-        self.paths = [*self._pictures, *tables]
-        self._white = development_of(self._pictures, settings)
+            self._singles.setdefault(shot.view, []).append(shot)
+        of_view = {view: [shot.path for shot in mine] for view, mine in sorted(self._singles.items())}
+        paths = [path for mine in of_view.values() for path in mine]
+        super().__init__([*paths, *tables], of_view, settings)
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """The transfer, and what the files say about their exposure.
@@ -243,100 +278,70 @@ class SinglesSource(Source):
         Raises:
             PolarguideError: the photographs are too large, or not of one camera and size.
         """
-        most = max(map(len, self._shots.values()))
-        remedy = "Make the pictures smaller, all by the same factor."
-        require_memory_of_each(self._pictures, most * _WORKED_SINGLE, "photographs of a view", remedy=remedy)
-        self._require_one_size()
+        self._require_memory("photographs of a view")
+        sizes: dict[str, Path] = {}  # but for the side they were held on
+        for path in self._shots:
+            size = None if is_camera_raw(path) else stated_size(path)
+            if size is not None:
+                sizes.setdefault(f"{max(size)}x{min(size)}", path)
+        self._require_one(sizes, "size", "Export all pictures of one camera alike, without a crop.")
         transfer, reason = self._transfer()
         light: dict[str, float] = {}
         cameras: dict[str, Path] = {}
         for number, view in enumerate(self.views, 1):
-            for shot in self._shots[view]:
-                taken = read_taken(shot.path)
+            for path in self._of_view[view]:
+                taken = read_taken(path)
                 if taken.camera:
-                    cameras.setdefault(taken.camera, shot.path)
+                    cameras.setdefault(taken.camera, path)
                 if taken.light is not None:
-                    light[self._name(shot)] = taken.light
+                    light[self._name(path)] = taken.light
             advance(number)
-        if len(cameras) > 1:
-            (first, path), (second, other) = list(cameras.items())[:2]
-            raise PolarguideError(
-                self._root,
-                expected="photographs of one camera",
-                found=f"{first} ({path.name}) and {second} ({other.name})",
-                remedy="Prepare those of one camera; only one set of intrinsics is estimated.",
-            )
+        remedy = "Prepare those of one camera; only one set of intrinsics is estimated."
+        self._require_one(cameras, "camera", remedy)
+        whole = len(self._shots)
+        stating = "All" if len(light) == whole else f"{len(light) or 'None'} of {whole}"
         return {
             "transfer": transfer,
             "scale": 1.0,
-            "rounding": self._rounding(transfer),
+            "rounding": self._rounding(transfer, 1.0),
             "light": light,
-            "notes": [self._summary(), reason, self._said_of_exposure(len(light))],
+            "notes": [self._summary(), reason, f"{stating} files state their exposure (EXIF)."],
         }
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the shots of a view: validity, transfer, shifts of the usual four, the turn of pictures and angles."""
-        asked, mine = self._settings, self._shots[view]
-        shots = read_stack([shot.path for shot in mine], self._white)
-        linear, bad = linear_intensities(shots.pictures, measured["transfer"]), shots.clipped | shots.dark
-        notes: list[str] = []
-        if asked.align and [shot.angle for shot in mine] == list(ANGLES):
-            shifts = estimate_shifts(linear)
-            linear, bad = align_shots(linear, bad, shifts)
-            notes = shift_notes(view, shifts)
-        code = shots.orientation
-        upright = np.stack([apply_orientation(picture, code) for picture in linear])
-        invalid = np.asarray(bad.any(axis=0))
-        height, width = upright.shape[1:3]
-        angles = [
-            turned(turned(shot.angle, asked.calibration), orientation_calibration(code)) for shot in mine
-        ]
+        asked, mine = self._settings, self._singles[view]
+        usual = [shot.angle for shot in mine] == list(ANGLES)
+        found = self._linear(view, measured["transfer"], align=asked.align and usual)
+        code = found.shots.orientation
+        turn = orientation_calibration(code)
+        angles = [turned(turned(shot.angle, asked.calibration), turn) for shot in mine]
         exposures = [
             {
-                "source": self._name(shot),
+                "source": self._name(shot.path),
                 "angle": angle,
-                "light": measured["light"].get(self._name(shot)),
+                "light": measured["light"].get(self._name(shot.path)),
                 "given_gain": shot.gain,
             }
             for shot, angle in zip(mine, angles, strict=True)
         ]
-        return DevelopedView(
-            intensities=np.ascontiguousarray(upright),
-            invalid=np.ascontiguousarray(apply_orientation(invalid, code)),
-            geometry=Geometry((width, height), (0, 0), 1, (width, height)),
-            angles=angles,
-            record={
-                "orientation": code,
-                "exposures": exposures,
-                "clipped_share": round(float(shots.clipped.any(axis=0).mean()), 6),
-                "dark_share": round(float(shots.dark.mean()), 6),
-                "invalid_share": round(float(invalid.mean()), 6),
-            },
-            notes=tuple(notes),
-        )
+        upright = np.stack([apply_orientation(picture, code) for picture in found.linear])
+        return self._developed(found, upright, {"exposures": exposures}, angles)
 
-    def _name(self, shot: SingleShot) -> str:
+    def _name(self, path: Path) -> str:
         """A photograph's name in its folder."""
-        return shot.path.relative_to(self._root).as_posix()
+        return path.relative_to(self._root).as_posix()
 
-    def _require_one_size(self) -> None:
-        """Refuse photographs whose headers state several sizes, but for the side they were held on.
+    def _require_one(self, found: dict[str, Path], what: str, remedy: str) -> None:
+        """Refuse photographs of two cameras or sizes: the first photograph of each, by its name.
 
         Raises:
-            PolarguideError: there are several.
+            PolarguideError: there are two.
         """
-        sizes: dict[tuple[int, int], Path] = {}
-        for path in self._pictures:
-            size = None if is_camera_raw(path) else stated_size(path)
-            if size is not None:
-                sizes.setdefault((max(size), min(size)), path)
-        if len(sizes) > 1:
-            (first, path), (second, other) = list(sizes.items())[:2]
+        if len(found) > 1:
+            names = [f"{name} ({path.name})" for name, path in list(found.items())[:2]]
             raise PolarguideError(
-                self._root,
-                expected="photographs of one size",
-                found=f"{first[0]}x{first[1]} ({path.name}) and {second[0]}x{second[1]} ({other.name})",
-                remedy="Export all pictures of one camera alike, without a crop.",
+                self._root, expected=f"photographs of one {what}", found=" and ".join(names), remedy=remedy
             )
 
     def _transfer(self) -> tuple[str, str]:
@@ -348,7 +353,7 @@ class SinglesSource(Source):
         asked = self._settings.transfer
         kinds = {
             "camera raw" if is_camera_raw(path) else "JPEG" if path.suffix.lower() in _JPEG else "PNG or TIFF"
-            for path in self._pictures
+            for path in self._shots
         }
         if len(kinds) > 1:
             raise PolarguideError(
@@ -359,40 +364,24 @@ class SinglesSource(Source):
             )
         (kind,) = kinds
         if kind == "camera raw":
-            return "linear", "Transfer linear: camera raw, developed without tone curve, alike for all shots."
+            return "linear", _RAW
         if asked != "auto":
             return asked, f"Transfer {asked}, as given."
-        found = "srgb" if kind == "JPEG" else "linear"
-        return found, f"Transfer {found}, as {kind} files usually are (--transfer sets it)."
-
-    def _rounding(self, transfer: str) -> Rounding:
-        """What codes are rounded to: by the steps of 8-bit values; none for 16 bits."""
-        first = self._shots[self.views[0]][0]
-        if (
-            self._settings.precision == "full"
-            or read_stack([first.path], self._white).pictures.dtype != np.uint8
-        ):
-            return EXACT
-        return rounding_of_bytes(transfer, 1.0)
+        usual = "srgb" if kind == "JPEG" else "linear"
+        return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
 
     def _summary(self) -> str:
         """How many photographs there are, and at which angles."""
-        shots = [shot for view in self.views for shot in self._shots[view]]
-        counts = Counter(_rough(turned(shot.angle, self._settings.calibration)) for shot in shots)
-        words = [counts.pop(word, 0) for word in ("unknown", "none")]
+        counts: Counter[Angle] = Counter()
+        for shot in itertools.chain(*self._singles.values()):
+            angle = turned(shot.angle, self._settings.calibration)
+            counts[angle if isinstance(angle, str) else round(angle, 1) % 180] += 1
+        unknown, bare = counts.pop("unknown", 0), counts.pop("none", 0)
         angles = [angle_text(angle) for angle in sorted(a for a in counts if not isinstance(a, str))]
-        parts = [f"{sum(counts.values())} at known angles ({listed(angles, 12)})"] if angles else []
-        parts += [f"{words[0]} at unknown angles"] if words[0] else []
-        parts += [f"{words[1]} without a filter"] if words[1] else []
-        return f"{len(shots)} photographs of {len(self.views)} views: {', '.join(parts)}."
-
-    def _said_of_exposure(self, count: int) -> str:
-        """How many files state their exposure."""
-        whole = len(self._pictures)
-        if count == whole:
-            return "All files state their exposure (EXIF)."
-        return f"{count or 'None'} of {whole} files state their exposure (EXIF)."
-
-
-def _rough(angle: Angle) -> Angle:
-    return angle if isinstance(angle, str) else round(angle, 1) % 180
+        parts = (
+            (counts.total(), f"at known angles ({listed(angles, 12)})"),
+            (unknown, "at unknown angles"),
+            (bare, "without a filter"),
+        )
+        kinds = ", ".join(f"{count} {what}" for count, what in parts if count)
+        return f"{len(self._shots)} photographs of {len(self.views)} views: {kinds}."

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
-import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.filter.camera_raw import is_camera_raw
-from polarguide.capture.formats.integrity import jpeg_segments, png_chunks, tiff_entries, tiff_order
+from polarguide.capture.formats.integrity import TIFF, jpeg_segments, png_chunks
 from polarguide.capture.formats.pictures import read_picture
-from polarguide.errors import PolarguideError, optional_import
+from polarguide.errors import optional_import
 from polarguide.files import read_file
 
 _ORIENTATION = 274
@@ -36,11 +38,8 @@ TURNS = {
 
 def orientation(data: bytes) -> int:
     """The orientation tag of a picture file, 1 to 8; 1 (as stored) where there is none that can be read."""
-    try:
-        value = _tag(tags_of(data))
-    except struct.error:
-        value = 1
-    return value if 1 <= value <= 8 else 1
+    value = tags_of(data).get(_ORIENTATION)
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
@@ -58,29 +57,31 @@ def orientation_calibration(code: int) -> Calibration:
     return Calibration(sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in _QUARTER else 0.0)
 
 
-def tags_of(data: bytes) -> bytes:
-    """The TIFF structure that holds the tags of a picture file; empty if there is none."""
+def tags_of(data: bytes) -> dict[int, Any]:
+    """The EXIF tags of a JPEG, PNG or TIFF file and of camera raw that is built like TIFF; none where they are damaged.
+
+    Pillow reads tags only: of pictures with 16 bits a channel it would return 8.
+    """
+    tiff = data
     if data.startswith(b"\xff\xd8"):
-        segments = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
-        return next((content[6:] for content in segments if content.startswith(b"Exif\0\0")), b"")
-    if data.startswith(b"\x89PNG"):
-        return next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
-    return data
-
-
-def _tag(tiff: bytes) -> int:
-    """The orientation in the first directory of a TIFF structure, 1 if it has none."""
-    if tiff[:4] in (b"II*\0", b"MM\0*"):
-        for tag, _, _, at in tiff_entries(tiff):
-            if tag == _ORIENTATION:
-                return int(struct.unpack_from(tiff_order(tiff) + "H", tiff, at)[0])
-    return 1
+        contents = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
+        tiff = next((content[6:] for content in contents if content.startswith(b"Exif\0\0")), b"")
+    elif data.startswith(b"\x89PNG"):
+        tiff = next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
+    if tiff[:4] not in TIFF:
+        return {}
+    exif = Image.Exif()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            exif.load(tiff)
+            return {**exif, **exif.get_ifd(_DIRECTORY)}
+    except Exception:  # Pillow raises a dozen kinds for tags that are damaged, and promises none
+        return {}
 
 
 _MAKER, _MODEL, _DIRECTORY = 271, 272, 34665
 _TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
-_SIZES = {2: 1, 3: 2, 4: 4, 5: 8}
-_LONGEST_TEXT = 200
 
 
 @dataclass(frozen=True)
@@ -101,32 +102,27 @@ def read_taken(path: Path) -> Taken:
     """What a file says about its exposure: EXIF of JPEG, PNG, TIFF and camera raw that is built like TIFF; else LibRaw.
 
     Raises:
-        PolarguideError: the file cannot be read.
+        PolarguideError: the file cannot be read, or LibRaw is needed and missing.
     """
     raw = is_camera_raw(path)
     data = read_file(path) if raw else read_picture(path)
     found = taken(data)
-    if raw and found.light is None and data[:4] not in (b"II*\0", b"MM\0*"):
-        return _by_libraw(path, data) or found
+    if not raw or found.light is not None or data[:4] in TIFF:
+        return found
+    libraw = optional_import("rawpy", str(path))
+    # LibRaw's errors: whoever develops the file says what is wrong with it.
+    with contextlib.suppress(Exception), libraw.imread(io.BytesIO(data)) as opened:
+        other = opened.other  # which some versions of rawpy do not have
+        return Taken("", _light(other.shutter, other.iso_speed, other.aperture))
     return found
 
 
 def taken(data: bytes) -> Taken:
     """What the EXIF tags of a picture file say; damaged ones say nothing."""
-    try:
-        tiff = tags_of(data)
-        if tiff[:4] not in (b"II*\0", b"MM\0*"):
-            return Taken("", None)
-        first = {tag: (kind, count, at) for tag, kind, count, at in tiff_entries(tiff)}
-        camera = " ".join(filter(None, (_text(tiff, first.get(_MAKER)), _text(tiff, first.get(_MODEL)))))
-        inner = dict(first)
-        if _DIRECTORY in first:
-            (start,) = struct.unpack_from(tiff_order(tiff) + "I", tiff, first[_DIRECTORY][2])
-            inner |= {tag: (kind, count, at) for tag, kind, count, at in tiff_entries(tiff, start)}
-        numbers = [_number(tiff, inner.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER)]
-    except struct.error:
-        return Taken("", None)
-    return Taken(camera, _light(*numbers))
+    tags = tags_of(data)
+    names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
+    light = _light(*(_number(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER)))
+    return Taken(" ".join(filter(None, names)), light)
 
 
 def _light(seconds: float | None, iso: float | None, f_number: float | None) -> float | None:
@@ -138,41 +134,10 @@ def _light(seconds: float | None, iso: float | None, f_number: float | None) -> 
     return seconds * iso / f_number**2
 
 
-def _by_libraw(path: Path, data: bytes) -> Taken | None:
-    """What LibRaw reads of other camera raw files; None where this version of rawpy does not tell."""
+def _number(value: Any) -> float | None:
+    """A tag as a number, the first of several; None where it is missing or not finite."""
     try:
-        with optional_import("rawpy", str(path)).imread(io.BytesIO(data)) as raw:
-            about = getattr(raw, "other", None)
-            return (
-                None if about is None else Taken("", _light(about.shutter, about.iso_speed, about.aperture))
-            )
-    except PolarguideError:
-        raise
-    except Exception:  # LibRaw's own; whoever develops the file says what is wrong with it
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, IndexError, ZeroDivisionError):
         return None
-
-
-def _value(tiff: bytes, entry: tuple[int, int, int] | None) -> bytes:
-    """The bytes of an entry's value; none where there is no such entry or its type is another."""
-    if entry is None or entry[0] not in _SIZES:
-        return b""
-    kind, count, at = entry
-    size = _SIZES[kind] * min(count, _LONGEST_TEXT if kind == 2 else 1)
-    if _SIZES[kind] * count > 4:
-        (at,) = struct.unpack_from(tiff_order(tiff) + "I", tiff, at)
-    return tiff[at : at + size]
-
-
-def _text(tiff: bytes, entry: tuple[int, int, int] | None) -> str:
-    return _value(tiff, entry).split(b"\0")[0].decode("ascii", "replace").strip()
-
-
-def _number(tiff: bytes, entry: tuple[int, int, int] | None) -> float | None:
-    value, order = _value(tiff, entry), tiff_order(tiff)
-    if entry is None or entry[0] == 2 or len(value) < _SIZES.get(entry[0], 1) or not value:
-        return None
-    if entry[0] == 5:
-        above, below = struct.unpack(order + "II", value[:8])
-        return above / below if below else None
-    found = float(struct.unpack(order + ("H" if entry[0] == 3 else "I"), value)[0])
-    return found if math.isfinite(found) else None
+    return number if math.isfinite(number) else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import struct
 import tokenize
@@ -69,17 +70,13 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     data = read_file(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             size = sum(entry.file_size for entry in archive.infolist())
             if size > _LARGEST_ARCHIVE:
                 raise ValueError(f"an archive that unfolds to {size} bytes")
-            return {
-                entry.filename.removesuffix(".npy"): _array(_member(archive, entry))
-                for entry in archive.infolist()
-            }
-    except zipfile.BadZipFile as error:
-        found = "an empty file" if not data else f"one that cannot be unpacked ({error})"
+            return {name: _array(_member(archive, entry)) for name, entry in members.items()}
     except BROKEN as error:
-        found = f"a damaged one ({error})"
+        found = "an empty file" if not data else f"one that cannot be unpacked ({error})"
     raise damaged(path, "a complete .npz file of numbers", found)
 
 
@@ -133,18 +130,26 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
     return found
 
 
+def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type in the header of ``.npy``; the stream is then behind it.
+
+    Raises:
+        One of ``BROKEN``: there is no such header.
+    """
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    return shape, dtype
+
+
 def _array(data: bytes, kinds: str = "biuf") -> NDArray[Any]:
     """Decode ``.npy``; a header that promises more than there is, is refused before memory is taken for it.
 
     ``kinds`` are the types of values that may be in it, as NumPy calls them.
     """
     stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    size = dtype.itemsize
-    for length in shape:
-        size *= length
+    shape, dtype = array_header(stream)
+    size = math.prod((dtype.itemsize, *shape))
     if dtype.hasobject or dtype.kind not in kinds or size > len(data) - stream.tell():
         raise ValueError("no complete array of numbers")
     stream.seek(0)
@@ -171,7 +176,7 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
     if suffix == ".hdr":
         pixels = _read_hdr(path)
     elif suffix == ".exr":
-        pixels = _read_exr(path)
+        pixels = _read_exr(path, "RGB", "Y")
     else:
         pixels = read_array(path)
     if pixels.ndim == 2:
@@ -188,45 +193,44 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
 def _read_hdr(path: Path) -> NDArray[Any]:
     data = read_file(path)
     found = "an empty file" if not data else "a file that is none"
-    size, pixels = hdr_size(data), None
-    if size is not None:
-        width, height = size
+    if (size := hdr_size(data)) is not None:
         found = f"one that is damaged or cut short (it ends after {len(data)} bytes)"
         # Run lengths reach 127 pixels with two bytes a channel: fewer bytes than this cannot be complete.
-        if 0 < height * width <= min(LARGEST_PIXELS, 64 * len(data)):
-            pixels = _decoded(data)
-    if pixels is None or pixels.dtype != np.float32 or pixels.ndim != 3:
-        raise damaged(path, "a complete Radiance HDR file", found)
-    return pixels[..., 2::-1]
+        if 0 < math.prod(size) <= min(LARGEST_PIXELS, 64 * len(data)):
+            level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            try:
+                pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+                if pixels is not None and pixels.dtype == np.float32 and pixels.ndim == 3:
+                    return pixels[..., 2::-1]
+            except cv2.error:
+                pass
+            finally:
+                cv2.utils.logging.setLogLevel(level)
+    raise damaged(path, "a complete Radiance HDR file", found)
 
 
-def _decoded(data: bytes) -> NDArray[Any] | None:
-    """Decode a picture file with OpenCV, without its messages."""
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        return None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-
-
-def _read_exr(path: Path, wanted: tuple[str, ...] | None = None) -> NDArray[Any]:
+def _read_exr(path: Path, *choices: Sequence[str]) -> NDArray[Any]:
+    """The channels [H, W, C] of the first of the choices of names that an OpenEXR file has whole."""
     data = read_file(path)
-    openexr = optional_import("OpenEXR", str(path))
+    package = optional_import("OpenEXR", str(path))
     found = "an empty file" if not data else "one that is damaged, cut short or something else"
-    pixels = None
     if data.startswith(_EXR_MAGIC):
         try:
             exr_size(data)
-            with in_utf8(path) as name:
-                pixels = _exr_channels(name, openexr, wanted)
+            with in_utf8(path) as name, package.File(str(name), separate_channels=True) as file:
+                window = file.header()["dataWindow"]
+                width, height = (int(window[1][axis]) - int(window[0][axis]) + 1 for axis in (0, 1))
+                if not 0 < width * height <= LARGEST_PIXELS:
+                    raise ValueError(f"{width}x{height} pixels")
+                channels = file.channels()
+                for names in choices:
+                    if all(name in channels for name in names):
+                        planes = [np.asarray(channels[name].pixels, np.float32) for name in names]
+                        return np.stack(planes, axis=-1)
         except Exception as error:  # the binding raises whatever C++ threw
             found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
-    if pixels is None:
-        names = "R, G and B, or Y" if wanted is None else ", ".join(wanted)
-        raise damaged(path, f"a complete OpenEXR file with channels {names}", found)
-    return pixels
+    names_wanted = ", or ".join(", ".join(names) for names in choices)
+    raise damaged(path, f"a complete OpenEXR file with channels {names_wanted}", found)
 
 
 def read_exr_channels(path: Path, groups: Sequence[Sequence[str]]) -> list[NDArray[np.float32]]:
@@ -235,7 +239,7 @@ def read_exr_channels(path: Path, groups: Sequence[Sequence[str]]) -> list[NDArr
     Raises:
         PolarguideError: the file cannot be read, is damaged or lacks a channel, or the package OpenEXR is missing.
     """
-    return [_read_exr(path, tuple(names)) for names in groups]
+    return [_read_exr(path, names) for names in groups]
 
 
 def hdr_size(data: bytes) -> tuple[int, int] | None:
@@ -273,17 +277,3 @@ def exr_size(data: bytes) -> tuple[int, int]:
     if not found:
         raise ValueError("no size")
     return width, height
-
-
-def _exr_channels(path: Path, package: Any, wanted: tuple[str, ...] | None) -> NDArray[Any] | None:
-    with package.File(str(path), separate_channels=True) as file:
-        window = file.header()["dataWindow"]
-        width, height = (int(window[1][axis]) - int(window[0][axis]) + 1 for axis in (0, 1))
-        if not 0 < width * height <= LARGEST_PIXELS:
-            raise ValueError(f"{width}x{height} pixels")
-        channels = file.channels()
-        choices = (("R", "G", "B"), ("Y",)) if wanted is None else (wanted,)
-        names = next((n for n in choices if all(name in channels for name in n)), None)
-        if names is None:
-            return None
-        return np.stack([np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1)

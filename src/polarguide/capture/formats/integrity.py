@@ -24,8 +24,8 @@ TIFF = (b"II*\0", b"MM\0*")
 BIG_TIFF = (b"II+\0", b"MM\0+")
 # Marks without a length: one that nobody uses, and restarts.
 _JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
-MOST_BIG_ENTRIES = 4096
-"""Of a BigTIFF directory that are looked at: its count has 64 bits, and files have some thirty."""
+MOST_ENTRIES = 4096
+"""Entries of a TIFF directory that are read: files have some thirty, and a count of BigTIFF may claim 2^64."""
 _MOST_SCANS = 200
 """Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not."""
 _MOST_PICTURES = 1000
@@ -72,11 +72,7 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
         return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
-    if data[:4] in TIFF:
-        return _tiff_size(data)
-    if data[:4] in BIG_TIFF:
-        return _big_tiff_size(data)
-    return None
+    return _tiff_size(data) if data[:4] in (*TIFF, *BIG_TIFF) else None
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
@@ -88,37 +84,48 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
         at += 12 + length
 
 
+def _jpeg_marks(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Kinds of the segments and scans of a JPEG file up to its end-of-image mark, and where their contents lie."""
+    at = 2
+    while at + 2 <= len(data) and data[at] == 0xFF:
+        kind, end = data[at + 1], at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if kind == 0xFF:  # fill byte
+            at += 1
+        elif kind in _JPEG_ALONE:
+            at += 2
+        else:
+            yield kind, at + 4, end
+            mark = _JPEG_SCAN_END.search(data, end) if kind == 0xDA else None
+            at = mark.start() if mark is not None else end
+            if kind == 0xD9 or (kind == 0xDA and mark is None):
+                return
+
+
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Kind and content of the segments of a JPEG file before its first scan."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        if data[at + 1] == 0xFF:  # fill byte
-            at += 1
-            continue
-        if data[at + 1] in _JPEG_ALONE:
-            at += 2
-            continue
-        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        yield data[at + 1], data[at + 4 : end]
-        at = end
+    for kind, start, end in _jpeg_marks(data):
+        if kind == 0xDA:
+            return
+        yield kind, data[start:end]
 
 
 def tiff_entries(data: bytes, start: int | None = None) -> Iterator[tuple[int, int, int, int]]:
-    """Tag, type and count of the entries in a directory of a TIFF file, and where their values stand.
+    """Tag, type and count of the entries in a directory of a TIFF or BigTIFF file, and where their values stand.
 
     Args:
         data: the file. start: where the directory stands; the first one's place if None.
 
     Raises:
-        struct.error: the file is too short.
+        struct.error, OverflowError: the file is too short.
     """
-    order = tiff_order(data)
+    order, big = tiff_order(data), data[:4] in BIG_TIFF  # places and counts of BigTIFF have 64 bits
+    head, counter, place = ("HHQ", "Q", 12) if big else ("HHI", "H", 8)
     if start is None:
-        (start,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, start)
-    for entry in range(start + 2, start + 2 + 12 * count, 12):
-        tag, kind, length = struct.unpack_from(order + "HHI", data, entry)
-        yield tag, kind, length, entry + 8
+        (start,) = struct.unpack_from(order + head[2:], data, 8 if big else 4)
+    (count,) = struct.unpack_from(order + counter, data, start)
+    first, size = start + struct.calcsize(counter), 20 if big else 12
+    for at in range(first, first + size * min(count, MOST_ENTRIES), size):
+        yield *struct.unpack_from(order + head, data, at), at + place
 
 
 def tiff_order(data: bytes) -> str:
@@ -135,56 +142,38 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """The same of a TIFF file; None where a side has another type than usual or stands there twice."""
+    """The same of a TIFF or BigTIFF file; None where a side has another type than usual or stands there twice."""
+    codes = {3: "H", 4: "I", 16: "Q"} if data[:4] in BIG_TIFF else {3: "H", 4: "I"}
+    sides: dict[int, int] = {}
     try:
-        sides = [entry for entry in tiff_entries(data) if entry[0] in (256, 257)]
-        if sorted(tag for tag, *_ in sides) != [256, 257] or any(kind not in (3, 4) for _, kind, *_ in sides):
-            return None
-        order = tiff_order(data)
-        found = {
-            tag: struct.unpack_from(order + _TIFF_CODES[kind], data, at)[0] for tag, kind, _, at in sides
-        }
-    except struct.error:
-        return None
-    return found[256], found[257]
-
-
-def _big_tiff_size(data: bytes) -> tuple[int, int] | None:
-    """The same of a BigTIFF file, whose places and counts have 64 bits."""
-    order, found = tiff_order(data), {}
-    try:
-        (start,) = struct.unpack_from(order + "Q", data, 8)
-        (count,) = struct.unpack_from(order + "Q", data, start)
-        for entry in range(start + 8, start + 8 + 20 * min(count, MOST_BIG_ENTRIES), 20):
-            tag, kind = struct.unpack_from(order + "HH", data, entry)
-            if tag in (256, 257) and (tag in found or kind not in (3, 4, 16)):
-                return None
+        for tag, kind, _, at in tiff_entries(data):
             if tag in (256, 257):
-                (found[tag],) = struct.unpack_from(order + {**_TIFF_CODES, 16: "Q"}[kind], data, entry + 12)
+                if tag in sides or kind not in codes:
+                    return None
+                (sides[tag],) = struct.unpack_from(tiff_order(data) + codes[kind], data, at)
     except (struct.error, OverflowError):
         return None
-    return (found[256], found[257]) if len(found) == 2 else None
+    return (sides[256], sides[257]) if len(sides) == 2 else None
 
 
 def _tiff_oddity(data: bytes) -> str | None:
     """What decoders pass over without a word: white that is stored as 0, and all pictures but the first."""
     order, pictures = tiff_order(data), 0
-    seen: set[int] = set()
+    directories: set[int] = set()
     (start,) = struct.unpack_from(order + "I", data, 4)
     with contextlib.suppress(struct.error):
-        while start and start not in seen and len(seen) < _MOST_PICTURES:
-            seen.add(start)
-            (count,) = struct.unpack_from(order + "H", data, start)
-            tags = {}
-            for at in range(start + 2, start + 2 + 12 * count, 12):
-                tag, kind = struct.unpack_from(order + "HH", data, at)
-                if tag in (_SUBFILE, _OLD_SUBFILE, _PHOTOMETRIC) and kind in _TIFF_CODES:
-                    (tags[tag],) = struct.unpack_from(order + _TIFF_CODES[kind], data, at + 8)
-            if len(seen) == 1 and tags.get(_PHOTOMETRIC) == 0:
+        while start and start not in directories and len(directories) < _MOST_PICTURES:
+            directories.add(start)
+            entries = list(tiff_entries(data, start))
+            tags = {
+                tag: struct.unpack_from(order + _TIFF_CODES[kind], data, at)[0]
+                for tag, kind, _, at in entries
+                if tag in (_SUBFILE, _OLD_SUBFILE, _PHOTOMETRIC) and kind in _TIFF_CODES
+            }
+            if len(directories) == 1 and tags.get(_PHOTOMETRIC) == 0:
                 return "a TIFF file whose white is 0"
-            smaller = tags.get(_SUBFILE, 0) & _NO_PICTURE or tags.get(_OLD_SUBFILE) == _REDUCED
-            pictures += not smaller
-            (start,) = struct.unpack_from(order + "I", data, start + 2 + 12 * count)
+            pictures += not (tags.get(_SUBFILE, 0) & _NO_PICTURE or tags.get(_OLD_SUBFILE) == _REDUCED)
+            (start,) = struct.unpack_from(order + "I", data, start + 2 + 12 * len(entries))
     return f"a TIFF file of {pictures} pictures" if pictures > 1 else None
 
 
@@ -206,38 +195,13 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def _jpeg_damage(data: bytes) -> str | None:
-    """Walk the segments of a JPEG file to its end-of-image mark."""
-    scans = _jpeg_scans(data)
-    if scans is None:
+    """Whether a JPEG file ends with its end-of-image mark, has a size, and not too many scans."""
+    kinds = [kind for kind, _, _ in _jpeg_marks(data)]
+    if 0xD9 not in kinds:
         return f"a JPEG file cut short (it ends after {len(data)} bytes)"
-    if scans > _MOST_SCANS:
-        return f"a JPEG file of {scans} scans"
+    if kinds.count(0xDA) > _MOST_SCANS:
+        return f"a JPEG file of {kinds.count(0xDA)} scans"
     return None if _jpeg_size(data) is not None else "a JPEG file without a size"
-
-
-def _jpeg_scans(data: bytes) -> int | None:
-    """How many scans a JPEG file has; None if it has no end."""
-    at, scans = 2, 0
-    while at + 4 <= len(data):
-        if data[at] != 0xFF:
-            return None
-        kind = data[at + 1]
-        if kind == 0xD9:
-            return scans
-        if kind == 0xFF:  # fill byte
-            at += 1
-            continue
-        if kind in _JPEG_ALONE:
-            at += 2
-            continue
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        if kind == 0xDA:
-            scans += 1
-            mark = _JPEG_SCAN_END.search(data, at)
-            if mark is None:
-                return None
-            at = mark.start()
-    return scans if data[at : at + 2] == b"\xff\xd9" else None
 
 
 def _tiff_is_complete(data: bytes) -> bool:

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.arrays import BROKEN, exr_size, hdr_size
+from polarguide.capture.formats.arrays import BROKEN, array_header, exr_size, hdr_size
 from polarguide.capture.formats.integrity import (
     BIG_TIFF,
     LARGEST_PIXELS,
-    MOST_BIG_ENTRIES,
+    MOST_ENTRIES,
     TIFF,
     damaged,
     declared_size,
@@ -247,22 +247,13 @@ def read_picture(path: Path) -> bytes:
 
 def _directory(file: BinaryIO, start: bytes) -> bytes:
     """The head of a TIFF file with its first directory right behind it, wherever it stands in the file."""
-    order, big = tiff_order(start), start[:4] in BIG_TIFF
-    (at,) = struct.unpack_from(order + ("Q" if big else "I"), start, 8 if big else 4)
-    file.seek(at)
-    if not big:
-        raw = file.read(2)
-        (count,) = struct.unpack(order + "H", raw)
-        return start[:4] + struct.pack(order + "I", 8) + raw + file.read(12 * count)
-    raw = file.read(8)
-    (count,) = struct.unpack(order + "Q", raw)
-    return start[:8] + struct.pack(order + "Q", 16) + raw + file.read(20 * min(count, MOST_BIG_ENTRIES))
+    big = start[:4] in BIG_TIFF
+    place, head = tiff_order(start) + ("Q" if big else "I"), 8 if big else 4
+    file.seek(struct.unpack_from(place, start, head)[0])
+    return start[:head] + struct.pack(place, head + struct.calcsize(place)) + file.read(20 * MOST_ENTRIES)
 
 
 def _array_size(head: bytes) -> tuple[int, int] | None:
     """Of an ``.npy`` file of two or more axes, rows first."""
-    stream = io.BytesIO(head)
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape = read(stream)[0]
+    shape, _ = array_header(io.BytesIO(head))
     return (int(shape[1]), int(shape[0])) if len(shape) > 1 else None
