@@ -44,8 +44,7 @@ def test_the_correction_gives_what_ideal_polarizers_would_measure(name: str) -> 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_samples_of_an_ideal_sensor_do_not_change_whatever_they_are(name: str) -> None:
-    pattern = sensor_pattern(name)
-    turn = np.radians(pattern.angles)
+    turn = np.radians(sensor_pattern(name).angles)
     vectors = np.stack([np.ones_like(turn), np.cos(2 * turn), np.sin(2 * turn)], axis=-1)[None, None] / 2
     ideal = AnalyzerCalibration(name, "", (0, 0), (32, 24), 32, vectors.astype(np.float32), "mean")
     noise = np.random.default_rng(0).uniform(0, 1, (24, 32)).astype(np.float32)
@@ -53,16 +52,14 @@ def test_the_samples_of_an_ideal_sensor_do_not_change_whatever_they_are(name: st
 
 
 def test_the_part_that_no_light_explains_is_kept_at_its_size() -> None:
-    rng = np.random.default_rng(1)
-    turn = np.radians([90.0, 45.0, 135.0, 0.0]) + rng.uniform(-0.03, 0.03, 4)
+    turn = np.radians([90.0, 45.0, 135.0, 0.0]) + np.random.default_rng(1).uniform(-0.03, 0.03, 4)
     a = np.stack([np.ones(4), 0.9 * np.cos(2 * turn), 0.9 * np.sin(2 * turn)], axis=1) / 2
     matrix = correction_matrices([row.astype(np.float32) for row in a], np.array([90, 45, 135, 0]))
     turn = np.radians([90.0, 45.0, 135.0, 0.0])
     ideal = np.stack([np.ones(4), np.cos(2 * turn), np.sin(2 * turn)], axis=1) / 2
     np.testing.assert_allclose(matrix @ a, ideal, atol=1e-6)
     np.testing.assert_allclose(np.linalg.pinv(ideal) @ matrix, np.linalg.pinv(a), atol=1e-5)
-    perpendicular = np.linalg.svd(a)[0][:, 3]
-    np.testing.assert_allclose(np.abs(matrix @ perpendicular), 0.5, atol=1e-5)
+    np.testing.assert_allclose(np.abs(matrix @ np.linalg.svd(a)[0][:, 3]), 0.5, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -114,8 +111,7 @@ def test_colors_have_analyzers_of_their_own() -> None:
 
 
 def test_the_peak_bounds_what_comes_out() -> None:
-    sensor = made_sensor("IMX250MZR", (24, 32), single=True)
-    calibration = true_calibration(sensor)
+    calibration = true_calibration(made_sensor("IMX250MZR", (24, 32), single=True))
     samples = np.random.default_rng(0).integers(0, 2, (24, 32)).astype(np.float32)
     peak = calibration.peak((0, 0), (32, 24))
     assert 1.0 < peak < 1.4

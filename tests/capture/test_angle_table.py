@@ -1,8 +1,9 @@
-"""``angles.csv``: what it says is read, and what is wrong with it is said in one line."""
+"""Tables of angles, calibrations of angles, and relative exposures."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import shutil
 from pathlib import Path
@@ -13,10 +14,12 @@ import torch
 
 from polarguide import PolarguideError
 from polarguide.capture import load_scene
+from polarguide.capture.calibration import Calibration, combined, oriented
 from polarguide.capture.exposures import FOUR, Exposure, read_table, table_text
 from polarguide.capture.filter.shots import find_single_shots
 from polarguide.inspection.capture import read_capture
-from polarguide.polarizer import malus, stokes_of_four
+from polarguide.polarizer import ANGLES, malus, stokes_of_four
+from polarguide.preparation.exposure_table import exposures_of_points, reconciled
 from tests.helpers.tiny_capture import NAMES, TinyCapture, write_picture, write_tiny_capture
 
 
@@ -227,3 +230,120 @@ def test_a_table_is_refused_for_both_or_for_none(tmp_path: Path, text: str) -> N
             read(folder)
         said.append((caught.value.expected, caught.value.found, caught.value.remedy))
     assert said[0] == said[1]
+
+
+def taken(calibration: Calibration) -> np.ndarray:
+    """What an instrument of this calibration stores under 0, 45, 90 and 135 of one pixel's light, [4, 1]."""
+    sign = -1 if calibration.sense == "cw" else 1
+    stokes = (1.0, 0.3, 0.25)
+    true = [np.radians(sign * angle + calibration.zero) for angle in calibration.order]
+    return np.array([[malus(stokes, angle)] for angle in true], np.float32)
+
+
+SOME = [
+    Calibration(),
+    Calibration(sense="cw"),
+    Calibration(zero=90),
+    Calibration(sense="cw", zero=45),
+    Calibration(order=(90, 45, 0, 135)),
+    Calibration(order=(45, 0, 90, 135)),
+    Calibration(zero=12.0),
+    Calibration(sense="cw", zero=-10.0),
+]
+
+
+@pytest.mark.parametrize(("first", "second"), list(itertools.product(SOME, SOME)))
+def test_one_calibration_in_place_of_two(first: Calibration, second: Calibration) -> None:
+    whole = combined(first, second)
+    if whole is None:
+        assert not first.permutes  # a pairing found after a turn was no fault of names
+        assert sorted(second.order) == sorted(ANGLES) != list(second.order)
+        return
+    # The stored values are those of an instrument that counts as ``whole`` says: all three ways read the same light.
+    stored = taken(whole)
+    np.testing.assert_allclose(oriented(stored, whole), taken(Calibration()), atol=1e-6)
+    np.testing.assert_allclose(oriented(oriented(stored, first), second), taken(Calibration()), atol=1e-6)
+
+
+def made(pictures: int, points: int, seed: int, *, share: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    """Intensities [points, pictures], and the logarithms of the exposures, mean 0."""
+    rng = np.random.default_rng(seed)
+    logs = rng.normal(0, 0.3, pictures)
+    values = rng.uniform(0.05, 0.8, points)[:, None] * np.exp(logs)
+    values[rng.uniform(size=values.shape) > share] = np.nan
+    return values, logs - logs.mean()
+
+
+def test_exact_intensities_give_exact_exposures() -> None:
+    values, logs = made(12, 300, 0)
+    found, numbers = exposures_of_points(values)
+    np.testing.assert_allclose(found, logs, atol=1e-6)
+    assert (numbers > 100).all()
+
+
+def test_polarized_and_mirroring_points_are_outvoted() -> None:
+    values, logs = made(20, 400, 1)
+    rng = np.random.default_rng(2)
+    angles = rng.uniform(0, np.pi, 20)
+    polarized = values[:160]  # all alike, as the surface of a table
+    polarized *= 1 + 0.4 * np.cos(2 * angles)
+    values[160:200] *= np.exp(rng.normal(0, 1.0, (40, 20)))
+    values *= np.exp(rng.normal(0, 0.02, values.shape))
+    found, _ = exposures_of_points(values)
+    assert np.abs(found - logs).max() < 0.02
+    plain = np.nanmean(np.log(values) - np.nanmean(np.log(values), axis=1, keepdims=True), axis=0)
+    assert np.abs(plain - plain.mean() - logs).max() > 0.1
+
+
+def test_pictures_without_points_in_common_are_not_compared() -> None:
+    values, logs = made(9, 300, 3, share=0.9)
+    values[:200, 6:] = np.nan  # two groups that nothing links, and one picture that sees next to nothing
+    values[200:, :6] = np.nan
+    values[10:, 0] = np.nan
+    found, numbers = exposures_of_points(values)
+    assert np.isnan(found[[0, 6, 7, 8]]).all()
+    assert numbers[0] < 20
+    np.testing.assert_allclose(found[1:6], logs[1:6] - logs[1:6].mean(), atol=1e-6)
+    alone, _ = exposures_of_points(values[:, :1])
+    assert np.isnan(alone).all()
+
+
+def test_files_are_corrected_a_little_and_only_a_little() -> None:
+    rng = np.random.default_rng(4)
+    logs = rng.normal(0, 0.2, 60)
+    points = logs + rng.normal(0, 0.05, 60) + 3.0
+    points[:2] += 0.4  # a reflection that all points are in
+    found = reconciled(points, logs, np.zeros(60, bool))
+    assert np.abs(found.logs - logs - np.median(found.logs - logs)).max() < 0.03
+    assert (found.contradicted, found.scatter) == ((), pytest.approx(0.05, abs=0.025))
+
+
+def test_a_file_that_is_contradicted_by_far_is_not_believed() -> None:
+    rng = np.random.default_rng(5)
+    logs = rng.normal(0, 0.2, 20)
+    files = logs.copy()
+    files[7] -= np.log(4)
+    found = reconciled(logs + rng.normal(0, 0.03, 20), files, np.zeros(20, bool))
+    assert (found.contradicted, found.logs[7]) == ((7,), pytest.approx(logs[7], abs=0.1))
+
+
+def test_the_filter_takes_a_share_that_points_tell() -> None:
+    """A real filter leaves 0.38, not half: photographs without it are 2.6 times as bright at one exposure."""
+    rng = np.random.default_rng(6)
+    bare = np.arange(24) % 4 == 0
+    files = rng.normal(0, 0.2, 24)
+    logs = files + np.where(bare, 0.0, np.log(0.38))
+    found = reconciled(logs + rng.normal(0, 0.02, 24), files, bare)
+    assert np.abs(found.logs - logs - np.median(found.logs - logs)).max() < 0.03
+    ideal = reconciled(np.full(24, np.nan), files, bare)
+    np.testing.assert_allclose(ideal.logs, files + np.where(bare, np.log(2), 0))
+
+
+def test_what_one_source_lacks_the_other_gives() -> None:
+    logs = np.linspace(-0.4, 0.4, 9)
+    points, files = logs + 1.0, logs.copy()
+    points[3], files[5], points[7], files[7] = (np.nan,) * 4
+    found = reconciled(points, files, np.zeros(9, bool)).logs
+    assert np.isnan(found[7])
+    known = np.arange(9) != 7
+    np.testing.assert_allclose((found - found[0])[known], (logs - logs[0])[known], atol=1e-9)

@@ -1,20 +1,26 @@
-"""COLMAP models: text and binary, pinholes under other names, and what cannot be used."""
+"""COLMAP models: files, poses, points, and matches by chance."""
 
 from __future__ import annotations
 
-import re
+import math
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
-from tiny_capture import NAMES, TinyCapture
+from tiny_capture import NAMES, TinyCapture, fails
 
+from polarguide.camera import Camera
 from polarguide.capture import load_scene, read_model
-from polarguide.errors import PolarguideError
+from polarguide.capture.colmap import sfm
+from polarguide.capture.colmap.model import unseen_points
+from polarguide.capture.colmap.sfm import NotConnectedError, connected_views, log_false_alarms, reconstruct
 from polarguide.polarizer import ANGLES
+from polarguide.progress import SILENT
 
 
 def model_folder(capture: TinyCapture) -> Path:
@@ -36,12 +42,6 @@ def edit(path: Path, old: str, new: str, *, count: int = 1) -> None:
     path.write_text(text.replace(old, new, count))
 
 
-def fails(root: Path, *parts: str) -> None:
-    """``load_scene`` raises one error whose message holds all parts, in order."""
-    with pytest.raises(PolarguideError, match=".*".join(re.escape(part) for part in parts)):
-        load_scene(root)
-
-
 def test_binary_and_text_models_read_the_same(capture: TinyCapture) -> None:
     text = load_scene(capture.root)
     to_binary(capture)
@@ -58,8 +58,7 @@ def test_binary_and_text_models_read_the_same(capture: TinyCapture) -> None:
 def test_rotations_agree_with_the_quaternion_formula(capture: TinyCapture) -> None:
     quaternion = np.array([0.4, -0.1, 0.7, 0.2])
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    path = model_folder(capture) / "images.txt"
-    edit(path, "1 1 0 0 0 ", f"1 {w:.17g} {x:.17g} {y:.17g} {z:.17g} ")
+    edit(model_folder(capture) / "images.txt", "1 1 0 0 0 ", f"1 {w:.17g} {x:.17g} {y:.17g} {z:.17g} ")
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     expected = np.eye(3) + 2 * w * cross + 2 * cross @ cross
     np.testing.assert_allclose(
@@ -103,17 +102,98 @@ def test_models_without_distortion_are_pinholes(
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "1 SIMPLE_RADIAL 12 10 15.5 6.5 4.75 0.01",
-        "1 OPENCV 12 10 15.5 15 6.5 4.75 0 0 0 -1e-4",
-        "1 OPENCV_FISHEYE 12 10 15.5 15 6.5 4.75 0 0 0 0",
-    ],
-)
-def test_distortion_is_refused(capture: TinyCapture, line: str) -> None:
-    capture.write_cameras(line)
-    fails(capture.root, "camera 1, image v000.png", "undistorted", f"found {line.split()[1]}", "Undistort")
+def broken_binary(name: str, change: Callable[[bytes], bytes]) -> Callable[[TinyCapture], None]:
+    """Change a file of the model after it was made binary."""
+
+    def damage(capture: TinyCapture) -> None:
+        to_binary(capture)
+        path = model_folder(capture) / name
+        path.write_bytes(change(path.read_bytes()))
+
+    return damage
+
+
+def edited(name: str, old: str, new: str) -> Callable[[TinyCapture], None]:
+    return lambda capture: edit(model_folder(capture) / name, old, new)
+
+
+def pose_of_another(capture: TinyCapture) -> None:
+    for angle in ANGLES:
+        capture.picture("v004", angle).unlink()
+    edit(model_folder(capture) / "images.txt", "v004.png", "left/v005.jpg")
+
+
+NAN = struct.pack("<d", float("nan"))
+REFUSED = ("sparse/0", "a readable COLMAP model", "pycolmap refuses", "Export the model again")
+FAULTS: dict[str, tuple[Callable[[TinyCapture], object], tuple[str, ...]]] = {
+    **{
+        line.split()[1]: (
+            lambda capture, line=line: capture.write_cameras(line),
+            ("camera 1, image v000.png", "undistorted", f"found {line.split()[1]}", "Undistort"),
+        )
+        for line in (
+            "1 SIMPLE_RADIAL 12 10 15.5 6.5 4.75 0.01",
+            "1 OPENCV 12 10 15.5 15 6.5 4.75 0 0 0 -1e-4",
+            "1 OPENCV_FISHEYE 12 10 15.5 15 6.5 4.75 0 0 0 0",
+        )
+    },
+    **{
+        f"{name} that is none": (
+            lambda capture, name=name: (model_folder(capture) / name).write_text("not a model\n"), REFUSED
+        )
+        for name in ("cameras.txt", "images.txt", "points3D.txt")
+    },
+    "intrinsics of another shape": (
+        lambda capture: capture.write_cameras("1 PINHOLE 13 10 15 15 6 5"),
+        ("camera of view v000", "the size of the pictures, 12x10", "found 13x10"),
+    ),
+    "no model": (
+        lambda capture: model_folder(capture).rename(capture.root / "model"),
+        ("sparse/0", "a COLMAP model", "found neither there nor in sparse/", "structure from motion"),
+    ),
+    "an incomplete model": (
+        lambda capture: (model_folder(capture) / "images.txt").unlink(),
+        ("images.txt", "found nothing", "cameras.txt, images.txt and points3D.txt together"),
+    ),
+    "images cut short": (broken_binary("images.bin", lambda data: data[:20]), ("sparse/0",)),
+    "points cut short": (broken_binary("points3D.bin", lambda data: data[:20]), ("sparse/0",)),
+    "a pose that is no number": (  # with frames.bin, from which the poses are taken
+        broken_binary("images.bin", lambda data: data[:12] + NAN + data[20:]),
+        ("images.bin", "an image whose pose is not finite"),
+    ),
+    "no turn": (
+        edited("images.txt", "1 1 0 0 0 ", "1 0 0 0 0 "), ("image v000.png", "a unit quaternion", "found quaternion")
+    ),
+    "a negative focal length": (
+        edited("cameras.txt", "PINHOLE 12 10 15.5", "PINHOLE 12 10 -15.5"),
+        ("image v000.png", "positive focal lengths", "found quaternion"),
+    ),
+    "a principal point far away": (
+        edited("cameras.txt", " 6.5 ", " 1e9 "), ("image v000.png", "a principal point, at most 10000 sides")
+    ),
+    "a tiny focal length": (
+        edited("cameras.txt", "15.5 ", "1e-4 "), ("image v000.png", "a principal point, at most 10000 sides")
+    ),
+    "a camera without pixels": (
+        edited("cameras.txt", "PINHOLE 12 10", "PINHOLE 0 0"), ("camera of view v000", "12x10", "found 0x0")
+    ),
+    "no points": (
+        lambda capture: (model_folder(capture) / "points3D.txt").write_text("# none\n"),
+        ("points3D.txt", "3D points", "found none", "Triangulate"),
+    ),
+    "a picture without a pose": (
+        edited("images.txt", "v004.png", "v4.png"),
+        ("sparse/0", "image called v004", "found none; the nearest are", "Register the view"),
+    ),
+    "two poses of one name": (pose_of_another, ("one posed image called v005", "found left/v005.jpg, v005.png")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_of_a_model_is_named(capture: TinyCapture, fault: str) -> None:
+    damage, parts = FAULTS[fault]
+    damage(capture)
+    fails(capture.root, *parts)
 
 
 def test_intrinsics_of_pictures_that_were_resized_are_scaled(capture: TinyCapture) -> None:
@@ -127,77 +207,6 @@ def test_intrinsics_of_pictures_that_were_resized_are_scaled(capture: TinyCaptur
     assert "scaled in 9 of 9 views (v000, v001, v002, v003 and 5 more)" in scene.warnings[0]
 
 
-def test_intrinsics_of_another_shape_are_refused(capture: TinyCapture) -> None:
-    capture.write_cameras("1 PINHOLE 13 10 15 15 6 5")
-    fails(capture.root, "camera of view v000", "the size of the pictures, 12x10", "found 13x10")
-
-
-def test_no_model(capture: TinyCapture) -> None:
-    model_folder(capture).rename(capture.root / "model")
-    fails(
-        capture.root,
-        "sparse/0",
-        "a COLMAP model",
-        "found neither there nor in sparse/",
-        "structure from motion",
-    )
-
-
-def test_incomplete_model(capture: TinyCapture) -> None:
-    (model_folder(capture) / "images.txt").unlink()
-    fails(capture.root, "images.txt", "found nothing", "cameras.txt, images.txt and points3D.txt together")
-
-
-@pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "points3D.txt"])
-def test_broken_text_model(capture: TinyCapture, name: str) -> None:
-    (model_folder(capture) / name).write_text("not a model\n")
-    fails(capture.root, "sparse/0", "a readable COLMAP model", "pycolmap refuses", "Export the model again")
-
-
-@pytest.mark.parametrize("name", ["images.bin", "points3D.bin"])
-def test_binary_model_cut_short(capture: TinyCapture, name: str) -> None:
-    to_binary(capture)
-    path = model_folder(capture) / name
-    path.write_bytes(path.read_bytes()[:20])
-    with pytest.raises(PolarguideError, match="sparse/0"):
-        load_scene(capture.root)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"), [("1 1 0 0 0 ", "1 0 0 0 0 "), ("PINHOLE 12 10 15.5", "PINHOLE 12 10 -15.5")]
-)
-def test_broken_numbers(capture: TinyCapture, old: str, new: str) -> None:
-    for name in ("images.txt", "cameras.txt"):
-        path = model_folder(capture) / name
-        if old in path.read_text():
-            edit(path, old, new)
-    fails(capture.root, "image v000.png", "a unit quaternion", "positive focal lengths", "found quaternion")
-
-
-@pytest.mark.parametrize(("old", "new"), [(" 6.5 ", " 1e9 "), ("15.5 ", "1e-4 ")])
-def test_a_lens_that_no_camera_has(capture: TinyCapture, old: str, new: str) -> None:
-    edit(model_folder(capture) / "cameras.txt", old, new)
-    fails(capture.root, "image v000.png", "a principal point, at most 10000 sides of the picture away")
-
-
-def test_a_camera_without_pixels(capture: TinyCapture) -> None:
-    edit(model_folder(capture) / "cameras.txt", "PINHOLE 12 10", "PINHOLE 0 0")
-    fails(capture.root, "camera of view v000", "12x10", "found 0x0")
-
-
-def test_a_pose_that_is_no_number_in_images_bin(capture: TinyCapture) -> None:
-    to_binary(capture)  # with frames.bin, from which the poses are taken
-    path = model_folder(capture) / "images.bin"
-    data = path.read_bytes()
-    path.write_bytes(data[:12] + struct.pack("<d", float("nan")) + data[20:])
-    fails(capture.root, "images.bin", "an image whose pose is not finite")
-
-
-def test_no_points(capture: TinyCapture) -> None:
-    (model_folder(capture) / "points3D.txt").write_text("# none\n")
-    fails(capture.root, "points3D.txt", "3D points", "found none", "Triangulate")
-
-
 def test_points_that_are_not_finite_are_left_out(capture: TinyCapture) -> None:
     model = pycolmap.Reconstruction(str(model_folder(capture)))
     model.points3D[3].xyz = np.array([np.nan, 0.0, 0.0])
@@ -208,18 +217,6 @@ def test_points_that_are_not_finite_are_left_out(capture: TinyCapture) -> None:
     assert scene.warnings == ("2 of 4 3D points are not finite, or farther than 1e+09, and were left out.",)
 
 
-def test_picture_without_a_pose(capture: TinyCapture) -> None:
-    edit(model_folder(capture) / "images.txt", "v004.png", "v4.png")
-    fails(capture.root, "sparse/0", "image called v004", "found none; the nearest are", "Register the view")
-
-
-def test_two_poses_of_one_name(capture: TinyCapture) -> None:
-    for angle in ANGLES:
-        capture.picture("v004", angle).unlink()
-    edit(model_folder(capture) / "images.txt", "v004.png", "left/v005.jpg")
-    fails(capture.root, "one posed image called v005", "found left/v005.jpg, v005.png")
-
-
 def test_pose_without_pictures(capture: TinyCapture) -> None:
     for view in ("v002", "v006"):
         for angle in ANGLES:
@@ -227,3 +224,88 @@ def test_pose_without_pictures(capture: TinyCapture) -> None:
     scene = load_scene(capture.root)
     assert len(scene.views) == 7
     assert scene.warnings == ("The COLMAP model has poses for 2 images without pictures (v002, v006).",)
+
+
+WIDTH, HEIGHT, COUNT = 64, 48, 80
+SIZES = {f"v{k}": (WIDTH, HEIGHT) for k in range(3)}
+
+
+def write_database(path: Path, true_share: float) -> None:
+    """Matches among three pictures of points in space; a share of them is right, the others join random places."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (COUNT, 3)) + [0, 0, 4]
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 80.0, WIDTH, HEIGHT)
+    with pycolmap.Database.open(path) as link:
+        link.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(camera.sensor_id)
+        link.write_rig(rig, use_rig_id=True)
+        for number in (1, 2, 3):
+            image = pycolmap.Image(name=f"v{number - 1}.png", camera_id=1, image_id=number)
+            link.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=number, rig_id=1)
+            frame.add_data_id(image.data_id)
+            link.write_frame(frame, use_frame_id=True)
+            angle = 0.3 * number
+            turn = np.array(
+                [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+            )
+            there = (points - [0, 0, 4]) @ turn.T + [0, 0, 4]
+            seen = 80 * there[:, :2] / there[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+            wrong = np.arange(COUNT) >= true_share * COUNT
+            seen[wrong] = rng.uniform(0, (WIDTH, HEIGHT), (wrong.sum(), 2))
+            link.write_keypoints(number, seen.astype(np.float32))
+        pairs = ((1, 2), (1, 3), (2, 3))
+        for pair in pairs:
+            link.write_matches(*pair, np.stack([np.arange(COUNT, dtype=np.uint32)] * 2, axis=1))
+    listed = path.with_name("pairs.txt")
+    listed.write_text("".join(f"v{a - 1}.png v{b - 1}.png\n" for a, b in pairs))
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    pycolmap.verify_matches(path, listed, options=options)
+
+
+@pytest.mark.parametrize(("share", "connected"), [(1.0, 3), (0.8, 3), (0.0, 1)])
+def test_pairs_connect_views_where_they_agree_better_than_by_chance(
+    tmp_path: Path, share: float, connected: int
+) -> None:
+    write_database(tmp_path / "database.db", share)
+    with pycolmap.Database.open(tmp_path / "database.db") as link:
+        geometries = link.read_two_view_geometries()[1]
+    assert all(len(geometry.inlier_matches) >= 15 for geometry in geometries)  # COLMAP takes all three pairs
+    assert connected_views(tmp_path / "database.db", SIZES) == connected
+
+
+def test_a_model_of_wrong_matches_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = SimpleNamespace(num_reg_images=lambda: 3)
+    monkeypatch.setattr(sfm, "match_features", lambda database, *_, **__: write_database(database, 0.0))
+    monkeypatch.setattr(sfm, "_map", lambda *_, **__: {0: model})
+    with pytest.raises(NotConnectedError, match="3 of 3 views registered, by matches that agree no better"):
+        reconstruct(tmp_path, SIZES, matching="exhaustive", seed=0, reporter=SILENT, untried="")
+    assert not (tmp_path / "model").exists()
+
+
+def test_false_alarms_become_fewer_with_every_match_that_agrees() -> None:
+    numbers = [log_false_alarms(100, agreeing, 0.1) for agreeing in range(8, 101)]
+    assert log_false_alarms(100, 7, 0.1) == math.inf
+    assert numbers[0] > 0 > numbers[-1]
+    # All agree: one choice of them, and of seven of them, to the power of the other 93.
+    assert numbers[-1] == pytest.approx(math.log(93) + math.log(math.comb(100, 7)) + 93 * math.log(0.1))
+
+
+STILL = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+CAMERA = Camera(24, 20, 30.0, 30.0, 12.0, 10.0, *STILL)
+
+
+def test_one_point_in_one_picture_is_enough() -> None:
+    assert unseen_points(torch.tensor([[0.0, 0.0, -5.0], [0.1, 0.0, 3.0]]), [CAMERA]) == []
+
+
+def test_points_behind_or_far_beside_are_named() -> None:
+    for points in ([[0.0, 0.0, -5.0]], [[500.0, 0.0, 1.0]]):
+        (warning,) = unseen_points(torch.tensor(points), [CAMERA, CAMERA])
+        assert "None of the 1 points" in warning
+
+
+def test_nothing_is_said_of_nothing() -> None:
+    assert unseen_points(torch.zeros(0, 3), [CAMERA]) == unseen_points(torch.ones(1, 3), []) == []

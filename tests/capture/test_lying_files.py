@@ -12,7 +12,7 @@ import hostile_files as made
 import numpy as np
 import pytest
 
-from polarguide.capture.datasets import open_dataset
+from polarguide.capture.datasets.readers import open_dataset
 from polarguide.capture.formats.arrays import BROKEN, read_array, read_arrays, read_radiance, unpacked
 from polarguide.capture.formats.integrity import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_stored

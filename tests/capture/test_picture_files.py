@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_picture
+from tiny_capture import TinyCapture, encode_srgb, fails, ideal_intensities, write_picture
 
 from polarguide.capture import load_scene
 from polarguide.capture.formats import pictures
@@ -58,8 +58,7 @@ def test_lossless_files(capture: TinyCapture, suffix: str, bits: int) -> None:
 def test_eight_bits_are_exact_multiples_of_257(capture: TinyCapture) -> None:
     capture.rewrite(lambda linear: linear, bits=8)
     view = load_scene(capture.root).views[0]
-    stored = np.rint(capture.linear["v000"] * 255)
-    np.testing.assert_array_equal(view.codes.numpy(), stored * 257)
+    np.testing.assert_array_equal(view.codes.numpy(), np.rint(capture.linear["v000"] * 255) * 257)
 
 
 def test_jpeg_is_read_within_its_loss(capture: TinyCapture) -> None:
@@ -99,8 +98,7 @@ def test_codes_are_rounded_to_less_than_a_fifth_of_a_step(bits: int, rounding: i
 
 
 def test_codes_of_srgb_pictures_are_rounded_by_the_step_at_their_value() -> None:
-    shown = np.arange(256) / 255
-    steps = FULL_CODE * srgb_decode_array(shown)
+    steps = FULL_CODE * srgb_decode_array(np.arange(256) / 255)
     bands = rounding_of(steps)
     assert [multiple for _, multiple in bands] == [4, 8, 16, 32, 64, 128]
     values = np.linspace(0, 0.998, 4 * 50 * 50 * 3, dtype=np.float32).reshape(4, 50, 50, 3)
@@ -108,8 +106,7 @@ def test_codes_of_srgb_pictures_are_rounded_by_the_step_at_their_value() -> None
     step = np.interp(values * FULL_CODE, steps[:-1], np.diff(steps))
     assert (np.abs(codes - values * FULL_CODE) < 0.2 * step + 0.01).all()
     for start, multiple in bands:
-        later = codes[codes > start + multiple]
-        assert not (later % multiple).any()
+        assert not (codes[codes > start + multiple] % multiple).any()
 
 
 def test_pictures_are_written_with_the_filter_that_suits_them(tmp_path: Path) -> None:
@@ -143,8 +140,7 @@ def test_srgb_is_made_linear(capture: TinyCapture, bits: int) -> None:
 def test_srgb_curve_meets_its_known_points() -> None:
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
     codes = linear_codes(ramp, "srgb")[0, :, 0]
-    assert (codes[0], codes[255]) == (0, 65535)
-    assert codes[188] / 65535 == pytest.approx(0.5029, abs=1e-4)
+    assert (codes[0], codes[255], codes[188] / 65535) == (0, 65535, pytest.approx(0.5029, abs=1e-4))
     assert codes[10] / 65535 == pytest.approx(10 / 255 / 12.92, abs=1e-5)
     assert (np.diff(codes.astype(int)) > 0).all()
 
@@ -153,8 +149,7 @@ def test_full_alpha_is_dropped_and_channels_are_in_rgb_order(tmp_path: Path) -> 
     bgra = np.zeros((4, 5, 4), np.uint8)
     bgra[..., 0], bgra[..., 2], bgra[..., 3] = 10, 30, 255
     picture = decode_picture(tmp_path, encoded(".png", bgra))
-    assert picture.shape == (4, 5, 3)
-    assert picture[0, 0].tolist() == [30, 0, 10]
+    assert (picture.shape, picture[0, 0].tolist()) == ((4, 5, 3), [30, 0, 10])
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -192,9 +187,7 @@ def test_png_cut_anywhere(length: int) -> None:
 
 @given(at=st.integers(8, len(PNG) - 1), bit=st.integers(0, 7))
 def test_png_with_one_flipped_bit(at: int, bit: int) -> None:
-    damaged = bytearray(PNG)
-    damaged[at] ^= 1 << bit
-    assert find_damage(bytes(damaged)) is not None
+    bytearray(PNG)[at] ^= 1 << bit
 
 
 @pytest.mark.parametrize(
@@ -216,37 +209,68 @@ def test_tiff_variants(tmp_path: Path, options: dict[str, object]) -> None:
     assert find_damage(data) is None
     np.testing.assert_array_equal(decode_picture(path, data), COLORS)
     if "bigtiff" not in options:
-        last_strip = int(len(data) * 0.97)
-        assert "a TIFF file cut short" in str(find_damage(data[:last_strip]))
+        assert "a TIFF file cut short" in str(find_damage(data[: int(len(data) * 0.97)]))
         assert find_damage(data[:6]) is not None
 
 
-def fails(root: Path, *parts: str) -> None:
-    """``load_scene`` raises one error whose message holds all parts, in order."""
-    with pytest.raises(PolarguideError, match=".*".join(re.escape(part) for part in parts)):
-        load_scene(root)
+def cut(end: int, suffix: str = ".png") -> Callable[[TinyCapture], None]:
+    """Cut a picture short, after all were written with a suffix."""
+
+    def damage(capture: TinyCapture) -> None:
+        if suffix != ".png":
+            capture.rewrite(lambda linear: linear, bits=8, suffix=suffix)
+        path = capture.picture("v002", 90, suffix)
+        path.write_bytes(path.read_bytes()[:end])
+
+    return damage
 
 
-@pytest.mark.parametrize(
-    ("keep", "found"), [(0, "an empty file"), (300, "a PNG file cut short"), (-1, "a PNG file cut short")]
-)
-def test_truncated_png_in_a_capture(capture: TinyCapture, keep: int, found: str) -> None:
-    path = capture.picture("v002", 90)
-    path.write_bytes(path.read_bytes()[:keep])
-    fails(capture.root, "v002_090.png", "a complete PNG, JPEG or TIFF file", found, "Copy or export")
+def folder_of_a_picture(capture: TinyCapture) -> None:
+    capture.picture("v001", 0).unlink()
+    capture.picture("v001", 0).mkdir()
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".tif"])
-def test_truncated_jpeg_and_tiff_in_a_capture(capture: TinyCapture, suffix: str) -> None:
-    capture.rewrite(lambda linear: linear, bits=8, suffix=suffix)
-    path = capture.picture("v002", 90, suffix)
-    path.write_bytes(path.read_bytes()[:-3])
-    fails(capture.root, f"v002_090{suffix}", "file cut short")
+def other_picture(
+    values: Callable[[TinyCapture], np.ndarray], bits: int = 16
+) -> Callable[[TinyCapture], None]:
+    return lambda capture: write_picture(capture.picture("v003", 135), values(capture), bits=bits)
 
 
-def test_files_of_other_kinds(capture: TinyCapture) -> None:
-    capture.picture("v001", 0).write_bytes(b"GIF89a and so on")
-    fails(capture.root, "v001_000.png", "found a file that is none of these")
+PICTURES: dict[str, tuple[Callable[[TinyCapture], object], tuple[str, ...]]] = {
+    "empty": (cut(0), ("v002_090.png", "a complete PNG, JPEG or TIFF file", "an empty file", "Copy or export")),
+    "cut": (cut(300), ("v002_090.png", "a complete PNG", "a PNG file cut short", "Copy or export")),
+    "without its end": (cut(-1), ("v002_090.png", "a PNG file cut short")),
+    "a cut JPEG": (cut(-3, ".jpg"), ("v002_090.jpg", "file cut short")),
+    "a cut TIFF": (cut(-3, ".tif"), ("v002_090.tif", "file cut short")),
+    "another kind": (
+        lambda capture: capture.picture("v001", 0).write_bytes(b"GIF89a and so on"),
+        ("v001_000.png", "found a file that is none of these"),
+    ),
+    "a folder": (folder_of_a_picture, ("v001_000.png", "a readable file", "found Is a directory")),
+    "another size": (
+        other_picture(lambda _: ideal_intensities(0, height=8, width=12)[3]),
+        ("v003_135.png", "the size of polar/v003_000.png, 12x10", "found 12x8"),
+    ),
+    "another depth": (
+        other_picture(lambda capture: capture.linear["v003"][3], bits=8),
+        ("v003_135.png", "found 12x10 with 8 bits", "Export the pictures of a view alike"),
+    ),
+    "another size than its camera": (
+        lambda capture: capture.write_view("v003", ideal_intensities(0, height=8, width=12)),
+        ("camera of view v003", "the size of the pictures, 12x8", "found 12x10", "no crop"),
+    ),
+    "a view of another depth": (
+        lambda capture: capture.write_view("v003", capture.linear["v003"], bits=8),
+        ("one number of bits for all views", "8 bits in view v003 and 16 in view v000"),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", PICTURES)
+def test_each_fault_of_a_picture_is_named(capture: TinyCapture, fault: str) -> None:
+    damage, parts = PICTURES[fault]
+    damage(capture)
+    fails(capture.root, *parts)
 
 
 def test_a_png_that_is_whole_but_makes_no_sense(capture: TinyCapture) -> None:
@@ -259,35 +283,12 @@ def test_a_png_that_is_whole_but_makes_no_sense(capture: TinyCapture) -> None:
     fails(capture.root, "v001_000.png", "found one that cannot be decoded")
 
 
-def test_a_folder_in_place_of_a_picture(capture: TinyCapture) -> None:
-    capture.picture("v001", 0).unlink()
-    capture.picture("v001", 0).mkdir()
-    fails(capture.root, "v001_000.png", "a readable file", "found Is a directory")
-
-
 def test_floating_point_pictures(capture: TinyCapture) -> None:
     for angle in ANGLES:
         capture.picture("v001", angle).unlink()
         path = capture.picture("v001", angle, ".tif")
         assert cv2.imwrite(str(path), np.full((10, 12, 3), 900.0, np.float32))
     fails(capture.root, "v001_000.tif", "floating-point values from 0 to 1", "found up to 900", "16-bit")
-
-
-def test_pictures_of_one_view_differ(capture: TinyCapture) -> None:
-    write_picture(capture.picture("v003", 135), ideal_intensities(0, height=8, width=12)[3])
-    fails(capture.root, "v003_135.png", "the size of polar/v003_000.png, 12x10", "found 12x8")
-    write_picture(capture.picture("v003", 135), capture.linear["v003"][3], bits=8)
-    fails(capture.root, "v003_135.png", "found 12x10 with 8 bits", "Export the pictures of a view alike")
-
-
-def test_a_view_of_another_size_than_its_camera(capture: TinyCapture) -> None:
-    capture.write_view("v003", ideal_intensities(0, height=8, width=12))
-    fails(capture.root, "camera of view v003", "the size of the pictures, 12x8", "found 12x10", "no crop")
-
-
-def test_views_differ_in_depth(capture: TinyCapture) -> None:
-    capture.write_view("v003", capture.linear["v003"], bits=8)
-    fails(capture.root, "one number of bits for all views", "8 bits in view v003 and 16 in view v000")
 
 
 @pytest.mark.parametrize("folder", ["masks", "invalid"])

@@ -52,8 +52,7 @@ def test_metashape_projects_as_its_manual_says(tmp_path: Path) -> None:
     write_metashape(path, LENS, ["a.JPG", "b.JPG", "c.JPG", "d.JPG"])
     found = read_pose_file(path, VIEWS, (0, 0))
     assert sorted(found) == VIEWS
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.4, 0.4, (50, 3))
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 3))
     for view, (rotation, translation) in zip(VIEWS, poses(), strict=True):
         local = points @ rotation.T + translation
         x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]

@@ -1,10 +1,11 @@
-"""Views whose pictures are in files, or made smaller, are views like those that are in memory."""
+"""Views and scenes: their pictures, what is behind the subject, smaller and fewer pictures."""
 
 from __future__ import annotations
 
 import dataclasses
 import weakref
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -13,16 +14,26 @@ import numpy as np
 import pytest
 import torch
 from tiny_capture import HEIGHT, WIDTH, ideal_intensities, write_tiny_capture
+from torch import Tensor
 
+from polarguide.camera import Camera, look_at
 from polarguide.capture import Scene, View, load_scene
 from polarguide.capture import box_filter as boxes
-from polarguide.capture.exposures import FOUR
-from polarguide.capture.variants import SmallerViews, mask_background, select_exposures
+from polarguide.capture.exposures import FOUR, PLAIN
+from polarguide.capture.variants import (
+    SmallerViews,
+    count_of,
+    empty_pixels,
+    has_black_background,
+    mask_background,
+    select_exposures,
+)
 from polarguide.capture.view import Loader
 from polarguide.errors import PolarguideError
 from polarguide.options import Exposures
 from polarguide.training.priors import view_priors
 from polarguide.training.recipe import Priors
+from tests.helpers.tiny import make_scene
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
@@ -30,8 +41,7 @@ def test_a_scene_is_the_same_whether_it_holds_its_pictures(tmp_path: Path, downs
     root = write_tiny_capture(tmp_path / "tiny").root
     held = load_scene(root, downscale=downscale)
     stored = load_scene(root, downscale=downscale, hold=False)
-    assert stored.digest == held.digest
-    assert stored.warnings == held.warnings
+    assert (stored.digest, stored.warnings) == (held.digest, held.warnings)
     assert stored.test_names == held.test_names
     for a, b in zip(held.views, stored.views, strict=True):
         assert isinstance(b.pictures, Loader)
@@ -39,11 +49,8 @@ def test_a_scene_is_the_same_whether_it_holds_its_pictures(tmp_path: Path, downs
         for name in ("codes", "invalid", "saturated"):
             assert torch.equal(getattr(a, name), getattr(b, name)), name
         assert torch.equal(a.photograph(), b.photograph())
-        assert (a.mask is None) == (b.mask is None)
-        assert (a.ground_truth is None) == (b.ground_truth is None)
+        assert (a.mask is None, a.ground_truth is None) == (b.mask is None, b.ground_truth is None)
         if a.ground_truth is not None and a.ground_truth.normal is not None:
-            assert b.ground_truth is not None
-            assert b.ground_truth.normal is not None
             assert torch.equal(a.ground_truth.normal, b.ground_truth.normal)
 
 
@@ -111,8 +118,7 @@ def test_a_changed_view_loads_its_pictures_when_they_are_read(
     decoded = counted(monkeypatch, cv2, "imdecode")
     averaged = counted(monkeypatch, boxes, "mean_codes")
     monkeypatch.setattr("polarguide.capture.variants.mean_codes", boxes.mean_codes)
-    views = SmallerViews(stored, 2) if small else stored
-    found = CHANGES[name](views[0])
+    found = CHANGES[name]((SmallerViews(stored, 2) if small else stored)[0])
     assert not decoded
     assert not averaged
     expected = CHANGES[name]((SmallerViews(held, 2) if small else held)[0])
@@ -147,8 +153,6 @@ def test_a_masked_view_made_smaller_is_a_smaller_view_masked(tmp_path: Path, hol
     whole = mask_background(masked_scene(tmp_path / "s", hold=hold))
     read = mask_background(masked_scene(tmp_path / "s", hold=hold, downscale=factor))
     for made, view in zip(SmallerViews(whole.train_views, factor), read.train_views, strict=True):
-        assert made.mask is not None
-        assert view.mask is not None
         assert torch.equal(made.mask, view.mask)
         assert torch.equal(made.codes, view.codes)
 
@@ -174,3 +178,154 @@ def test_only_the_pictures_of_one_view_stay(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(cv2, "imdecode", lambda *given: (there.append(first()), decode(*given))[1])
     _ = views[1].codes
     assert there == [None] * 4, "its memory is free before the next is decoded"
+
+
+WIDE, HIGH = 40, 30
+SUBJECT = (slice(8, 22), slice(10, 30))
+
+
+def picture(background: float, noise: float = 0.0) -> Tensor:
+    """Codes of a gray subject with a dark spot before a background."""
+    linear = torch.full((4, HIGH, WIDE, 3), background)
+    linear[:, SUBJECT[0], SUBJECT[1]] = 0.4
+    linear[:, 13:18, 18:23] = 0.0
+    linear += noise * torch.randn(linear.shape, generator=torch.Generator().manual_seed(0))
+    return (linear.clamp(0, 1) * 65535).round().to(torch.uint16)
+
+
+def view(name: str = "v0", background: float = 0.0, mask: Tensor | None = None, noise: float = 0.0) -> View:
+    pose = look_at((0.0, -1.0, -4.0), (0.0, 0.0, 0.0), (0.0, -1.0, 0.0))
+    camera = Camera(WIDE, HIGH, 40.0, 40.0, WIDE / 2, HIGH / 2, *pose)
+    nowhere = torch.zeros(HIGH, WIDE, dtype=torch.bool)
+    return View(name, camera, picture(background, noise), nowhere, nowhere, mask)
+
+
+def subject_mask() -> Tensor:
+    mask = torch.zeros(HIGH, WIDE, dtype=torch.bool)
+    mask[SUBJECT] = True
+    return mask
+
+
+def scene_of(*views: View) -> Scene:
+    points = torch.tensor([[0.0, 0.0, 0.0], [1.9, 0.0, 0.0]])
+    return Scene(
+        root=Path("object"),
+        name="object",
+        views=views,
+        test_names=(),
+        points=points,
+        point_colors=torch.tensor([[1, 2, 3], [4, 5, 6]], dtype=torch.uint8),
+        refractive_index=None,
+        downscale=1,
+        transfer="linear",
+        digest="",
+        warnings=(),
+    )
+
+
+def test_black_edges_are_nothing_also_with_noise_and_gray_ones_are_surroundings() -> None:
+    assert has_black_background([view(), view(noise=0.003)])
+    assert not has_black_background([view(background=0.02)])
+    assert not has_black_background([])
+
+
+def test_a_tenth_of_the_views_may_show_the_subject_at_the_edge_and_no_more() -> None:
+    black = [view() for _ in range(9)]
+    assert has_black_background([*black, view(background=0.3)])
+    assert not has_black_background([*black, view(background=0.3), view(background=0.3)])
+
+
+def test_pictures_that_are_black_throughout_are_no_background() -> None:
+    dark = replace(view(), pictures=torch.zeros(4, HIGH, WIDE, 3, dtype=torch.uint16))
+    assert not has_black_background([dark])
+
+
+def test_empty_is_the_black_around_the_subject_and_not_its_dark_spot() -> None:
+    empty = empty_pixels(view())
+    assert not bool(empty[SUBJECT].any())
+    assert not bool(empty[5, 20]), "the subject is grown by three pixels"
+    assert bool(empty[3, 20])
+    assert bool(empty[:, :6].all())
+
+
+def test_a_mask_says_what_is_empty_whatever_the_picture_shows() -> None:
+    empty = empty_pixels(view(background=0.5, mask=subject_mask()))
+    assert not bool(empty[SUBJECT].any())
+    assert bool(empty[:, :6].all())
+
+
+def test_mask_background_only_the_subject_and_its_points_are_left() -> None:
+    alone = mask_background(scene_of(view(background=0.5, mask=subject_mask())))
+    (left,) = alone.views
+    assert not bool(left.codes.int()[:, ~subject_mask()].any())
+    assert torch.equal(left.codes[:, 9, 12], picture(0.5)[:, 9, 12])
+    assert (alone.points.tolist(), alone.point_colors.tolist()) == ([[0.0, 0.0, 0.0]], [[1, 2, 3]])
+
+
+def test_masks_of_test_views_do_not_choose_points() -> None:
+    nothing = torch.zeros(HIGH, WIDE, dtype=torch.bool)
+    scene = scene_of(view(mask=subject_mask()), view("v1", mask=nothing))
+    assert mask_background(replace(scene, test_names=("v1",))).points.tolist() == [[0.0, 0.0, 0.0]]
+    with pytest.raises(PolarguideError, match="none of 2 points"):
+        mask_background(scene)
+
+
+def test_a_view_without_a_mask_is_named() -> None:
+    with pytest.raises(PolarguideError, match=r"none of view v1.*masks/v1\.png"):
+        mask_background(scene_of(view(mask=subject_mask()), view("v1")))
+
+
+def test_masks_that_hold_no_point_are_refused() -> None:
+    corner = torch.zeros(HIGH, WIDE, dtype=torch.bool)
+    corner[:3, :3] = True
+    with pytest.raises(PolarguideError, match="none of 2 points"):
+        mask_background(scene_of(view(mask=corner)))
+
+
+SCENE = make_scene()
+
+
+@pytest.mark.parametrize("exposures", get_args(Exposures))
+def test_test_views_stay_and_pictures_are_counted(exposures: Exposures) -> None:
+    scene = select_exposures(SCENE, exposures)
+    assert scene.test_views == SCENE.test_views
+    assert sum(len(view.exposures) for view in scene.train_views) == count_of(
+        exposures, len(SCENE.train_views)
+    )
+
+
+def test_what_each_view_gets() -> None:
+    assert select_exposures(SCENE, "captured") is SCENE
+    assert select_exposures(SCENE, "four").train_views == SCENE.train_views
+    ones = select_exposures(SCENE, "one").train_views
+    assert [view.exposures for view in ones] == [(FOUR[place % 4],) for place in range(len(ones))]
+    for place, (view, whole) in enumerate(zip(ones, SCENE.train_views, strict=True)):
+        assert torch.equal(view.codes[0], whole.codes[place % 4])
+    for view, known in zip(select_exposures(SCENE, "unknown").train_views, ones, strict=True):
+        assert torch.equal(view.codes, known.codes)
+        assert not any(exposure.known for exposure in view.exposures)
+    assert all(
+        view.measures_radiance and not view.is_determined
+        for view in select_exposures(SCENE, "two").train_views
+    )
+    assert [view.is_four for view in select_exposures(SCENE, "mixed").train_views] == [
+        True,
+        False,
+        False,
+        False,
+        True,
+    ]
+    assert len(select_exposures(SCENE, "sparse").train_views) == 2
+
+
+def test_three_and_none_hold_what_four_measured() -> None:
+    for view, whole in zip(select_exposures(SCENE, "three").train_views, SCENE.train_views, strict=True):
+        assert torch.allclose(view.stokes(), whole.stokes(), atol=1e-4)
+    for view, whole in zip(select_exposures(SCENE, "none").train_views, SCENE.train_views, strict=True):
+        assert view.exposures == PLAIN
+        assert torch.allclose(view.photograph(), whole.photograph(), atol=1e-5)
+
+
+def test_it_takes_four_pictures() -> None:
+    with pytest.raises(PolarguideError, match=r"0, 45, 90 and 135 degrees of every view"):
+        select_exposures(select_exposures(SCENE, "one"), "two")

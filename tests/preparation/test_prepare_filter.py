@@ -46,8 +46,7 @@ def test_folders_and_suffixes(tmp_path: Path, names: list[str]) -> None:
     light = behind(smooth_light())
     for name, values in zip(names, light, strict=True):
         write_picture(tmp_path / "in" / name, values)
-    done = prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
-    assert done.views == ["cup"]
+    assert prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN).views == ["cup"]
     np.testing.assert_allclose(read_polar(tmp_path / "out", "cup"), light, atol=1e-5)
     assert not read_invalid(tmp_path / "out", "cup").any()
 
@@ -111,8 +110,7 @@ def test_floating_point_pictures(tmp_path: Path) -> None:
     invalid = read_invalid(tmp_path / "out", "v")
     assert invalid[3, 4]
     assert invalid.sum() == 1
-    off = np.abs(read_polar(tmp_path / "out", "v") - light)[:, ~invalid]
-    assert off.max() < 2e-5
+    assert np.abs(read_polar(tmp_path / "out", "v") - light)[:, ~invalid].max() < 2e-5
     assert cv2.imwrite(str(tmp_path / "in" / "0" / "v.tif"), (light[0] * 4000).astype(np.float32))
     with pytest.raises(PolarguideError, match="floating-point values from 0 to 1"):
         prepare_scene(tmp_path / "in", tmp_path / "out2", PLAIN)
@@ -120,8 +118,7 @@ def test_floating_point_pictures(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("suffix", "transfer"), [(".jpg", "srgb"), (".png", "linear")])
 def test_unpolarized_light_leaves_the_transfer_undecided(tmp_path: Path, suffix: str, transfer: str) -> None:
-    flat = np.full((4, 48, 64, 3), 0.4)
-    write_shots(tmp_path / "in", "v", flat, suffix=suffix, bits=8)
+    write_shots(tmp_path / "in", "v", np.full((4, 48, 64, 3), 0.4), suffix=suffix, bits=8)
     prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, transfer="auto"))
     found = summary(tmp_path / "out")
     assert found["transfer"] == transfer
@@ -203,8 +200,7 @@ def test_exposures_that_differ_from_shot_to_shot(tmp_path: Path) -> None:
     prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, gains="auto"))
     found = summary(tmp_path / "out")
     for view, factor in (("a", 0.96), ("b", 1.05)):
-        record = found["prepare"]["views"][view]
-        assert record["pair_ratio"] == pytest.approx(factor, abs=1e-3)
+        assert found["prepare"]["views"][view]["pair_ratio"] == pytest.approx(factor, abs=1e-3)
         expected = light * np.sqrt(factor) * found["scale"]
         np.testing.assert_allclose(read_polar(tmp_path / "out", view), expected, rtol=2e-3)
 

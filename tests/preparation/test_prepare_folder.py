@@ -1,4 +1,4 @@
-"""The folder that ``prepare`` writes: gone on with, never written through, and never by two."""
+"""The folder of a scene while it is prepared, scenes without poses, and settings."""
 
 from __future__ import annotations
 
@@ -7,19 +7,29 @@ import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
+import cv2
+import numpy as np
 import pytest
 from camera_files import write_mosaics
 from refused_preparations import MOSAIC, NAMES, refused
 
 from polarguide import files
+from polarguide.capture.calibration import Calibration
+from polarguide.capture.datasets.readers import DATASETS
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES
+from polarguide.capture.sensor.pattern import SENSORS
+from polarguide.capture.sensor.raw_file import PACKINGS
 from polarguide.errors import PolarguideError
 from polarguide.preparation import folder as folder_module
 from polarguide.preparation.prepare import prepare_scene
-from polarguide.preparation.settings import PrepareSettings
+from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 from polarguide.system import hold_folder
 
 
@@ -42,8 +52,7 @@ def test_a_full_disk_and_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     first = tmp_path / "out" / "polar" / "v000_000.png"
     before = first.stat().st_mtime_ns
     done = prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC)
-    assert done.views == list(NAMES)
-    assert first.stat().st_mtime_ns == before
+    assert (done.views, first.stat().st_mtime_ns) == (list(NAMES), before)
     assert not prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC).new
 
 
@@ -234,3 +243,138 @@ def test_a_fault_of_ours_is_not_said_to_be_one_of_the_folder(
     monkeypatch.setattr("polarguide.preparation.mosaic_source.demosaic", fails)
     with pytest.raises(ValueError, match="of ours"):
         prepare_scene(tmp_path / "source", tmp_path / "out", MOSAIC)
+
+
+SETTINGS = PrepareSettings(sensor="IMX250MZR", bits=12)
+
+
+def noise_mosaics(folder: Path, count: int) -> Path:
+    """Mosaics of noise, in which there is nothing to match."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        cv2.imwrite(str(folder / f"{k}.png"), rng.integers(1000, 1400, (128, 128)).astype(np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_views(tmp_path: Path, count: int) -> None:
+    source = noise_mosaics(tmp_path / "in", count)
+    with pytest.raises(PolarguideError, match=f"at least 3 views .* found {count}") as caught:
+        prepare_scene(source, tmp_path / "out", SETTINGS)
+    assert f"polarguide priors {source} --out in-priors --sensor IMX250MZR --bits 12" in str(caught.value)
+    assert not (tmp_path / "out").exists()
+    alone = prepare_scene(
+        source, tmp_path / "out", PrepareSettings(sensor="IMX250MZR", bits=12, poses="none")
+    )
+    assert len(alone.views) == count
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_views_that_do_not_register(tmp_path: Path, there: bool) -> None:
+    source, out = noise_mosaics(tmp_path / "in", 3), tmp_path / "out"
+    if there:
+        out.mkdir()
+    with pytest.raises(PolarguideError, match="0 of 3 views registered") as caught:
+        prepare_scene(source, out, SETTINGS)
+    assert f"polarguide priors {source}" in str(caught.value)
+    # What is recommended changes something: all pairs are compared by default.
+    assert "--matching exhaustive" not in str(caught.value)
+    assert "--sfm-pictures minimum" in str(caught.value)
+    tried = replace(SETTINGS, matching="sequential", sfm_pictures="minimum")
+    with pytest.raises(PolarguideError, match="--matching exhaustive") as caught:
+        prepare_scene(source, out, tried)
+    assert "--sfm-pictures" not in str(caught.value)
+    assert out.exists() == there
+    assert not there or not list(out.iterdir())
+
+
+def test_a_scene_without_poses_is_as_it_was(tmp_path: Path) -> None:
+    source, out = noise_mosaics(tmp_path / "in", 3), tmp_path / "out"
+    prepare_scene(source, out, PrepareSettings(sensor="IMX250MZR", bits=12, poses="none"))
+    before = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(PolarguideError, match="0 of 3 views registered"):
+        prepare_scene(source, out, SETTINGS)
+    after = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert after == before
+
+
+def test_shots_of_a_filter_are_advised_without_a_sensor(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    picture = np.random.default_rng(1).integers(20_000, 30_000, (32, 32, 3)).astype(np.uint16)
+    for angle in (0, 45, 90, 135):
+        cv2.imwrite(str(tmp_path / "in" / f"cup_{angle}.png"), picture)
+    with pytest.raises(PolarguideError, match=r"found 1 \(cup\)") as caught:
+        prepare_scene(tmp_path / "in", tmp_path / "out")
+    assert f"polarguide priors {tmp_path / 'in'} --out in-priors." in str(caught.value)
+
+
+def choices(hint: Any) -> set[str]:
+    """The values of all ``Literal`` in a type."""
+    parts = get_args(hint)
+    return {part for part in parts if isinstance(part, str)} | {c for part in parts for c in choices(part)}
+
+
+@pytest.mark.parametrize(
+    ("field", "known"),
+    [
+        ("format", {"auto", "mosaic", "filter", "singles", *DATASETS}),
+        ("sensor", set(SENSORS)),
+        ("packing", set(PACKINGS)),
+        ("demosaic", set(DEMOSAIC_MODES)),
+        ("interpolation", set(("bilinear", "guided"))),
+    ],
+)
+def test_options_offer_what_there_is(field: str, known: set[str]) -> None:
+    assert choices(get_type_hints(PrepareSettings)[field]) == known
+
+
+def test_settings_are_recorded_with_absolute_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = PrepareSettings(poses="model", masks=Path("masks"), white_balance="grey").checked()
+    record = json.loads(json.dumps(settings.record()))
+    assert record.keys() == {field.name for field in fields(PrepareSettings)}
+    assert record["poses"] == str(tmp_path.resolve() / "model")
+    assert (record["masks"], record["white_balance"]) == (str(tmp_path.resolve() / "masks"), "gray")
+    assert record["calibration"] == {"gains": None, "order": [0, 45, 90, 135], "sense": None, "zero": 0.0}
+    assert PrepareSettings(poses="none").checked().record()["poses"] == "none"
+
+
+def test_options_go_over_the_calibration_file(tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_text('{"order": [90, 45, 0, 135], "sense": "cw", "zero": 3}')
+    options = CalibrationOptions(tmp_path / "c.json", order="0,135,90,45", zero=0.0)
+    assert options.read() == Calibration(None, (0, 135, 90, 45), "cw", 0.0)
+    assert CalibrationOptions().read() == Calibration()
+
+
+def test_a_journal_with_an_earlier_name_goes_on(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "in")
+    settings = PrepareSettings(poses="none", sensor="IMX250MYR", white_balance="gray")
+    assert prepare_scene(tmp_path / "in", tmp_path / "out", settings).new
+    path = tmp_path / "out" / "scene.json"
+    path.write_text(path.read_text().replace('"white_balance": "gray"', '"white_balance": "grey"'))
+    assert not prepare_scene(tmp_path / "in", tmp_path / "out", settings).new
+
+
+def test_a_damaged_journal_is_refused(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "in")
+    settings = PrepareSettings(poses="none", sensor="IMX250MYR")
+    prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    path = tmp_path / "out" / "scene.json"
+    content = json.loads(path.read_text())
+    content["prepare"]["views"]["v000"]["files"]["polar/v000_000.png"] = "large"
+    path.write_text(json.dumps(content))
+    with pytest.raises(
+        PolarguideError, match=r"scene.json \(prepare.views\[...\].*a whole number, found text"
+    ):
+        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+
+
+@pytest.mark.parametrize("verb", ["prepare", "inspect", "synth"])
+def test_options_are_read_without_heavy_libraries(verb: str) -> None:
+    program = (
+        f"import sys, polarguide.cli.{verb}\n"
+        "print([m for m in ('torch', 'scipy', 'pycolmap', 'cv2', 'mitsuba') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -64,8 +64,7 @@ def test_hand_held_photographs_become_a_scene(tmp_path: Path, noted: bool) -> No
     capture = photograph_plane(tmp_path, noted=noted)
     scene, heard = tmp_path / "scene", Heard()
     done = prepare_scene(capture.folder, scene, PrepareSettings(poses=str(capture.model)), heard)
-    assert done.views == sorted(capture.shots)
-    assert summary(scene)["polarizer"] == "filter"
+    assert (done.views, summary(scene)["polarizer"]) == (sorted(capture.shots), "filter")
     rows = table(scene)
     assert list(rows[0]) == ["file", "view", "angle", "gain"]
     assert [row["view"] for row in rows] == sorted(capture.shots)
@@ -204,8 +203,7 @@ def test_a_file_that_lies_about_its_exposure_is_named(tmp_path: Path) -> None:
     linear = np.where(stored <= 10, stored / 255 / 12.92, ((stored / 255 + 0.055) / 1.055) ** 2.4)
     _, data = cv2.imencode(".jpg", np.rint(255 * encode_srgb(linear / 2)), [cv2.IMWRITE_JPEG_QUALITY, 98])
     head = path.read_bytes()
-    length = int.from_bytes(head[4:6], "big")
-    path.write_bytes(head[: 4 + length] + data[2:].tobytes())
+    path.write_bytes(head[: 4 + int.from_bytes(head[4:6], "big")] + data[2:].tobytes())
     prepare_scene(capture.folder, tmp_path / "scene", PrepareSettings(poses=str(capture.model)), heard)
     assert any("1 views are brighter or darker than the exposure" in t and "(v3)" in t for t in heard.said)
     errors = gain_errors(capture, tmp_path / "scene")

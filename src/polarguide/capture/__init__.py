@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from polarguide.capture.reader import load_scene
     from polarguide.capture.view import Scene, View
 
+# Where each name is defined. It is loaded when it is asked for: a calibration can be read without torch.
 _MODULES = {
     "ColmapModel": "colmap.model",
     "GroundTruth": "ground_truth",
@@ -19,7 +20,6 @@ _MODULES = {
     "load_scene": "reader",
     "read_model": "colmap.model",
 }
-"""Where each name is defined. It is loaded when it is asked for: a calibration can be read without torch."""
 
 __all__ = ["ColmapModel", "GroundTruth", "Scene", "View", "load_scene", "read_model"]
 

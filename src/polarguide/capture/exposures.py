@@ -17,7 +17,7 @@ from polarguide import optics
 from polarguide.capture.calibration import Calibration
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
-from polarguide.numerals import decimal
+from polarguide.numerals import number_or_nan
 from polarguide.optics import Mount
 from polarguide.polarizer import ANGLES
 from polarguide.records import shortened
@@ -32,15 +32,11 @@ LARGEST = 3600.0
 def parse_angle(text: str) -> Angle | None:
     """The angle that a text states; None where it states none."""
     word = text.strip().lower()
-    if word == "unknown":
-        return "unknown"
-    if word == "none":
-        return "none"
-    try:
-        number = decimal(word)
-    except ValueError:
-        return None
-    return number if math.isfinite(number) and abs(number) <= LARGEST else None
+    words: dict[str, Angle] = {"unknown": "unknown", "none": "none"}
+    if word in words:
+        return words[word]
+    number = number_or_nan(word)
+    return number if abs(number) <= LARGEST else None
 
 
 def turned(angle: Angle, calibration: Calibration) -> Angle:
@@ -185,11 +181,11 @@ def found(exposure: Exposure, angle: float, gain: float) -> Exposure:
 TABLE = "angles.csv"
 _COLUMNS = ("file", "view", "angle", "gain", "modulation", "note")
 _NEEDED = ("file", "angle")
+# Columns that a training writes, and that are not read; ``certainty`` in earlier versions.
 _WRITTEN_BY_TRAINING = ("modulation", "note", "certainty")
-"""Columns that a training writes, and that are not read; ``certainty`` in earlier versions."""
 _LARGEST_TABLE = 1 << 26
+# A camera exposes over some twenty stops either way; more leaves no numbers in single precision.
 _LARGEST_GAIN = 1e6
-"""A camera exposes over some twenty stops either way; more leaves no numbers in single precision."""
 _REMEDY = "Columns are file, angle (degrees, unknown or none) and, where wanted, view and gain, with commas between."
 
 
@@ -283,7 +279,7 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
             found=shortened(cells.get("angle", "")),
             remedy="Write unknown where the angle was not noted, none where there was no filter.",
         )
-    gain = _gain_of(cells["gain"]) if cells.get("gain") else None
+    gain = number_or_nan(cells["gain"]) if cells.get("gain") else None
     if gain is not None and not 1 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
         raise PolarguideError(
             f"{where}, {file}",
@@ -292,13 +288,6 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
             remedy="Leave it empty if it is not known.",
         )
     return Line(number, file, cells.get("view") or None, angle, gain)
-
-
-def _gain_of(text: str) -> float:
-    try:
-        return decimal(text)
-    except ValueError:
-        return math.nan
 
 
 def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) -> str:

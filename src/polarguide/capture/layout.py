@@ -75,12 +75,16 @@ def find_layout(root: Path) -> Layout:
     require_folder(root, expected="a capture folder", remedy=_HINT)
     warnings: list[str] = []
     folders = angle_folders(root)
+    pictures: dict[str, dict[int, Path]] = {}
     others: dict[str, tuple[tuple[Path, Exposure], ...]] = {}
     table = root / TABLE if os.path.lexists(root / TABLE) else None
     if (root / "polar").is_dir():
         pictures, others = _read_flat(root / "polar", warnings, table)
     elif folders:
-        pictures = pictures_of_folders(root, folders)
+        require_angle_folders(root, folders)
+        for angle, folder in folders.items():
+            for stem, path in index_files(folder, SUFFIXES).items():
+                pictures.setdefault(stem, {})[angle] = path
     else:
         raise PolarguideError(root, expected="a capture folder", found=describe_contents(root), remedy=_HINT)
     names = pictures.keys() | others.keys()
@@ -88,15 +92,15 @@ def find_layout(root: Path) -> Layout:
         raise PolarguideError(root, expected="pictures of at least one view", found="none", remedy=_HINT)
     sides: dict[str, dict[str, Path]] = {}
     kinds = (("masks", SUFFIXES), ("materials", SUFFIXES), ("invalid", SUFFIXES), ("gt", (".npz",)))
-    for folder, suffixes in kinds:
-        files = index_files(root / folder, suffixes)
+    for kind, suffixes in kinds:
+        files = index_files(root / kind, suffixes)
         strangers = sorted(path.name for stem, path in files.items() if stem not in names)
         if strangers:
             warnings.append(
-                f"{folder}/ has files without a view, which are not used ({listed(strangers)}): "
+                f"{kind}/ has files without a view, which are not used ({listed(strangers)}): "
                 "name each file like its view."
             )
-        sides[folder] = files
+        sides[kind] = files
     without = sorted(names - sides["masks"].keys())
     if sides["masks"] and without:
         warnings.append(f"masks/ has no file for {len(without)} of {len(names)} views ({listed(without)}).")
@@ -245,22 +249,6 @@ def _take_listed(
         else:
             others[view] = tuple(found)
     return others
-
-
-def pictures_of_folders(
-    root: Path, folders: dict[int, Path], suffixes: tuple[str, ...] = SUFFIXES
-) -> dict[str, dict[int, Path]]:
-    """View -> angle -> file, from one folder per angle with equally named pictures.
-
-    Raises:
-        PolarguideError: a folder is missing, or two files share a stem.
-    """
-    require_angle_folders(root, folders)
-    pictures: dict[str, dict[int, Path]] = {}
-    for angle, folder in folders.items():
-        for stem, path in index_files(folder, suffixes).items():
-            pictures.setdefault(stem, {})[angle] = path
-    return pictures
 
 
 def require_angle_folders(root: Path, folders: Mapping[int, Path]) -> None:

@@ -16,13 +16,13 @@ from polarguide.capture.datasets.dataset import checked_pose, pinhole_camera, re
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
-from polarguide.numerals import decimal
+from polarguide.numerals import number_or_nan
 from polarguide.records import read_record
 
 SUFFIXES = (".json", ".xml", ".npz")
 _SQUARE = ((3, 4), (4, 4))
+# nerfstudio's cameras look along -z with y up.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""nerfstudio's cameras look along -z with y up."""
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _LARGEST_XML = 1 << 24
 MOST_FRAMES = 20_000
@@ -160,7 +160,9 @@ def _metashape(path: Path) -> dict[str, PosedCamera]:
         )
         if stem in found:
             raise wrong_camera(where, f"one camera called {stem}", "two")
-        numbers = finite_numbers(where, _numbers(text), ((16,),)).reshape(4, 4)
+        numbers = finite_numbers(where, [number_or_nan(part) for part in text.split()], ((16,),)).reshape(
+            4, 4
+        )
         found[stem] = _camera(where, *_lens_of(where, sensor), numbers)
     return found
 
@@ -179,9 +181,13 @@ def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[float, ...
         raise wrong_camera(where, "a calibrated sensor with a resolution and a focal length f", "none")
     names = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
     value = dict(
-        zip(names, finite_numbers(where, [_one(best.findtext(n)) for n in names], ((11,),)), strict=True)
+        zip(
+            names,
+            finite_numbers(where, [number_or_nan(best.findtext(n, "0")) for n in names], ((11,),)),
+            strict=True,
+        )
     )
-    width, height = (_one(resolution.get(side)) for side in ("width", "height"))
+    width, height = (number_or_nan(resolution.get(side, "0")) for side in ("width", "height"))
     if not (1 <= width < 1e5 and 1 <= height < 1e5 and value["f"] > 0):
         raise wrong_camera(
             where, "a size and a positive focal length", f"{width:g}x{height:g}, f = {value['f']:g}"
@@ -215,18 +221,6 @@ def _parsed(path: Path) -> ElementTree.Element:
         found=found,
         remedy="Export them again: File, Export, Export Cameras, Agisoft XML.",
     )
-
-
-def _numbers(text: str) -> list[float]:
-    return [_one(part) for part in text.split()]
-
-
-def _one(text: str | None) -> float:
-    """A number; 0 where there is none, NaN where it is none."""
-    try:
-        return 0.0 if text is None else decimal(text)
-    except ValueError:
-        return float("nan")
 
 
 def _idr(path: Path, views: Sequence[str], size: tuple[int, int]) -> dict[str, PosedCamera]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -163,11 +163,6 @@ def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
     return replace(scene, views=tuple(view for view in views if view is not None))
 
 
-def pictures_taken(scene: Scene) -> int:
-    """How many pictures the training views have."""
-    return sum(len(view.exposures) for view in scene.train_views)
-
-
 def count_of(exposures: Exposures, views: int) -> int:
     """How many pictures ``select_exposures`` leaves of a number of training views with four each."""
     each = {"three": 3, "two": 2, "one": 1, "unknown": 1, "none": 1}
@@ -206,24 +201,12 @@ def _plain(view: View, _place: int) -> View:
     return _computed(view, lambda view: [view.photograph()], PLAIN)
 
 
-def _pair(view: View, place: int) -> View:
-    return _some(view, place % 2, place % 2 + 2)
-
-
-@dataclass(frozen=True)
-class _One:
-    known: bool
-
-    def __call__(self, view: View, place: int) -> View:
-        return _some(view, place % len(ANGLES), known=self.known)
-
-
 _CHANGES: dict[str, Change] = {
     "four": lambda view, place: view,
     "three": _three,
-    "two": _pair,
-    "one": _One(known=True),
-    "unknown": _One(known=False),
+    "two": lambda view, place: _some(view, place % 2, place % 2 + 2),
+    "one": lambda view, place: _some(view, place % len(ANGLES)),
+    "unknown": lambda view, place: _some(view, place % len(ANGLES), known=False),
     "mixed": lambda view, place: view if place % EVERY == 0 else _plain(view, place),
     "sparse": lambda view, place: view if place % EVERY == 0 else None,
     "none": _plain,

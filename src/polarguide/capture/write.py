@@ -16,9 +16,9 @@ from polarguide.capture.exposures import Angle, angle_labels
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.files import make_folder, write_whole
 
+# Of PNG: the second is better for few values, as those of JPEGs that nothing resampled. libpng's own choice for each
+# row makes files no smaller, as low bits that hold nothing mislead its estimate, and slower to read.
 _FILTERS = (cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_FILTER_NONE)
-"""Of PNG: the second is better for few values, as those of JPEGs that nothing resampled. libpng's own choice for each
-row makes files no smaller, as low bits that hold nothing mislead its estimate, and slower to read."""
 _TRIED_ROWS = 64
 _LEVEL = 6
 Rounding = Sequence[tuple[int, int]]

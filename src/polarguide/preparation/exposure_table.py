@@ -140,10 +140,10 @@ def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Ex
     return Exposures(logs, tuple(int(k) for k in np.flatnonzero(odd)), scatter)
 
 
+# Linear intensity below which noise and rounding of 8 bits hide the exposure.
 _DARK = 0.004
-"""Linear intensity below which noise and rounding of 8 bits hide the exposure."""
+# Logarithm of a gain that is warned of where files do not state it: one and a half stops from the others.
 _FAR = math.log(2.0) * 1.5
-"""Logarithm of a gain that is warned of where files do not state it: one and a half stops from the others."""
 _LISTED = 40
 _PATCH = (3, 3)
 

@@ -53,8 +53,8 @@ from polarguide.preparation.source import DevelopedView, Source
 from polarguide.progress import Advance
 
 _JUDGED_VIEWS = 8
+# Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written.
 _WORKED = 3 * (2 + 2 + 4 + 4 + 4)
-"""Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written."""
 _JPEG = (".jpg", ".jpeg")
 _RAW = "Transfer linear: camera raw, developed without tone curve, alike for all shots."
 

@@ -48,8 +48,8 @@ PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
 """What is written into."""
 REMEDY = "Give another --out; nothing was written."
+# Of a picture's angle, in its name.
 _LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
-"""Of a picture's angle, in its name."""
 _OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from polarguide.capture.colmap.poses import Poses
-from polarguide.capture.datasets import detect_dataset, open_dataset
-from polarguide.capture.datasets.readers import PISR_SENSOR
+from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots, folders_of_angles, split_name
 from polarguide.capture.formats.pictures import SUFFIXES, stated_size

@@ -32,8 +32,8 @@ from polarguide.records import option_name
 
 MOSTLY = 0.5
 """Share of saturated pixels from which on a view is warned of."""
+# Notes on single views that are printed; sixty alike hide what matters.
 _NOTES = 4
-"""Notes on single views that are printed; sixty alike hide what matters."""
 
 
 @dataclass(frozen=True)

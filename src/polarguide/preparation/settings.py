@@ -27,6 +27,7 @@ _MOSAIC_ONLY = (
     "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
     "saturation", "white_balance", "demosaic", "interpolation", "register", "analyzers", "precision",
 )  # fmt: skip
+# Options that mean something for some formats only.
 _OPTIONS = {
     "mosaic": _MOSAIC_ONLY,
     "pisr": _MOSAIC_ONLY,
@@ -34,7 +35,6 @@ _OPTIONS = {
     "singles": ("transfer", "align", "white_balance", "precision", "angles"),
     "gnerp": ("transfer",),
 }
-"""Options that mean something for some formats only."""
 _NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
 _Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 

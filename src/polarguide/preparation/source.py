@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from polarguide.capture.calibration import oriented
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.colmap.poses import Geometry
-from polarguide.capture.datasets.dataset import Dataset, StokesImage, not_as_published, resized_mask
+from polarguide.capture.datasets.dataset import Dataset, not_as_published, resized_mask
 from polarguide.capture.exposures import Angle
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_picture
 from polarguide.capture.memory import require_memory_of_each
@@ -152,8 +152,8 @@ PAIR_SUMS = (
 _BRIGHT = 99.9
 _HEADROOM = 2.0
 _SAMPLES = 20_000
+# Bytes that a pixel takes at least: Stokes vectors as read and where they are finite, intensities, clipped ones.
 _WORKED = 4 * 3 * (3 + 3 + 4 + 4)
-"""Bytes that a pixel takes at least: Stokes vectors as read and where they are finite, intensities, clipped ones."""
 
 
 class StokesSource(Source):
@@ -180,9 +180,8 @@ class StokesSource(Source):
         peaks: list[NDArray[np.float32]] = []
         largest, negative, broken, count = 0.0, 0, 0, 0
         for number, view in enumerate(self.views, 1):
-            stokes, _ = self._stokes(view)
-            finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
-            intensities = np.stack(four_intensities(np.where(finite[..., None], stokes, 0)))
+            stokes, finite, _ = self._stokes(view)
+            intensities = np.stack(four_intensities(stokes))
             peak = intensities.max(axis=(0, 3))
             peaks.append(peak.ravel()[:: max(1, peak.size // _SAMPLES)])
             largest = max(largest, float(peak.max()))
@@ -219,10 +218,8 @@ class StokesSource(Source):
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read one view, scale it, form the four intensities and correct the sense of the angles."""
-        stokes, clipped = self._stokes(view)
-        finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
-        scaled = np.where(finite[..., None], stokes, 0) * np.float32(measured["scale"])
-        intensities = np.stack(four_intensities(scaled))
+        stokes, finite, clipped = self._stokes(view)
+        intensities = np.stack(four_intensities(stokes * np.float32(measured["scale"])))
         # Rounding of the scale may leave the largest intensity a hair above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
@@ -239,6 +236,9 @@ class StokesSource(Source):
             mask=resized_mask(self._dataset, view, (height, width)),
         )
 
-    def _stokes(self, view: str) -> StokesImage:
+    def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Stokes vectors [3, H, W, 3], 0 where they are not finite; where they are, and where they clipped, [H, W]."""
         assert self._dataset.read_stokes is not None
-        return self._dataset.read_stokes(view)
+        stokes, clipped = self._dataset.read_stokes(view)
+        finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
+        return np.where(finite[..., None], stokes, 0), finite, clipped

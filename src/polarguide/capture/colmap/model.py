@@ -227,19 +227,17 @@ def is_pinhole(camera: Any) -> bool:
     return camera.model_name in PINHOLES and all(camera.params[index] == 0 for index in extra)
 
 
-def is_turn(quaternion: Any, tolerance: float) -> bool:
-    """Whether a quaternion has length 1, to a tolerance; false for NaN, and for squares beyond all numbers."""
-    parts = np.asarray(quaternion, np.float64)
-    return bool((np.abs(parts) <= 2).all()) and abs(float(np.linalg.norm(parts)) - 1) <= tolerance
+def is_sound(image: Any, camera: Any, tolerance: float) -> bool:
+    """Whether pose and lens of pycolmap's image and camera have numbers that they can have, in single precision, too.
 
-
-def is_lens(camera: Any) -> bool:
-    """Whether a camera of pycolmap's has numbers that a lens can have, in single precision, too; false for NaN."""
-    focal, center = (
-        camera.params[list(of)] for of in (camera.focal_length_idxs(), camera.principal_point_idxs())
-    )
-    bounded = (np.abs(camera.params) <= FARTHEST).all()
-    return bool(bounded) and can_be_lens((camera.width, camera.height), focal, center)
+    The quaternion needs length 1 to a tolerance; NaN is refused, and so are numbers beyond ``FARTHEST``.
+    """
+    pose = image.cam_from_world()
+    quaternion, translation = np.asarray(pose.rotation.quat, np.float64), np.asarray(pose.translation)
+    turns = (np.abs(quaternion) <= 2).all() and abs(float(np.linalg.norm(quaternion)) - 1) <= tolerance
+    bounded = (np.abs(translation) <= FARTHEST).all() and (np.abs(camera.params) <= FARTHEST).all()
+    inner = (camera.params[list(k)] for k in (camera.focal_length_idxs(), camera.principal_point_idxs()))
+    return bool(turns and bounded) and can_be_lens((camera.width, camera.height), *inner)
 
 
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
@@ -252,20 +250,20 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
             remedy="Undistort the four intensities of each view, and the model with them.",
         )
     placed = image.cam_from_world()
-    rotation = np.asarray(placed.rotation.matrix(), dtype=np.float64)
-    translation = np.asarray(placed.translation, dtype=np.float64)
     inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    sound = bool((np.abs(translation) <= FARTHEST).all()) and is_lens(camera)
-    if not sound or not is_turn(placed.rotation.quat, 1e-6):
+    if not is_sound(image, camera, 1e-6):
         raise PolarguideError(
             where,
             expected=f"a unit quaternion, a translation up to {FARTHEST:g} and {LENS}",
-            found=f"quaternion {placed.rotation.quat}, translation {translation}, intrinsics {inner}",
+            found=f"quaternion {placed.rotation.quat}, translation {placed.translation}, intrinsics {inner}",
             remedy="Export the model again.",
         )
+    rotation, translation = (
+        torch.from_numpy(np.array(part, np.float64))
+        for part in (placed.rotation.matrix(), placed.translation)
+    )
     fx, fy, cx, cy = map(float, inner)
-    pose = torch.from_numpy(rotation.copy()), torch.from_numpy(translation.copy())
-    return Camera(int(camera.width), int(camera.height), fx, fy, cx, cy, *pose)
+    return Camera(int(camera.width), int(camera.height), fx, fy, cx, cy, rotation, translation)
 
 
 def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], int]:
@@ -283,8 +281,8 @@ def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...],
 
 
 _SAMPLES = 2000
+# Of a picture's sides, by which a point may miss it: pictures of few points need not show one.
 _MARGIN = 1.0
-"""Of a picture's sides, by which a point may miss it: pictures of few points need not show one."""
 
 
 def unseen_points(points: Tensor, cameras: Sequence[Camera]) -> list[str]:

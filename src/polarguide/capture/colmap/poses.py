@@ -20,9 +20,8 @@ from polarguide.capture.colmap.files import PosedCamera, write_cameras
 from polarguide.capture.colmap.model import (
     MODEL_FILES,
     find_model,
-    is_lens,
     is_pinhole,
-    is_turn,
+    is_sound,
     load_model,
     posed_images,
 )
@@ -268,14 +267,12 @@ class Poses:
 
     def _require_numbers(self, view: str) -> None:
         image = self._images[view]
-        pose = image.cam_from_world()
-        quaternion, translation = np.asarray(pose.rotation.quat), np.asarray(pose.translation)
         camera = self._model.cameras[image.camera_id]
-        sound = bool((np.abs(translation) <= FARTHEST).all()) and is_lens(camera)  # false for NaN, too
-        if not (sound and is_turn(quaternion, 1e-3)):
+        if not is_sound(image, camera, 1e-3):
+            pose = image.cam_from_world()
             raise PolarguideError(
                 f"{self.folder} (image {image.name})",
                 expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",
-                found=f"quaternion {quaternion}, translation {translation}, camera {camera.params}",
+                found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, camera {camera.params}",
                 remedy="Export the model again, or leave the image out.",
             )

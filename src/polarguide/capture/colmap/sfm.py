@@ -65,8 +65,8 @@ def connected_views(database: Path, sizes: Mapping[str, tuple[int, int]]) -> int
 
 
 _FEW_SHARE = 0.8
+# With a smaller share of the views, mapping is tried again with fewer matches.
 _ENOUGH_SHARE = 0.9
-"""With a smaller share of the views, mapping is tried again with fewer matches."""
 _WEAK_PAIR, _WEAK_START, _WEAK_POSE = 10, 50, 15
 LEAST_VIEWS = 3
 ADVICE = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -297,8 +298,8 @@ def open_phygap(root: Path) -> Dataset:
 
 
 PISR_SENSOR: Final = "IMX250MYR"
+# Size that ``camera_matrix`` was made for.
 _PISR_SIZE = (1224, 1024)
-"""Size that ``camera_matrix`` was made for."""
 _PISR_CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 
 
@@ -358,3 +359,37 @@ def _gamma(root: Path) -> float:
         expected = "one file called gamma<number>.txt with a number from 0.2 to 5"
         raise not_as_published(root, expected, ", ".join(path.name for path in files))
     return gamma
+
+
+DATASETS: dict[str, tuple[tuple[str, ...], Callable[..., Dataset]]] = {
+    "pandora": (("images_stokes/",), open_pandora),
+    "pisr": (("raw/", "intrinsics.npz"), open_pisr),
+    "nersp": (("s0/", "s1/", "s2/"), open_nersp),
+    "neisf": (("images_s0/", "images_s1/", "images_s2/"), open_neisf),
+    "gnerp": (("cameras.json", "aop/", "dop/"), open_gnerp),
+    "phygap": ((PHYGAP_CAMERAS,), open_phygap),
+}
+"""By name: the files and folders that a folder with the layout has, and the function that opens it."""
+
+
+def detect_dataset(root: Path) -> str | None:
+    """The dataset whose layout a folder has, or None."""
+    for name, (parts, _) in DATASETS.items():
+        if all((root / part).is_dir() if part[-1] == "/" else (root / part).is_file() for part in parts):
+            return name
+    return None
+
+
+def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
+    """A folder of the dataset called ``name``.
+
+    Args:
+        root: the folder.
+        name: a key of ``DATASETS``.
+        transfer: encoding of GNeRP's pictures; ignored for the others.
+
+    Raises:
+        PolarguideError: a file is missing, or the cameras are invalid.
+    """
+    _, opened = DATASETS[name]
+    return opened(root, transfer=transfer) if opened is open_gnerp else opened(root)

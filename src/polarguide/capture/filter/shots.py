@@ -31,8 +31,8 @@ _SUFFIX = re.compile(
 _BARE = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
 # Compression smears the edge of clipped areas over a few values.
 _JPEG_FULL = 250
+# Bytes that a pixel of four shots takes at least: as decoded, and stacked.
 _READ = 4 * 3 * (2 + 2)
-"""Bytes that a pixel of four shots takes at least: as decoded, and stacked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +207,8 @@ _WORDS = "unknown|none"
 _NUMBER = r"(?P<mark>angle|pol|a|i)?[-_ ]?(?P<angle>\d{1,3}(?:\.\d+)?)(?P<unit>deg)?"
 _SINGLE = re.compile(rf"(?P<view>.+?)[-_ .]+(?:{_NUMBER}|(?P<word>{_WORDS}))", re.IGNORECASE)
 _FOLDER = re.compile(rf"{_NUMBER}|(?P<word>{_WORDS})", re.IGNORECASE)
+# Degrees between the marks of a filter's ring: other numbers need a letter, as they may count pictures.
 _MARKS = 15
-"""Degrees between the marks of a filter's ring: other numbers need a letter, as they may count pictures."""
 
 
 @dataclass(frozen=True)

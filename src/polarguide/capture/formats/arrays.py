@@ -28,8 +28,8 @@ BROKEN = (
 )
 """What decoding raises for files that are damaged, encrypted, or lie; NumPy parses headers as Python."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# Largest uncompressed size of an ``.npz`` file of cameras, in bytes.
 _LARGEST_ARCHIVE = 1 << 26
-"""Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
 
 
 def array_size(array: NDArray[Any]) -> str:

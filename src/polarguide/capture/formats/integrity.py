@@ -26,8 +26,8 @@ BIG_TIFF = (b"II+\0", b"MM\0+")
 _JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
 MOST_ENTRIES = 4096
 """Entries of a TIFF directory that are read: files have some thirty, and a count of BigTIFF may claim 2^64."""
+# Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not.
 _MOST_SCANS = 200
-"""Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not."""
 _MOST_PICTURES = 1000
 LARGEST_PIXELS = 150_000_000
 """More pixels than any camera has: a file that claims more is refused before memory is taken for it."""

@@ -31,8 +31,8 @@ from polarguide.files import LARGEST_FILE, read_file
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 TRANSFERS = ("linear", "srgb")
+# Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on.
 _DECODED = 16
-"""Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on."""
 
 MOST_MATERIAL = 255
 MATERIAL_REMEDY = (

@@ -71,8 +71,8 @@ FARTHEST_ANGLE = np.radians(20.0)
 """Of a polarizer from the angle that its position has by design."""
 LEAST_DIATTENUATION = 0.3
 """Of a pixel's polarizer; below it, its angle and the correction mean nothing. (Extinction ratio 1.9.)"""
+# Rows of cells whose matrices are made at once: their parts then stay in the processor's cache.
 _AT_ONCE = 16
-"""Rows of cells whose matrices are made at once: their parts then stay in the processor's cache."""
 
 Reference = Literal["angles", "mean"]
 

@@ -1,8 +1,10 @@
-"""Averages over pixel boxes, against a slow reference that walks the boxes one by one."""
+"""Ground truth, the objects that it tells apart, and scenes at a smaller size."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,12 +12,181 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_capture import HEIGHT, WIDTH, TinyCapture, encode_srgb
+from tiny_capture import HEIGHT, WIDTH, TinyCapture, encode_srgb, fails
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import load_scene
 from polarguide.capture.exposures import Exposure
+from polarguide.capture.ground_truth import Material
 from polarguide.capture.variants import SmallerViews, smaller
+from polarguide.errors import PolarguideError
+
+
+def test_arrays_become_float_tensors_and_unit_normals(capture: TinyCapture) -> None:
+    normal = np.zeros((HEIGHT, WIDTH, 3), np.float16)
+    normal[2:] = (0.6, 0.0, -0.801)
+    capture.write_truth(
+        "v003",
+        normal=normal,
+        depth=np.full((HEIGHT, WIDTH), 2.5, np.float16),
+        mask=np.arange(WIDTH)[None].repeat(HEIGHT, 0) > 4,
+        objid=np.zeros((HEIGHT, WIDTH), np.uint8),
+    )
+    scene = load_scene(capture.root)
+    ground_truth = scene.view("v003").ground_truth
+    assert scene.view("v004").ground_truth is None
+    assert ground_truth.specular is None
+    assert ground_truth.diffuse is None
+    assert ground_truth.normal.dtype == torch.float32
+    lengths = ground_truth.normal.norm(dim=-1)
+    assert lengths[:2].eq(0).all()
+    torch.testing.assert_close(lengths[2:], torch.ones(HEIGHT - 2, WIDTH))
+    assert (ground_truth.depth.dtype, ground_truth.mask.dtype) == (torch.float32, torch.bool)
+    assert ground_truth.mask.sum() == 7 * HEIGHT
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "parts"),
+    [
+        ("normal", np.zeros((12, 10, 3)), ("shape [10, 12, 3] like the pictures", "float64 of shape [12, 10, 3]")),
+        ("depth", np.full((HEIGHT, WIDTH), "deep"), ("found <U4 of shape [10, 12]",)),
+        *(
+            ("specular", np.pad(np.full((1, 2, 3), value), ((1, HEIGHT - 2), (2, WIDTH - 4), (0, 0))),
+             ("finite numbers", "found 6 of 360 values", "Write zeros"))
+            for value in (np.nan, np.inf, 1e300)
+        ),
+    ],
+)  # fmt: skip
+def test_arrays_that_are_refused(
+    capture: TinyCapture, name: str, array: np.ndarray, parts: tuple[str, ...]
+) -> None:
+    capture.write_truth("v000", **{name: array})
+    fails(capture.root, f"gt/v000.npz ({name})", *parts)
+
+
+@pytest.mark.parametrize("keep", [0, 10, 200, -30])
+def test_cut_short(capture: TinyCapture, keep: int) -> None:
+    path = capture.write_truth("v000", depth=np.random.default_rng(0).random((HEIGHT, WIDTH)))
+    path.write_bytes(path.read_bytes()[:keep])
+    fails(
+        capture.root,
+        "gt/v000.npz",
+        "a NumPy .npz file",
+        "a damaged, truncated or other file",
+        "Write it again",
+    )
+
+
+def test_a_single_array_and_pickled_objects_are_refused(capture: TinyCapture) -> None:
+    path = capture.write_truth("v000", depth=np.array([{"a": 1}], dtype=object))
+    fails(capture.root, "gt/v000.npz", "a damaged, truncated or other file")
+    with path.open("wb") as file:
+        np.save(file, np.zeros((HEIGHT, WIDTH)))
+    fails(capture.root, "gt/v000.npz", "a damaged, truncated or other file")
+
+
+CUP = {
+    "id": 2,
+    "name": "cup",
+    "foreground": True,
+    "material": {"type": "pplastic", "alpha": 0.03, "ior": 1.5},
+}
+GROUND = {
+    "id": 1,
+    "name": "ground",
+    "foreground": False,
+    "material": {"type": "pplastic", "alpha": 0.3, "ior": 1.5},
+}
+
+
+def numbered(capture: TinyCapture, objects: Any, ids: np.ndarray | None = None) -> TinyCapture:
+    ids = np.ones((HEIGHT, WIDTH), np.uint8) if ids is None else ids
+    capture.write_truth("v003", objid=ids)
+    capture.write_json("scene.json", {"objects": objects, "scene": "tiny"})
+    return capture
+
+
+def test_the_table_is_read(capture: TinyCapture) -> None:
+    ground, cup = load_scene(numbered(capture, [GROUND, CUP]).root).objects
+    assert (ground.id, ground.name, ground.foreground) == (1, "ground", False)
+    assert (cup.id, cup.material.alpha, cup.material.kind) == (2, 0.03, "dielectric")
+
+
+def test_a_table_that_nothing_refers_to_may_lack_fields(capture: TinyCapture) -> None:
+    capture.write_json("scene.json", {"objects": [{"somebody": "else's"}]})
+    assert load_scene(capture.root).objects == ()
+
+
+@pytest.mark.parametrize(
+    ("objects", "parts"),
+    [
+        ([CUP, {**GROUND, "id": 2}], ("(objects)", "each has its own id", "two with the id 2")),
+        ([CUP, {**GROUND, "name": "cup"}], ("(objects)", "each has its own name", "two with the name cup")),
+        ([{"name": "cup"}], ("(objects[0])", "the field id", "only name")),
+        ([{**CUP, "id": 0}], ("(objects[0].id)", "1 to 65535", "found 0")),
+        ([{**CUP, "id": "two"}], ("(objects[0].id)", "a whole number", '"two"')),
+        ([{**CUP, "material": "clay"}], ("(objects[0].material)", "a JSON object", '"clay"')),
+        ({"cup": 2}, ("(objects)", "a list", '{"cup": 2}')),
+    ],
+)
+def test_a_wrong_table(capture: TinyCapture, objects: Any, parts: tuple[str, ...]) -> None:
+    with pytest.raises(PolarguideError) as caught:
+        load_scene(numbered(capture, objects).root)
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in ("scene.json", *parts, "Correct it, or remove"):
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("ids", "found"),
+    [
+        (np.full((HEIGHT, WIDTH), 1.5), "float64 from 1.5 to 1.5"),
+        (np.full((HEIGHT, WIDTH), -1), "int64 from -1 to -1"),
+        (np.full((HEIGHT, WIDTH), 70000), "int64 from 70000 to 70000"),
+    ],
+)
+def test_numbers_that_are_none(capture: TinyCapture, ids: np.ndarray, found: str) -> None:
+    with pytest.raises(PolarguideError, match=re.escape(found)) as caught:
+        load_scene(numbered(capture, [CUP], ids).root)
+    assert "gt/v003.npz (objid)" in str(caught.value).replace("\\", "/")
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_a_number_counts_where_its_whole_box_agrees(capture: TinyCapture, factor: int) -> None:
+    ids = np.random.default_rng(0).choice([1, 1, 1, 1, 2], (HEIGHT, WIDTH)).astype(np.uint16)
+    depth = np.where(np.random.default_rng(1).uniform(size=ids.shape) < 0.2, 0, 2.0 + ids)
+    numbered(capture, [CUP, GROUND], ids)
+    capture.write_truth("v003", objid=ids, depth=depth)
+    found = load_scene(capture.root, downscale=factor).view("v003").ground_truth
+    rows, columns = HEIGHT // factor, WIDTH // factor
+    assert tuple(found.object_ids.shape) == (rows, columns)
+    for y in range(rows):
+        for x in range(columns):
+            box = np.s_[y * factor : (y + 1) * factor, x * factor : (x + 1) * factor]
+            numbers = set(ids[box].ravel().tolist())
+            assert int(found.object_ids[y, x]) == (numbers.pop() if len(numbers) == 1 else 0)
+            expected = depth[box].mean() if (depth[box] > 0).all() else 0.0
+            assert float(found.depth[y, x]) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("material", "kind"),
+    [
+        (Material("pplastic", 0.03, 1.5), "dielectric"),
+        (Material("plastic", 0.15, 1.5), "dielectric"),
+        (Material("plastic", 0.16, 1.5), "rough dielectric"),
+        (Material("", 0.3, 1.33), "rough dielectric"),
+        (Material("roughconductor", 0.12), "metal"),
+        (Material("metal", 0.3), "rough metal"),
+        (Material("chrome", 0.01, k=[3.0, 3.0, 3.0]), "metal"),
+        (Material("matte"), "matte"),
+        (Material(), None),
+        (Material("wax", 0.2), None),
+    ],
+)
+def test_classes_of_material(material: Material, kind: str | None) -> None:
+    assert material.kind == kind
 
 
 def slow_boxes(values: np.ndarray, factor: int) -> list[list[np.ndarray]]:
@@ -50,8 +221,7 @@ def test_camera_keeps_looking_at_the_same_points(capture: TinyCapture, factor: i
     full = load_scene(capture.root).views[1].camera
     small = load_scene(capture.root, downscale=factor).views[1].camera
     assert (small.width, small.height) == (WIDTH // factor, HEIGHT // factor)
-    assert small.fx == full.fx / factor
-    assert small.cy == full.cy / factor
+    assert (small.fx, small.cy) == (full.fx / factor, full.cy / factor)
 
 
 @pytest.mark.parametrize("factor", [2, 3])
@@ -62,7 +232,6 @@ def test_masks_need_all_pixels_and_invalid_any(capture: TinyCapture, factor: int
         (capture.root / folder).mkdir()
         cv2.imwrite(str(capture.root / folder / "v000.png"), picture.astype(np.uint8) * 255)
     view = load_scene(capture.root, downscale=factor).views[0]
-    assert view.mask is not None
     np.testing.assert_array_equal(view.mask.numpy(), slow(np.all, mask, factor))
     np.testing.assert_array_equal(view.invalid.numpy(), slow(np.any, invalid, factor))
 
@@ -90,7 +259,6 @@ def test_ground_truth(capture: TinyCapture, factor: int) -> None:
     specular, diffuse = rng.random((2, HEIGHT, WIDTH, 3))
     capture.write_truth("v000", normal=normal, depth=depth, mask=mask, specular=specular, diffuse=diffuse)
     ground_truth = load_scene(capture.root, downscale=factor).views[0].ground_truth
-    assert ground_truth is not None
     fields = (
         ground_truth.normal,
         ground_truth.depth,
@@ -174,8 +342,6 @@ def test_views_are_made_smaller_one_by_one(capture: TinyCapture) -> None:
         assert torch.equal(view.photograph(), whole.photograph())
     assert views[0].mask is views[0].materials is None
     found = views[1]
-    assert found.mask is not None
-    assert found.materials is not None
     assert found.mask.nonzero().tolist() == [[0, 0]]  # a box that is the subject in part is not
     assert found.materials[0, :2].tolist() == [0, 2]  # a box of two materials is of none
     assert int(found.materials.max()) == 2
