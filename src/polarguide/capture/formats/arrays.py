@@ -76,7 +76,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 raise ValueError(f"an archive that unfolds to {size} bytes")
             return {name: _array(_member(archive, entry)) for name, entry in members.items()}
     except BROKEN as error:
-        found = "an empty file" if not data else f"one that cannot be unpacked ({error})"
+        what = "one that cannot be unpacked" if isinstance(error, zipfile.BadZipFile) else "a damaged one"
+        found = f"{what} ({error})" if data else "an empty file"
     raise damaged(path, "a complete .npz file of numbers", found)
 
 
