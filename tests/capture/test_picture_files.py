@@ -13,9 +13,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from tiny_capture import TinyCapture, encode_srgb, fails, ideal_intensities, write_picture
 
 from polarguide.capture import load_scene
+from polarguide.capture.filter.exif import orientation
 from polarguide.capture.formats import pictures
 from polarguide.capture.formats.integrity import find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
@@ -315,3 +317,21 @@ def test_a_lack_of_memory_is_told_from_damage(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(pictures.np, "empty", none_left)
     with pytest.raises(PolarguideError, match="expected memory for a picture of 50x40 pixels, found less"):
         pictures.decode_stored(tmp_path / "a.png", data)
+
+
+@pytest.mark.parametrize("code", [1, 2, 3, 6])
+@pytest.mark.parametrize("big", [False, True])
+def test_pixels_are_as_stored_whatever_the_orientation_and_never_from_pillow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, big: bool
+) -> None:
+    """Pillow would give color of 16 bits a channel with 8, without a word; OpenCV turns TIFF files by itself."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("Pillow opened a picture")
+
+    monkeypatch.setattr(Image, "open", refuse)
+    path, tags = tmp_path / "a.tif", [(274, "H", 1, code, True)]
+    tifffile.imwrite(path, COLORS, photometric="rgb", bigtiff=big, extratags=tags)
+    np.testing.assert_array_equal(decode_picture(path, path.read_bytes()), COLORS)
+    assert orientation(path.read_bytes()) == (1 if big else code)
+    np.testing.assert_array_equal(decode_picture(path, PNG), COLORS[..., ::-1])

@@ -16,12 +16,11 @@ from PIL import Image
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.filter.camera_raw import is_camera_raw
-from polarguide.capture.formats.integrity import TIFF, jpeg_segments, png_chunks
+from polarguide.capture.formats.integrity import ORIENTATION, TIFF, jpeg_segments, png_chunks
 from polarguide.capture.formats.pictures import read_picture
 from polarguide.errors import optional_import
 from polarguide.files import read_file
 
-_ORIENTATION = 274
 _MIRRORED = (2, 4, 5, 7)
 _QUARTER = (5, 6, 7, 8)
 TURNS = {
@@ -38,7 +37,7 @@ TURNS = {
 
 def orientation(data: bytes) -> int:
     """The orientation tag of a picture file, 1 to 8; 1 (as stored) where there is none that can be read."""
-    value = tags_of(data).get(_ORIENTATION)
+    value = tags_of(data).get(ORIENTATION)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 

@@ -20,6 +20,7 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _TIFF_CODES = {1: "B", 3: "H", 4: "I"}
+ORIENTATION = 274
 TIFF = (b"II*\0", b"MM\0*")
 BIG_TIFF = (b"II+\0", b"MM\0+")
 # Marks without a length: one that nobody uses, and restarts.
@@ -126,6 +127,20 @@ def tiff_entries(data: bytes, start: int | None = None) -> Iterator[tuple[int, i
     first, size = start + struct.calcsize(counter), 20 if big else 12
     for at in range(first, first + size * min(count, MOST_ENTRIES), size):
         yield *struct.unpack_from(order + head, data, at), at + place
+
+
+def without_orientation(data: bytes) -> bytes:
+    """A picture file that passed ``find_damage``, where OpenCV finds no orientation to apply.
+
+    It turns the pixels of TIFF files even where it is asked for them unchanged, but not those of JPEG and PNG.
+    """
+    if data[:4] in (*TIFF, *BIG_TIFF):
+        for tag, kind, _, at in tiff_entries(data):
+            if tag == ORIENTATION and kind in _TIFF_CODES:
+                changed = bytearray(data)
+                struct.pack_into(tiff_order(data) + _TIFF_CODES[kind], changed, at, 1)
+                return bytes(changed)
+    return data
 
 
 def tiff_order(data: bytes) -> str:

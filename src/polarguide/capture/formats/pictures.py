@@ -23,6 +23,7 @@ from polarguide.capture.formats.integrity import (
     declared_size,
     find_damage,
     tiff_order,
+    without_orientation,
 )
 from polarguide.capture.view import FULL_CODE
 from polarguide.color import srgb_decode_array
@@ -182,7 +183,8 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
     pixels = None
     if damage is None:
         with contextlib.suppress(cv2.error):
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            stored = np.frombuffer(without_orientation(data), np.uint8)
+            pixels = cv2.imdecode(stored, cv2.IMREAD_UNCHANGED)
         if pixels is None:
             _require_room(path, size)
             damage = "one that cannot be decoded"
