@@ -25,7 +25,7 @@ from polarguide.runs.point_cloud import gaussian_colors
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
-from polarguide.visualization.embedded import content_policy, page_part, script_json
+from polarguide.visualization.pages import content_policy, page_part, script_json
 
 SCRIPTS = (
     "algebra.js",

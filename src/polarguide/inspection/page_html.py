@@ -14,7 +14,7 @@ from polarguide.inspection.shots import ShotFindings
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.progress import SILENT, Reporter
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import content_policy, page_part
+from polarguide.visualization.pages import content_policy, page_part
 
 FILE = "inspection.html"
 _CLASSES: dict[Verdict, str] = {

@@ -17,7 +17,8 @@ from polarguide.shots.maps import REASONS, Reason, ShotMaps
 from polarguide.shots.pictures import Stretch, drawn, stretch_of
 from polarguide.shots.surface import SurfaceMaps
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import content_policy, data_uri, page_part, script_json
+from polarguide.visualization.embedded import data_uri
+from polarguide.visualization.pages import content_policy, page_part, script_json
 
 PAGE = "shot.html"
 SIDE = 816
