@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import polarguide
-from polarguide.visualization.embedded import content_policy
+from polarguide.visualization.pages import content_policy
 
 PAGES = sorted(Path(polarguide.__file__).parent.rglob("*.html"))
 

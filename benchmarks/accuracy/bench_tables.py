@@ -15,11 +15,12 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from scipy import stats
 
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.table import METRICS, OBJECT_METRICS
-from polarguide.experiments.results import read_results
+from polarguide.experiments.record import read_results
 
 BY_KEY = {metric.key: metric for metric in METRICS}
 COLUMNS = {
@@ -154,7 +155,7 @@ def read_scenes(paths: list[Path]) -> dict[str, dict[str, dict[int, Any]]]:
     """
     scenes: dict[str, dict[str, dict[int, Any]]] = {}
     for path in paths:
-        record = read_results(path)
+        record = msgspec.to_builtins(read_results(path))
         for recipe in record["recipes"]:
             for run in record["runs"]:
                 if run["recipe"] == recipe["name"] and run["state"] == "done":

@@ -25,9 +25,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.table import METRICS
-from polarguide.experiments.results import read_results
+from polarguide.experiments.record import read_results
 
 PICTURE = {"psnr": 0.15, "psnr_foreground": 0.15}
 LAYERS = {"specular_psnr": 0.2, "diffuse_psnr": 0.2}
@@ -210,7 +212,7 @@ def main() -> None:
     scenes: dict[str, Runs] = {}
     for path in options.records:
         try:
-            record = read_results(path)
+            record = msgspec.to_builtins(read_results(path))
         except PolarguideError as error:
             parser.error(str(error))
         for name in (known["name"] for known in record["scenes"]):

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.experiments.shown import MINUS
+from polarguide.experiments.tables import MINUS
 
 METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
 WHOLE = "all"

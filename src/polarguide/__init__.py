@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from polarguide.capture.sensor.analyzer_file import read_analyzers
     from polarguide.capture.sensor.analyzers import AnalyzerCalibration
     from polarguide.errors import PolarguideError, PolarguideWarning
-    from polarguide.experiments.ablate import ablate
-    from polarguide.experiments.compare import compare
+    from polarguide.experiments.compare import ablate, compare
     from polarguide.experiments.options import CompareOptions
     from polarguide.inspection.settings import InspectSettings
     from polarguide.measurement.options import MeasureOptions, WatchOptions
@@ -62,8 +61,7 @@ _NAMES = {
     "capture.sensor.analyzer_file": ("read_analyzers",),
     "capture.sensor.analyzers": ("AnalyzerCalibration",),
     "errors": ("PolarguideError", "PolarguideWarning"),
-    "experiments.ablate": ("ablate",),
-    "experiments.compare": ("compare",),
+    "experiments.compare": ("ablate", "compare"),
     "experiments.options": ("CompareOptions",),
     "inspection.settings": ("InspectSettings",),
     "measurement.options": ("MeasureOptions", "WatchOptions"),

@@ -16,7 +16,7 @@ import pytest
 from polarguide.cli.app import run
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, plan_runs, scene_entries
-from polarguide.experiments.results import validate_results
+from polarguide.experiments.record import read_results
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
@@ -75,9 +75,7 @@ def test_interrupted_failed_and_finished(
     assert f"{second}/run.json: expected " in said.err
     assert len(said.err.splitlines()) == 1
     assert "done  demo, 3dgs-dr, seed 0" in said.out
-    record = json.loads((out / "results.json").read_text())
-    validate_results(record)
-    assert [r["state"] for r in record["runs"]] == ["done", "failed"]
+    assert [r.state for r in read_results(out / "results.json").runs] == ["done", "failed"]
     lines = [json.loads(line) for line in (first / LOG).read_text().splitlines()]
     assert [line["step"] for line in lines] == list(range(9, 200, 10))
     assert lines[: len(before)] == before, "it went on instead of starting over"

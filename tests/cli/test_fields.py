@@ -10,7 +10,7 @@ import pytest
 from polarguide.cli.app import run
 from polarguide.cli.compare import chosen_steps
 from polarguide.errors import PolarguideError
-from polarguide.experiments.results import validate_results
+from polarguide.experiments.record import read_results
 
 SMALL = ["--downscale", "8", "--threads", "1"]
 
@@ -46,7 +46,7 @@ def test_a_field_is_compared_with_gaussians(
     command += ["--downscale", "8", "--jobs", "1", "--out", str(out), "--report-views", "1"]
     assert run(command) == 0
     record = json.loads((out / "results.json").read_text())
-    validate_results(record)
+    read_results(out / "results.json")
     assert [r["about"].endswith("; 4 steps.") for r in record["recipes"]] == [False, True]
     assert [r.get("steps") for r in record["recipes"]] == [None, 4]
     rows = [

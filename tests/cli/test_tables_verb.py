@@ -6,14 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-from comparison_records import results, run
+from comparison_records import content, run
 
 from polarguide.cli.app import run as command
-from polarguide.experiments.results import write_results
 
 
 def test_wrong_input_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_results(tmp_path / "x.json", results([run("x", "3dgs", 0, psnr=30.0)]))
+    (tmp_path / "x.json").write_text(json.dumps(content([run("x", "3dgs", 0, psnr=30.0)])))
     (tmp_path / "y.json").write_text(json.dumps({"format": "polarguide-results-2"}))
     for arguments, said in (
         ([str(tmp_path / "none.json")], "none.json"),

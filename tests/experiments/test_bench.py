@@ -15,10 +15,9 @@ import polarguide
 from polarguide.errors import PolarguideError
 from polarguide.experiments import bench as benches
 from polarguide.experiments.bench import run_bench
-from polarguide.experiments.bench_options import BENCH, Bench, BenchOptions
 from polarguide.experiments.compare import locked
 from polarguide.experiments.join import join_tables
-from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.options import BENCH, Bench, BenchOptions, CompareOptions
 from polarguide.recipes import recipe_named
 from polarguide.synth import render as renderer
 from polarguide.synth.manifest import scene_digest

@@ -6,13 +6,13 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from heard import Heard
 
 import polarguide
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, plan_runs, scene_entries
-from polarguide.experiments.results import read_results
-from polarguide.progress import Reporter
+from polarguide.experiments.record import read_results
 from polarguide.recipes import recipe_named
 from polarguide.training.settings import TrainSettings
 
@@ -20,21 +20,11 @@ SETTINGS = TrainSettings(steps=20)
 OPTIONS = CompareOptions(downscale=8, jobs=1, report_views=1)
 
 
-class Messages(Reporter):
-    """Collects what is said."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.said.append(text)
-
-
 @pytest.mark.slow
 def test_a_comparison_and_an_ablation_share_runs(
     demo_scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    messages = Messages()
+    messages = Heard()
     results = polarguide.compare(
         [demo_scene],
         [recipe_named("3dgs-dr")],
@@ -45,10 +35,9 @@ def test_a_comparison_and_an_ablation_share_runs(
     )
     index = "demo: refractive index 1.5, as scene.json says"
     assert messages.said == [index, "runs: 1, of them finished before: 0", "done  demo, 3dgs-dr, seed 0"]
-    assert read_results(tmp_path / "results.json") == results
-    (run,) = results["runs"]
-    assert (run["state"], run["error"]) == ("done", None)
-    assert results["table"][0]["cells"]["psnr"]["mean"] == run["metrics"]["psnr"]  # type: ignore[index]
+    assert read_results(tmp_path / "results.json") == results.record
+    assert results.runs["state"].tolist() == ["done"]
+    assert results.scores["psnr"].tolist() == results.runs["psnr"].tolist()
     assert (tmp_path / "report.html").exists()
 
     # The run of an ablation cannot begin: its folder holds something else.
@@ -60,9 +49,10 @@ def test_a_comparison_and_an_ablation_share_runs(
     results = polarguide.ablate(
         [demo_scene], "3dgs-dr", tmp_path, only=["consistent"], settings=SETTINGS, options=OPTIONS
     )
-    assert [(r["recipe"], r["state"]) for r in results["runs"]] == [("3dgs-dr", "done"), (only, "failed")]
-    assert "run.json" in str(results["runs"][1]["error"])
-    assert results["settings"]["against"] == "3dgs-dr"
+    runs = results.runs.set_index("recipe")
+    assert runs["state"].to_dict() == {"3dgs-dr": "done", only: "failed"}
+    assert "run.json" in runs.loc[only, "error"]
+    assert results.record.settings.against == "3dgs-dr"
     assert capfd.readouterr() == ("", "")
 
 

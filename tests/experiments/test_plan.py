@@ -16,9 +16,7 @@ from polarguide.errors import PolarguideError
 from polarguide.evaluation.evaluate import evaluate
 from polarguide.evaluation.sources import scoring_digest
 from polarguide.experiments import plan as plans
-from polarguide.experiments.ablate import ablated
-from polarguide.experiments.collect import collect
-from polarguide.experiments.compare import compare
+from polarguide.experiments.compare import ablated, collect, compare
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
 from polarguide.options import SceneOptions
@@ -104,6 +102,37 @@ def test_a_recipe_may_have_seeds_of_its_own() -> None:
         compare(["none"], ["3dgs"], "none", seeds_of={"3dgs": 0})
 
 
+@pytest.mark.parametrize(
+    ("recipes", "words", "rows"),
+    [
+        (["polarguide-stokes"], ("four", "one", "none"), ["four", "one", "none"]),
+        (
+            ["3dgs", "polarguide-stokes"],
+            ("one", "none"),
+            ["3dgs one", "3dgs none", "polarguide-stokes one", "polarguide-stokes none"],
+        ),
+    ],
+)
+def test_exposures_have_rows_and_folders_by_their_words(
+    recipes: list[str], words: tuple[str, ...], rows: list[str]
+) -> None:
+    question = asked(recipes=tuple(map(recipe_named, recipes)), exposures=words, seeds=1)
+    runs = plan_runs(question, [ENTRY])
+    assert [run.row.name for run in runs] == rows
+    assert [run.folder.parent.name for run in runs] == [row.replace(" ", "-") for row in rows]
+    assert [run.settings.exposures for run in runs] == [row.split()[-1] for row in rows]
+    assert runs[-1].recipe.name == "polarguide-stokes:unpolarized"
+    assert len({run.folder.name for run in runs}) == len(runs)
+    assert question.command.endswith(f"--exposures {' '.join(words)}")
+
+
+@pytest.mark.parametrize("words", [("one", "one"), ("five",)])
+def test_words_are_checked(words: tuple[str, ...]) -> None:
+    with pytest.raises(PolarguideError) as error:
+        CompareOptions(exposures=words)  # type: ignore[arg-type]
+    assert error.value.where == "exposures"
+
+
 def test_another_scene_recipe_value_or_program_has_another_key(monkeypatch: pytest.MonkeyPatch) -> None:
     def key(scene: str = "s", recipe: dict[str, Any] | None = None, code: str = "c", seed: int = 0) -> str:
         data = RECIPES["3dgs"].data() if recipe is None else recipe
@@ -123,6 +152,7 @@ def test_the_command_in_the_record_asks_for_the_same() -> None:
     assert command.startswith(
         "polarguide compare 'my cup' --recipes 3dgs polarguide:without-normals --steps 40"
     )
+    assert "--exposures" not in command
     assert asked(asked="polarguide bench --out x").command == "polarguide bench --out x"
 
 
@@ -158,13 +188,13 @@ def test_truth_that_some_views_lack_is_said_before_anything_is_trained(
     (said,) = [text for text in reporter.said if counts in text]
     assert said.startswith("partial: The ground truth gives ")
     record = collect(question, entries, plan_runs(question, entries), {})
-    assert record["scenes"][0]["warnings"] == [text.removeprefix("partial: ") for text in reporter.said]
+    assert record.record.scenes[0].warnings == [text.removeprefix("partial: ") for text in reporter.said]
 
 
 def test_of_a_whole_scene_a_record_has_no_warnings(demo_scene: Path, tmp_path: Path) -> None:
     question = asked(scenes=(demo_scene,), downscale=4, out=tmp_path)
     entries = scene_entries(question)
-    assert "warnings" not in collect(question, entries, plan_runs(question, entries), {})["scenes"][0]
+    assert not collect(question, entries, plan_runs(question, entries), {}).record.scenes[0].warnings
 
 
 def test_how_far_a_run_is(planned: PlannedRun, tmp_path: Path) -> None:

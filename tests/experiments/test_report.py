@@ -10,7 +10,6 @@ import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,9 +20,10 @@ from comparison_records import part, results, run, unfinished
 
 from polarguide.capture import GroundTruth, Scene
 from polarguide.capture.ground_truth import Material, SceneObject
-from polarguide.experiments.curves import Curve, curves_svg, read_curve, smoothed, ticks
-from polarguide.experiments.forms import sections
+from polarguide.experiments.charts import Curve
 from polarguide.experiments.report import _ground_truth_tile, report_html
+from polarguide.experiments.results import Results
+from polarguide.experiments.tables import sections
 from polarguide.visualization.embedded import Tile, chosen_views, data_uri, embed
 
 FREE = ("r:unpolarized", "r:unpolarized-without-consistency")
@@ -109,7 +109,7 @@ def test_nothing_comes_from_outside() -> None:
     assert not [value for key, value in reader.attributes if key in ("src", "href", "action")]
 
 
-def bench() -> dict[str, Any]:
+def bench() -> Results:
     """A comparison with controls, objects, unequal seeds and runs that are missing."""
     rng = np.random.default_rng(0)
     runs = []
@@ -164,7 +164,7 @@ def test_every_section_is_on_the_page_and_in_the_browser(tmp_path: Path) -> None
         ]
         for section in sections(record):
             rows = view.locator(f"#{section.key} tbody tr")
-            assert rows.count() == sum(len(block.rows) for block in section.blocks)
+            assert rows.count() == sum(len(rows) for _, rows in section.blocks)
             wide = view.locator(f"#{section.key}").evaluate("e => e.scrollWidth <= e.clientWidth + 1")
             assert wide, f"{section.key} runs out of its panel"
         assert view.locator("#sheets a").get_attribute("href") == "runs/figure/r/0-ab%20cd/errors.png"
@@ -217,40 +217,6 @@ def test_chosen_views_are_spread() -> None:
     assert chosen_views("abc", 5) == ["a", "b", "c"]
     assert chosen_views("abcdef", 3) == ["a", "c", "e"]
     assert chosen_views("abc", 0) == []
-
-
-def test_a_log_becomes_a_curve(tmp_path: Path) -> None:
-    rows = [{"step": 10 * i + 9, "seconds": i / 2, "psnr": 20.0 + i} for i in range(1000)]
-    (tmp_path / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"step": 3')
-    curve = read_curve(tmp_path, "a")
-    assert curve is not None
-    assert (curve.steps[0], curve.steps[-1], curve.seconds[-1]) == (10, 10000, 499.5)
-    assert len(curve.psnr) <= 240
-    np.testing.assert_allclose(curve.psnr, 20 + (curve.steps - 10) / 10)  # a line stays one under smoothing
-    assert 'aria-label="PSNR over steps"' in curves_svg([curve], "steps")
-    assert read_curve(tmp_path / "none", "a") is None
-
-
-def test_smoothing_keeps_the_mean_of_noise_and_both_ends() -> None:
-    values = np.random.default_rng(0).normal(25.0, 1.0, 2000)
-    smooth = smoothed(values, 0.05)
-    assert smooth[100:-100].std() < 0.2
-    assert (smooth[0], smooth[-1]) == pytest.approx((values[0], values[-1]))
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [
-        (0, 60, [0, 10, 20, 30, 40, 50, 60]),
-        (18.3, 21.2, [18, 18.5, 19, 19.5, 20, 20.5, 21, 21.5]),
-        (5, 5, None),
-    ],
-)
-def test_ticks_are_round_and_enclose(low: float, high: float, expected: list[float] | None) -> None:
-    found = ticks(low, high)
-    assert found[0] <= low < found[-1] or found[0] <= low <= high <= found[-1]
-    assert found[-1] > found[0]
-    assert expected is None or found == expected
 
 
 def test_no_script_but_its_own_may_run() -> None:

@@ -1,46 +1,72 @@
-"""Means, spreads and bests on numbers that can be checked by head, and the three forms of the table."""
+"""Means, spreads and tables on numbers that can be checked by head, and the files that hold them."""
 
 from __future__ import annotations
 
-import csv
 import io
-from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import pandas as pd
 import pytest
-from comparison_records import results, run, unfinished
+from comparison_records import part, results, run, unfinished
 
 from polarguide.evaluation.table import COLUMNS
-from polarguide.experiments.aggregate import aggregate, cell_of
-from polarguide.experiments.forms import csv_text, latex, latex_text, markdown
-from polarguide.experiments.results import Results
-from polarguide.experiments.tables import leading_rows, notes, scores_section
+from polarguide.experiments.results import Cell, Results, cell_of
+from polarguide.experiments.tables import (
+    Section,
+    against_section,
+    control_section,
+    notes,
+    part_section,
+    scores_section,
+    sections,
+)
+from polarguide.experiments.writing import csv_text, latex_text, readable, write_tables
 
-BY_KEY = {column.key: column for column in COLUMNS}
+FREE, LOOSE = "r:unpolarized", "r:unpolarized-without-consistency"
+
+
+def seen(scene: str, recipe: str, seed: int, **parts: dict[str, Any]) -> dict[str, Any]:
+    """A run with objects, and with materials of the same scores."""
+    made = run(scene, recipe, seed, psnr=30.0)
+    materials = {scores["material"]: scores for scores in parts.values() if scores["material"]}
+    return made | {"objects": parts, "materials": materials}
+
+
+def ball(**metrics: float | None) -> dict[str, Any]:
+    return part("metal", **metrics)
+
+
+def rows(section: Section, block: int = 0) -> dict[tuple[str, ...], list[str]]:
+    """Shown cells by labels; bold ones have a star."""
+    _, found = section.blocks[block]
+    return {
+        tuple(text + (f" ({remark})" if remark else "") for text, _, remark in labels): [
+            " ".join(filter(None, ("*" * bold + value, more))) for value, more, bold in cells
+        ]
+        for labels, cells in found
+    }
+
+
+def text(found: Results, name: str = "results.md") -> str:
+    return readable(sections(found), name)
 
 
 def test_mean_and_sample_standard_deviation_over_seeds() -> None:
-    runs = [run("cup", "a", seed, psnr=value) for seed, value in enumerate((30.0, 32.0, 34.0))]
-    (row,) = aggregate(runs, ["cup"], ["a"])
-    assert row["finished"] == 3
-    assert row["cells"]["psnr"] == {"mean": 32.0, "spread": 2.0, "count": 3}
-    assert row["cells"]["ssim"] == {"mean": None, "spread": None, "count": 0}
-
-
-def test_one_seed_has_no_spread() -> None:
-    assert cell_of([5.0, None]) == {"mean": 5.0, "spread": None, "count": 1}
-    assert cell_of([]) == {"mean": None, "spread": None, "count": 0}
+    found = results([run("cup", "a", seed, psnr=value) for seed, value in enumerate((30.0, 32.0, 34.0))])
+    (row,) = found.table
+    assert (row.finished, row.cells["psnr"], row.cells["ssim"]) == (3, Cell(32.0, 2.0, 3), Cell())
+    assert found.scores.loc[0, ["runs", "psnr", "psnr_spread"]].tolist() == [3, 32.0, 2.0]
+    assert (cell_of([5.0, None]), cell_of([])) == (Cell(5.0, None, 1), Cell())
 
 
 def test_the_mean_over_scenes_weighs_scenes_alike() -> None:
     runs = [run("x", "a", 0, psnr=10.0), run("x", "a", 1, psnr=14.0), run("y", "a", 0, psnr=20.0)]
-    row = aggregate(runs, ["x", "y"], ["a"])[-1]
-    assert row["scene"] is None
+    row = results(runs).table[-1]
     # Only seed 0 is on both scenes: the mean is that of the scenes' means, and there is no spread.
-    assert row["cells"]["psnr"] == {"mean": 16.0, "spread": None, "count": 1}
-    runs.append(run("y", "a", 1, psnr=24.0))
-    row = aggregate(runs, ["x", "y"], ["a"])[-1]
-    assert row["cells"]["psnr"]["mean"] == 17.0  # of 12 and 22
-    assert row["cells"]["psnr"]["spread"] == pytest.approx(8**0.5)  # of 15 and 19
+    assert (row.scene, row.cells["psnr"]) == (None, Cell(16.0, None, 1))
+    cell = results([*runs, run("y", "a", 1, psnr=24.0)]).table[-1].cells["psnr"]
+    assert (cell.mean, cell.spread) == (17.0, pytest.approx(8**0.5))  # of 12 and 22; of 15 and 19
 
 
 def test_means_over_different_scenes_are_not_compared() -> None:
@@ -50,29 +76,19 @@ def test_means_over_different_scenes_are_not_compared() -> None:
         run("x", "b", 0, psnr=11.0, normal_mae_deg=30.0),
         unfinished("y", "b", 0),
     ]
-    a, b = aggregate(runs, ["x", "y"], ["a", "b"])[-2:]
-    assert a["cells"]["psnr"]["mean"] == 15.0
-    assert b["cells"]["psnr"]["mean"] is None
+    means = results(runs).scores.set_index("recipe").iloc[-2:]
+    assert means.loc["a", "psnr"] == 15.0
+    assert pd.isna(means.loc["b", "psnr"])
     # y has no normals to compare with for anybody, so that x alone is the mean of both.
-    assert (a["cells"]["normal_mae_deg"]["mean"], b["cells"]["normal_mae_deg"]["mean"]) == (20.0, 30.0)
+    assert means["normal_mae_deg"].tolist() == [20.0, 30.0]
 
 
-@pytest.mark.parametrize(
-    ("key", "values", "best"),
-    [
-        ("psnr", (30.0, 31.0, 29.0), {1}),
-        ("normal_mae_deg", (20.5, 19.0, 21.0), {1}),
-        ("psnr", (30.004, 30.0, 29.0), {0, 1}),  # the same number as shown
-        ("psnr", (30.0, None, 30.0), {0, 2}),
-        ("psnr", (None, 31.0, None), set()),  # nothing to be better than
-        ("gaussians", (1.0, 2.0, 3.0), set()),  # neither is better
-    ],
-)
-def test_the_best_is_marked(key: str, values: tuple[float | None, ...], best: set[int]) -> None:
-    names = [f"r{index}" for index in range(len(values))]
-    runs = [run("cup", name, 0, **{key: value}) for name, value in zip(names, values, strict=True)]
-    record = results(runs)
-    assert leading_rows(record["table"], BY_KEY[key], record) == best
+def test_runs_are_a_frame_with_their_states_and_scores() -> None:
+    frame = results([run("x", "a", 0, psnr=30.0), unfinished("x", "b", 0, "disk full")]).runs
+    assert frame[["recipe", "state", "error"]].fillna("").to_numpy().tolist() == [
+        ["a", "done", ""], ["b", "failed", "disk full"],
+    ]  # fmt: skip
+    assert frame["psnr"].dropna().tolist() == [30.0]
 
 
 def test_what_is_not_there_is_told_apart() -> None:
@@ -81,101 +97,184 @@ def test_what_is_not_there_is_told_apart() -> None:
         run("cup", "polarguide", 0, psnr=31.0, specular_psnr=25.0, fps=60.0),
         unfinished("cup", "broken", 0, "disk full"),
     ]
-    (block,) = scores_section(results(runs)).blocks
-    shown = {row.labels[0].text: [cell.value for cell in row.cells] for row in block.rows}
-    assert [row.labels[0].remark for row in block.rows] == ["", "", "failed"]
-    assert shown == {  # PSNR, specular PSNR, Gaussians, FPS
-        "3dgs": ["30.00", "n/a", "1,200", ""],
-        "polarguide": ["31.00", "25.00", "n/a", "60.0"],
-        "broken": ["", "", "", ""],
+    assert rows(scores_section(results(runs))) == {  # PSNR, specular PSNR, Gaussians, FPS
+        ("3dgs",): ["30.00", "n/a", "1,200", ""],
+        ("polarguide",): ["*31.00", "25.00", "n/a", "60.0"],
+        ("broken (failed)",): ["", "", "", ""],
     }
 
 
+def test_notes_name_what_failed_and_what_scores_do_not_mean() -> None:
+    runs = [run("x", "a", 0, lpips=0.1), unfinished("x", "b", 0, "disk full"), unfinished("x", "c", 0)]
+    runs += [run("y", name, 0) | {"mesh_reason": "skimage is not installed"} for name in "ab"]
+    found = results(runs)
+    found.record.scenes[1].warnings = ["The ground truth gives normals of 1 of 2 test views."]
+    stated = notes(found)
+    assert stated.count("mesh F-score 1 % n/a: skimage is not installed.") == 1
+    for note in (
+        "x, b, seed 0 failed: disk full",
+        "x, c, seed 0 has not finished",
+        "LPIPS n/a: no weights.",
+        "y: The ground truth gives normals of 1 of 2 test views.",
+    ):
+        assert note in stated
+    assert not any(note.startswith("x:") for note in stated)
+
+
+def test_what_polarization_buys_is_shown_with_its_interval_and_marks() -> None:
+    table = {"r": (33.0, 6.0), FREE: (31.0, 9.0), LOOSE: (32.0, 14.0)}
+    section = control_section(
+        results([run("x", name, 0, psnr=p, normal_mae_deg=n) for name, (p, n) in table.items()])
+    )
+    assert rows(section) == {("x", "none, 1 seed"): ["*+1.00 b", "*−3.0 a"]}  # noqa: RUF001
+    assert section.headings == ["PSNR (dB) ↑", "normal error (deg) ↓"]
+    assert any(FREE in note and LOOSE in note for note in section.notes)
+    runs = [run(s, n, 0, psnr=v) for s, a, b in ("xab", "ycd", "zef") for n, v in (("r", 31.0), (FREE, 30.8))]
+    runs[0]["views"] = {f"v{k}": {"psnr": 31.0 + k} for k in range(4)}
+    runs[1]["views"] = {f"v{k}": {"psnr": 30.8 + k} for k in range(4)}
+    found = results(runs)
+    interval = "≈ +0.20 [+0.20, +0.20]"
+    assert rows(control_section(found)) == {
+        ("x", "4 views of 1 seed"): [interval],
+        ("y", "none, 1 seed"): ["≈ +0.20"],
+        ("z", "none, 1 seed"): ["≈ +0.20"],
+        ("over scenes", "3 scenes"): ["*+0.20 [+0.20, +0.20]"],
+    }
+    assert "| over scenes | 3 scenes | **+0.20** \\[+0.20, +0.20\\] |" in text(found)
+
+
+def test_rows_without_runs_to_pair_say_so() -> None:
+    runs = [run("x", "r", 0, psnr=33.0), unfinished("x", FREE, 0, "disk full"), run("x", LOOSE, 0, psnr=31.0)]
+    runs += [run("y", "r", 0, psnr=33.0), unfinished("y", FREE, 0), unfinished("y", LOOSE, 0)]
+    runs += [run("y", LOOSE, 1, psnr=20.0)]  # of another seed
+    found = results(runs)
+    section = control_section(found)
+    assert [labels[0] for labels in rows(section)] == [
+        "x", "y (no runs to pair)", "over scenes (no runs to pair)",
+    ]  # fmt: skip
+    assert f"x, r: chosen without {FREE}, for want of runs to pair." in section.notes
+    for label in (f"`{FREE}` (failed)", f"`{FREE}` (missing)", f"`{LOOSE}` (1 of 2 seeds)"):
+        assert label in text(found)
+    assert f"`{LOOSE}` (2 of 3 runs)" in text(found)
+
+
+def test_differences_to_a_recipe_that_was_asked_for() -> None:
+    table = {"3dgs": 30.0, "s": 29.5, "t": 30.2}
+    found = results([run("x", name, 0, psnr=value) for name, value in table.items()], against="3dgs")
+    assert rows(against_section(found)) == {
+        ("s", "none, 1 seed"): ["−0.50"],  # noqa: RUF001 - worse, and not noise
+        ("t", "none, 1 seed"): ["≈ +0.20"],
+    }
+    assert [section.key for section in sections(found)] == ["scores", "against"]
+
+
+def test_a_row_for_every_object_and_a_column_for_every_recipe() -> None:
+    runs = [
+        seen("x", "3dgs", 0, ball=ball(psnr=30.0, metal_share=0.815), vase=part("plastic", psnr=25.0)),
+        seen("x", "r", 0, ball=ball(psnr=29.0, specular_psnr=20.0), vase=part("plastic", psnr=26.0)),
+        seen("y", "3dgs", 0, ball=ball(psnr=10.0)),
+        unfinished("y", "r", 0),
+    ]
+    found = results(runs)
+    section = part_section(found, "object")
+    assert section.headings == ["3dgs", "r"]
+    assert [title for title, _ in section.blocks] == [
+        "PSNR (dB) ↑", "specular PSNR (dB) ↑", "taken for metal (%)",
+    ]  # fmt: skip
+    assert rows(section) == {
+        ("x", "ball", "metal"): ["*30.00", "29.00"],
+        ("x", "vase", "plastic"): ["25.00", "*26.00"],
+        ("y", "ball", "metal"): ["10.00", ""],
+    }
+    assert rows(section, 1) == {("x", "ball", "metal"): ["", "20.00"]}
+    assert rows(section, 2) == {("x", "ball", "metal"): ["81.5", ""]}
+    # Of r, the metal of one scene is missing: its mean would be one of other scenes.
+    assert rows(part_section(found, "material")) == {
+        ("metal", "x, y"): ["20.00", ""],
+        ("plastic", "x"): ["25.00", "*26.00"],
+    }
+    assert part_section(results([run("x", "r", 0, psnr=30.0)]), "object").blocks == []
+
+
+def test_what_polarization_buys_by_object_is_paired_by_seed() -> None:
+    gain = {0: 1.0, 1: 1.2, 2: 0.9}
+    runs = [seen("x", "r", s, ball=ball(psnr=30.0 + 5 * s + g, ssim=0.9)) for s, g in gain.items()]
+    runs += [seen("x", FREE, s, ball=ball(psnr=30.0 + 5 * s, ssim=0.9)) for s in gain]
+    section = part_section(results(runs), "object")
+    assert rows(section) == {("x", "ball", "metal"): ["*36.03", "35.00", "*+1.03"]}
+    # Equal in every seed: a difference of 0 for sure.
+    assert rows(section, 1) == {("x", "ball", "metal"): ["*0.900", "*0.900", "≈ +0.000"]}
+    one = results([seen("x", "r", 0, ball=ball(psnr=33.0)), seen("x", FREE, 0, ball=ball(psnr=30.0))])
+    assert rows(part_section(one, "object")) == {("x", "ball", "metal"): ["*33.00", "30.00", "+3.00?"]}
+
+
+def test_frames_are_the_csv_files(tmp_path: Path) -> None:
+    runs = [seen("x, y", "r", s, ball=ball(psnr=30.123456789 + s), rock=part(None, psnr=1.0)) for s in (0, 1)]
+    found = results([*runs, *(run("x, y", FREE, s, psnr=28.0) for s in (0, 1)), run("z", "r", 0, psnr=1.0)])
+    write_tables(tmp_path, found)
+    scores = pd.read_csv(tmp_path / "results.csv")
+    pd.testing.assert_frame_equal(scores, found.scores, check_dtype=False)
+    assert scores.columns.tolist() == [
+        "scene", "recipe", "runs", *(f"{c.key}{end}" for c in COLUMNS for end in ("", "_spread")),
+    ]  # fmt: skip
+    differences = pd.read_csv(tmp_path / "differences.csv")
+    assert differences["mean"].tolist() == found.differences["mean"].tolist()
+    parts = pd.read_csv(tmp_path / "parts.csv").set_index("name")
+    assert parts.loc["ball", ["part", "material", "runs", "psnr"]].tolist() == [
+        "object",
+        "metal",
+        2,
+        30.623456789,
+    ]
+    # What an earlier comparison in the folder had, and this one has not, goes.
+    write_tables(tmp_path, results([run("z", "r", 0, psnr=1.0)]))
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".csv", ".json", ".md", ".tex"]
+
+
 def test_markdown() -> None:
-    runs = [run("cup", "a", s, psnr=30.0 + s) for s in (0, 1)]
-    runs += [run("cup", "b", s, psnr=29.0, normal_within_11=0.125) for s in (0, 1)]
-    text = markdown(results(runs))
-    assert "| recipe | PSNR (dB) ↑ | normals within 11.25 deg (%) ↑ |" in text
-    assert "| `a` | **30.50** ± 0.71 | n/a |" in text
-    assert "| `b` | 29.00 ± 0.00 | 12.5 ± 0.0 |" in text
-    assert "LPIPS n/a: no weights." in text
-    assert "mesh F-score" not in text
-    assert "SSIM" not in text, "a column without values"
-    assert "over 2 seeds" in text
-
-
-def test_scene_and_error_text_cannot_break_markdown() -> None:
-    runs = [run("a|b*", "r", 0, psnr=1.0), unfinished("a|b*", "s", 0, "no <b>\nfile_")]
-    text = markdown(results(runs))
-    assert "## a|b\\*" in text
-    assert "no \\<b\\> file\\_" in text
-
-
-def test_csv_has_every_column_in_full_precision() -> None:
-    runs = [run("x, y", "a", 0, psnr=30.123456789), run("z", "a", 0, psnr=1.0)]
-    rows = list(csv.DictReader(io.StringIO(csv_text(results(runs)))))
-    assert list(rows[0]) == ["scene", "recipe", "runs", *(f"{k}{e}" for k in BY_KEY for e in ("", "_spread"))]
-    assert (rows[0]["scene"], rows[0]["psnr"], rows[0]["ssim"]) == ("x, y", "30.123456789", "")
-    assert [row["scene"] for row in rows] == ["x, y", "z", ""]
+    runs = [run("a|b*", "a", s, psnr=30.0 + s) for s in (0, 1)]
+    runs += [run("a|b*", "b", s, psnr=29.0, normal_within_11=0.125) for s in (0, 1)]
+    made = text(results([*runs, unfinished("a|b*", "s", 0, "no <b>\nfile_")]))
+    assert made.startswith(
+        "# Comparison\n\n## a|b\\*\n\n| recipe | PSNR (dB) ↑ | normals within 11.25 deg (%) ↑ |\n|---|---:|---:|\n"
+    )
+    assert (
+        "| `a` (2 seeds) | **30.50** ± 0.71 | n/a |\n| `b` (2 seeds) | 29.00 ± 0.00 | 12.5 ± 0.0 |\n" in made
+    )
+    assert "no \\<b\\> file\\_" in made
+    assert "SSIM" not in made, "a column without values"
+    objects = text(results([seen("x", "r", 0, **{"a|b": ball(psnr=1.0)})]))
+    assert "## By object\n\n### PSNR (dB) ↑\n" in objects
+    assert "| x | a\\|b | metal | 1.00 |" in objects
 
 
 def test_latex() -> None:
     runs = [run("my_cup", "a", s, psnr=30.0 + s) for s in (0, 1)] + [run("my_cup", "b&c", 0, psnr=29.0)]
-    text = latex(results(runs))
-    assert "\\emph{my\\_cup}" in text
-    assert "a (2 seeds) & \\textbf{30.50} $\\pm$ 0.71 \\\\" in text
-    assert "b\\&c (1 seed) & 29.00 \\\\" in text
-    assert "PSNR (dB) $\\uparrow$" in text
-    for word in ("\\toprule", "\\midrule", "\\bottomrule", "\\begin{tabular}{lr}", "\\end{tabular}"):
-        assert word in text
-
-
-def test_latex_special_characters_are_escaped() -> None:
+    made = text(results([*runs, unfinished("my_cup", "d", 0, "first\nsecond")]), "results.tex")
+    for line in (
+        "\\begin{tabular}{lr}\n\\toprule\nrecipe & PSNR (dB) $\\uparrow$ \\\\\n\\midrule\n",
+        "\\multicolumn{2}{l}{\\emph{my\\_cup}} \\\\\na (2 seeds) & \\textbf{30.50} $\\pm$ 0.71 \\\\\n",
+        "b\\&c (1 seed) & 29.00 \\\\\n",
+        "\\bottomrule\n\\end{tabular}\n",
+    ):
+        assert line in made
+    assert all(line.startswith("%") for line in made.split("\\end{tabular}\n")[1].splitlines())
     assert latex_text("50% of $x_1 & {y} #2 ~^\\") == (
         r"50\% of \$x\_1 \& \{y\} \#2 \textasciitilde{}\textasciicircum{}\textbackslash{}"
     )
+    section = text(results([run("x", "r", 0, psnr=33.125), run("x", FREE, 0, psnr=32.0)]), "results.tex")
+    assert "% What polarization buys\n\\begin{tabular}{llr}" in section
+    assert "x & none, 1 seed & \\textbf{+1.12} \\\\" in section
 
 
-def test_a_comment_of_latex_stays_one() -> None:
-    runs = [run("x", "a", 0, psnr=1.0), unfinished("x", "b", 0, "first\nsecond")]
-    after = latex(results(runs)).split("\\end{tabular}\n")[1]
-    assert all(line.startswith("%") for line in after.splitlines())
-
-
-def test_notes_name_what_failed() -> None:
-    said = notes(
-        results([run("x", "a", 0, lpips=0.1), unfinished("x", "b", 0, "disk full"), unfinished("x", "c", 0)])
-    )
-    assert "x, b, seed 0 failed: disk full" in said
-    assert "x, c, seed 0 has not finished" in said
-    assert not any("LPIPS" in note for note in said)
-
-
-def test_notes_name_the_scene_whose_truth_is_not_complete() -> None:
-    record = results([run("x", "a", 0, psnr=30.0), run("y", "a", 0, psnr=30.0)])
-    record["scenes"][1]["warnings"] = ["The ground truth gives normals of 1 of 2 test views."]
-    assert "y: The ground truth gives normals of 1 of 2 test views." in notes(record)
-    assert not any(note.startswith("x:") for note in notes(record))
-    assert "normals of 1 of 2" in markdown(record)
-
-
-@pytest.mark.parametrize("write", [markdown, latex, csv_text])
-def test_terminals_obey_no_name_in_a_file(write: Callable[[Results], str]) -> None:
-    text = write(results([run("s\x1b[2J", "a\x1b]0;mine\x07", 0, psnr=30.0)]))
-    assert all(sign.isprintable() or sign == "\n" for sign in text)
-    assert "x1b" in text
-
-
-def test_names_are_no_formulas_in_a_spreadsheet() -> None:
-    rows = list(
-        csv.DictReader(
-            io.StringIO(csv_text(results([run(name, "a", 0, psnr=30.0) for name in ("=1+1", "@x", "cup")])))
-        )
-    )
-    assert {row["scene"] for row in rows} >= {"'=1+1", "'@x", "cup"}
-
-
-def test_why_a_mesh_has_no_score_is_said_once() -> None:
-    runs = [run("x", name, 0) | {"mesh_reason": "skimage is not installed"} for name in "ab"]
-    said = notes(results(runs))  # type: ignore[arg-type]
-    assert said.count("mesh F-score 1 % n/a: skimage is not installed.") == 1
+def test_terminals_and_spreadsheets_obey_no_name_in_a_file() -> None:
+    found = results([run("s\x1b[2J", "a\x1b]0;mine\x07", 0, psnr=30.0)])
+    for made in (text(found), text(found, "results.tex"), csv_text(found.scores)):
+        assert all(sign.isprintable() or sign == "\n" for sign in made)
+        assert "x1b" in made
+    formulas = results([run(name, "a", 0, psnr=30.0) for name in ("=1+1", "@x", "cup")])
+    assert pd.read_csv(io.StringIO(csv_text(formulas.scores)))["scene"].tolist()[:3] == [
+        "'=1+1",
+        "'@x",
+        "cup",
+    ]

@@ -11,11 +11,12 @@ from typing import Any
 
 import pytest
 import torch
+from heard import Heard
 
 from polarguide.capture import Scene
 from polarguide.evaluation.evaluate import evaluate
 from polarguide.experiments import compare as comparing
-from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
+from polarguide.experiments.compare import BESIDE_OTHERS, collect
 from polarguide.experiments.jobs import Job
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import (
@@ -26,9 +27,10 @@ from polarguide.experiments.plan import (
     plan_runs,
     scene_entries,
 )
+from polarguide.experiments.record import PartScores
 from polarguide.experiments.worker import Scoring, Training
+from polarguide.experiments.writing import write_tables
 from polarguide.options import ComputeOptions, SceneOptions
-from polarguide.progress import Reporter
 from polarguide.recipes import recipe_named
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
@@ -92,34 +94,30 @@ def test_seconds_count_only_alone(planned: Planned, trained: Path) -> None:
     question, scenes, only = planned
     shutil.copytree(trained, only.folder)
     score(only.folder, train_seconds=12.5, fps=60.0)
-    (record,) = collect(question, scenes, [only], {})["runs"]
-    assert (record["state"], record["metrics"]["train_seconds"], record["metrics"]["fps"]) == (
-        "done",
-        12.5,
-        60.0,
-    )
+    names = ["state", "train_seconds", "fps"]
+    runs = collect(question, scenes, [only], {}).runs
+    assert runs[names].iloc[0].tolist() == ["done", 12.5, 60.0]
     (only.folder / BESIDE_OTHERS).touch()
-    (record,) = collect(question, scenes, [only], {only.folder: "an old error"})["runs"]
-    assert (record["metrics"]["train_seconds"], record["metrics"]["fps"]) == (None, 60.0)
-    assert record["error"] is None
+    (run,) = collect(question, scenes, [only], {only.folder: "an old error"}).record.runs
+    assert run.metrics is not None
+    assert (run.metrics["train_seconds"], run.metrics["fps"], run.error) == (None, 60.0, None)
 
 
 def test_objects_materials_and_black_pixels_are_collected(planned: Planned, trained: Path) -> None:
     question, scenes, only = planned
     shutil.copytree(trained, only.folder)
     score(only.folder, objects={}, materials={})
-    record = collect(question, scenes, [only], {})
-    assert (record["runs"][0]["objects"], record["runs"][0]["materials"]) == ({}, {})
-    assert record["scenes"][0]["black_share"] < 0.01
+    record = collect(question, scenes, [only], {}).record
+    assert (record.runs[0].objects, record.runs[0].materials) == ({}, {})
+    assert (record.scenes[0].black_share or 0.0) < 0.01
     values = {
         "psnr": 20.0, "normal_mae_deg": None, "specular_psnr": None, "diffuse_psnr": 30.0, "stokes_error": 0.5,
     }  # fmt: skip
     scores = {"pixels": 7, "views": 1, **values}
     score(only.folder, objects={"ball": {"material": "metal", **scores}}, materials={"metal": scores})
-    (run,) = collect(question, scenes, [only], {})["runs"]
-    expected = {"pixels": 7, "views": 1, "metrics": values}
-    assert run["objects"] == {"ball": {"material": "metal", **expected}}
-    assert run["materials"] == {"metal": {"material": None, **expected}}
+    (run,) = collect(question, scenes, [only], {}).record.runs
+    assert run.objects == {"ball": PartScores("metal", 7, 1, values)}
+    assert run.materials == {"metal": PartScores(None, 7, 1, values)}
     # What an earlier comparison in the folder had, and this one has not, goes.
     (question.out / "differences.csv").touch()
     write_tables(question.out, collect(question, scenes, [only], {}))
@@ -143,16 +141,6 @@ def test_black_pixels_are_counted(tiny_scene: Scene) -> None:
     assert black_share(dataclasses.replace(view, pictures=codes)) == 0
 
 
-class Warnings(Reporter):
-    """Collects warnings."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def warn(self, text: str) -> None:
-        self.said.append(text)
-
-
 def test_speed_times_what_was_not_timed(
     planned: Planned, trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -166,11 +154,11 @@ def test_speed_times_what_was_not_timed(
 
     monkeypatch.setattr(comparing, "run_jobs", instead)
     score(only.folder, fps=60.0)
-    reporter = Warnings()
+    reporter = Heard()
     comparing._time(question, [only], reporter)
     assert asked == []
     score(only.folder)
     comparing._time(question, [only], reporter)
     scoring = Scoring(folder=str(only.folder), speed=True, compute=ComputeOptions(1, "cpu"))
     assert [job.tasks for job in asked] == [(scoring,)]
-    assert [text[:19] for text in reporter.said] == ["no speed for 1 runs"]
+    assert [text.partition(":")[0] for text in reporter.said][-1:] == ["no speed for 1 runs"]

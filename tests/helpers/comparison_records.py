@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from polarguide.evaluation.table import COLUMNS
-from polarguide.experiments.aggregate import aggregate
-from polarguide.experiments.results import FORMAT, Results, differences_of, validate_results
+from polarguide.experiments.record import FORMAT, Record
+from polarguide.experiments.results import Results
+from polarguide.records import decode
 
 
 def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:
@@ -38,50 +39,34 @@ def unfinished(scene: str, recipe: str, seed: int, error: str | None = None) -> 
     return run(scene, recipe, seed) | blank | {"state": "failed" if error else "missing", "error": error}
 
 
-def results(
+def content(
     runs: list[dict[str, Any]],
     against: str | None = None,
     black: tuple[str, ...] = (),
     **provenance: Any,
 ) -> dict[str, Any]:
-    """A record of these runs; ``black`` are the scenes on black."""
+    """The record of these runs as JSON; ``black`` are the scenes on black."""
     scenes, recipes = (list(dict.fromkeys(r[key] for r in runs)) for key in ("scene", "recipe"))
-    record = Results(
-        format=FORMAT,
-        provenance={
-            "version": "1",
-            "commit": None,
-            "sources": "abc",
-            "command": "polarguide compare",
-            "date": "2026-01-01",
-            **provenance,
-        },
-        settings={
-            "steps": 10,
-            "seeds": len({r["seed"] for r in runs}),
-            "downscale": 1,
-            "transfer": "linear",
-            "refractive_index": 1.5,
-            "threads": 1,
-            "jobs": 1,
-            "against": against,
-            "background": "auto",
-            "materials": "auto",
-        },
-        scenes=[
-            {
-                "name": name,
-                "digest": "d" * 64,
-                "views": 3,
-                "test_views": ["v0"],
-                "black_share": 0.6 if name in black else 0.0,
-            }
-            for name in scenes
-        ],
-        recipes=[{"name": name, "about": f"about {name}", "data": {}} for name in recipes],
-        runs=runs,
-        table=aggregate(runs, scenes, recipes),
-        differences=[],
-    )
-    record["differences"] = differences_of(record)
-    return validate_results(record)
+    made = {
+        "version": "1",
+        "commit": None,
+        "sources": "abc",
+        "command": "polarguide compare",
+        "date": "2026-01-01",
+    }
+    settings = {"steps": 10, "seeds": len({r["seed"] for r in runs}), "downscale": 1, "transfer": "linear"}
+    settings |= {"refractive_index": 1.5, "threads": 1, "jobs": 1, "against": against}
+    scene = {"digest": "d" * 64, "views": 3, "test_views": ["v0"]}
+    return {
+        "format": FORMAT,
+        "provenance": {**made, **provenance},
+        "settings": {**settings, "background": "auto", "materials": "auto"},
+        "scenes": [{"name": name, **scene, "black_share": 0.6 if name in black else 0.0} for name in scenes],
+        "recipes": [{"name": name, "about": f"about {name}", "data": {}} for name in recipes],
+        "runs": runs,
+    }
+
+
+def results(runs: list[dict[str, Any]], **more: Any) -> Results:
+    """A comparison of these runs; further arguments as for ``content``."""
+    return Results(decode(content(runs, **more), Record, "results.json"))

@@ -59,7 +59,7 @@ def folder_cases() -> Iterator[Case]:
     def bench(spoiler: Change) -> Change:
         def change(folder: Path) -> None:
             from polarguide.experiments.bench import SCENES
-            from polarguide.experiments.bench_options import BENCH, BenchOptions
+            from polarguide.experiments.options import BENCH, BenchOptions
             from polarguide.synth.folder import scene_request
             from polarguide.synth.settings import Overrides, find_scene
 

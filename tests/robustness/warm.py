@@ -24,7 +24,7 @@ IMPORTED = (
     "trimesh",
     "typeguard",
     "polarguide.api",
-    "polarguide.experiments.study",
+    "polarguide.experiments.compare",
     "polarguide.preparation.prepare",
 )
 

@@ -21,7 +21,7 @@ EXCEPT = {
     ("inspection/settings.py", "default of steps"): "of the short training that inspects",
     ("neural/recipe.py", "default of steps"): "the recipe's own number, which ``resolve`` takes",
     ("neural/recipe.py", "default of background"): "samples of a ray",
-    ("experiments/results.py", "refractive_index compared with 0"): "records of the first versions",
+    ("experiments/record.py", "refractive_index compared with 0"): "records of the first versions",
 }
 
 

@@ -11,7 +11,6 @@ import pytest
 import polarguide
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
-from polarguide.experiments.results import read_results
 from polarguide.options import SceneOptions
 from polarguide.progress import Reporter
 from polarguide.recipes import recipe_named
@@ -80,14 +79,9 @@ def test_without_settings_it_is_that_of_the_scene(water: Path, tmp_path: Path) -
 def test_a_comparison_takes_it_too(water: Path, tmp_path: Path) -> None:
     options = CompareOptions(downscale=4, device="cpu", report_views=0)
     results = polarguide.compare([water], ["3dgs"], tmp_path, settings=TrainSettings(2), options=options)
-    (run,) = results["runs"]
-    assert index_of(tmp_path / run["folder"]) == 1.33
-    assert results["settings"]["refractive_index"] is None
-    assert results["scenes"][0]["refractive_index"] == 1.33
-    # Records of earlier versions have 0 in place of null.
-    file = tmp_path / "results.json"
-    file.write_text(json.dumps({**results, "settings": {**results["settings"], "refractive_index": 0.0}}))
-    assert read_results(file) == results
+    assert index_of(tmp_path / results.runs["folder"][0]) == 1.33
+    assert results.record.settings.refractive_index is None
+    assert results.record.scenes[0].refractive_index == 1.33
 
 
 def test_one_that_is_asked_for_overrides_the_scene(water: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from toy_shading import TOY, SkyShading
 import polarguide
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.sources import model_digest
-from polarguide.experiments.ablate import ablated
+from polarguide.experiments.compare import ablated
 from polarguide.shading.deferred import DeferredShading
 
 

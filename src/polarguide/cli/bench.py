@@ -11,7 +11,7 @@ import tyro
 from polarguide.cli.compare import print_results
 from polarguide.cli.console import say, use_threads
 from polarguide.cli.job_progress import JobReporter
-from polarguide.experiments.bench_options import BenchOptions
+from polarguide.experiments.options import BenchOptions
 from polarguide.system import signals_as_interrupts
 
 

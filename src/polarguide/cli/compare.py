@@ -103,12 +103,12 @@ def print_results(results: Results, out: Path) -> None:
         PolarguideError: runs have failed.
     """
     say(f"tables: {out}/results.md, .csv, .tex, .json   report: {out}/report.html")
-    failed = [run for run in results["runs"] if run["state"] == "failed"]
+    failed = [run for run in results.record.runs if run.state == "failed"]
     if failed:
-        errors = ", ".join(f"{r['scene']}, {r['recipe']}, seed {r['seed']}: {r['error']}" for r in failed)
+        errors = ", ".join(f"{run.scene}, {run.recipe}, seed {run.seed}: {run.error}" for run in failed)
         raise PolarguideError(
             out,
-            expected=f"{len(results['runs'])} finished runs",
+            expected=f"{len(results.record.runs)} finished runs",
             found=f"that {len(failed)} failed ({errors})",
             remedy="What there is has been written. Remove the cause and give the same command again.",
         )

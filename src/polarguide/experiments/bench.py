@@ -9,8 +9,8 @@ from pathlib import Path
 from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.mesh import missing_package
-from polarguide.experiments.bench_options import BENCH, Bench, BenchOptions
 from polarguide.experiments.compare import compare, locked
+from polarguide.experiments.options import BENCH, Bench, BenchOptions
 from polarguide.experiments.results import Results
 from polarguide.files import make_folder
 from polarguide.options import PathLike
@@ -45,7 +45,7 @@ def run_bench(
         reporter: receives messages and progress, and the SHA-256 of every scene.
 
     Returns:
-        The record of the comparison, or None if nothing was to be trained.
+        The results of the comparison, or None if nothing was to be trained.
 
     Raises:
         PolarguideError: a scene of ``out`` is of other settings or another version of its preset, or a file of it has

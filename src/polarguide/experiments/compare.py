@@ -1,33 +1,44 @@
-"""Train and score several recipes on several scenes, and set tables and a report of them."""
+"""Train and score several recipes on several scenes, or a recipe and its ablations, and write what they score."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime, timezone
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
+from polarguide import __version__
 from polarguide.capture.layout import refuse_scene
+from polarguide.capture.variants import count_of
 from polarguide.errors import PolarguideError
-from polarguide.experiments.collect import BESIDE_OTHERS, collect, write_tables
-from polarguide.experiments.exposure_figure import write_exposure_figure
+from polarguide.evaluation.sources import commit, scoring_digest
+from polarguide.evaluation.table import COLUMNS, PART_METRICS
+from polarguide.experiments.charts import exposure_svg, read_study, study_svg
 from polarguide.experiments.jobs import STDERR, Job, run_jobs
 from polarguide.experiments.options import MOST_SEEDS, CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
+from polarguide.experiments.record import FORMAT, REMEDY, Record
 from polarguide.experiments.report import write_report
 from polarguide.experiments.results import Results
-from polarguide.experiments.study import write_study
 from polarguide.experiments.worker import Scoring, Task, Training
+from polarguide.experiments.writing import write_tables
 from polarguide.files import check_out, make_folder, require_inside, write_text
-from polarguide.options import ComputeOptions, PathLike, check_choice, check_count
+from polarguide.options import MOST, ComputeOptions, PathLike, check_choice, check_count
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
+from polarguide.recipes.registry import ABLATIONS, ablations_of
+from polarguide.records import decode
 from polarguide.system import only_writer
 from polarguide.training.recipe import Method
 from polarguide.training.settings import TrainSettings
 
 LOCK = ".lock"
+BESIDE_OTHERS = "beside_others.txt"
+"""Marks a run folder whose training shared the machine, so that its seconds do not count."""
 
 
 def compare(
@@ -63,7 +74,7 @@ def compare(
         reporter: receives messages and progress.
 
     Returns:
-        The record as written. A run that failed is in it, with its error; the others are not affected.
+        What was written, as data frames. A run that failed is in ``runs``, with its error; the others are not affected.
 
     Raises:
         PolarguideError: wrong input, or another comparison at work in ``out``.
@@ -78,12 +89,11 @@ def compare(
         steps_of=dict(steps_of),
         asked=asked,
     )
-    for name, count in seeds_of.items():
-        check_choice("seeds_of", name, [recipe.name for recipe in comparison.recipes])
-        check_count("seeds_of", count, 1, MOST_SEEDS)
-    for name, count in steps_of.items():
-        check_choice("steps", name, [recipe.name for recipe in comparison.recipes])
-        check_count("steps", count)
+    names = [recipe.name for recipe in comparison.recipes]
+    for word, of, most in (("seeds_of", seeds_of, MOST_SEEDS), ("steps", steps_of, MOST)):
+        for name, count in of.items():
+            check_choice(word, name, names)
+            check_count(word, count, 1, most)
     if not scenes:
         raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
     check_out(comparison.out)
@@ -102,9 +112,58 @@ def compare(
         results = collect(comparison, entries, plan, failures)
         write_tables(comparison.out, results)
         write_report(comparison, entries, plan, results, reporter)
-        write_study(comparison.out, results, {entry.name: entry.path for entry in entries})
-        write_exposure_figure(comparison, results)
+        _write_charts(comparison, entries, results)
     return results
+
+
+def ablate(
+    scenes: Sequence[PathLike],
+    base: str,
+    out: PathLike,
+    *,
+    only: Sequence[str] = (),
+    reference: Sequence[str | Method] = (),
+    settings: TrainSettings = TrainSettings(),
+    options: CompareOptions = CompareOptions(),
+    reporter: Reporter = SILENT,
+) -> Results:
+    """``compare`` with a recipe and its ablations; it shares runs with a comparison in the same folder.
+
+    Differences are to the recipe, unless ``options.against`` names another.
+
+    Args:
+        scenes, out, settings, options, reporter: as for ``compare``.
+        base: name of the recipe whose ablations to train.
+        only: names of the ablations to take, such as without-normals; all if empty.
+        reference: recipes to add as first rows.
+
+    Raises:
+        PolarguideError: as ``compare``; or a recipe without ablations, or an ablation that it does not have.
+    """
+    recipes = [*reference, *ablated(base, only)]
+    options = replace(options, against=options.against or base)
+    return compare(scenes, recipes, out, settings=settings, options=options, reporter=reporter)
+
+
+def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
+    """The names of a recipe and of its ablations, or of those of them that are in ``only``.
+
+    Args:
+        base: a recipe.
+        only: ablations with or without ``base:`` before the name; all if empty.
+
+    Raises:
+        PolarguideError: a recipe without ablations, or an ablation that it does not have.
+    """
+    names = [recipe.name.removeprefix(f"{base}:") for recipe in ablations_of(base)]
+    if not names:
+        expected = "a recipe with ablations: " + ", ".join(ABLATIONS)
+        remedy = "Take one of these, or use compare."
+        raise PolarguideError("base", expected=expected, found=base, remedy=remedy)
+    wanted = [name.removeprefix(f"{base}:") for name in only]
+    for name in wanted:
+        check_choice("only", name, names)
+    return (base, *(f"{base}:{name}" for name in names if name in wanted or not only))
 
 
 def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
@@ -119,14 +178,12 @@ def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
                 remedy="Give it a name of its own, and register it under the entry points polarguide.recipes.",
             )
     if not found:
-        raise PolarguideError(
-            "compare", expected="a recipe", found="none", remedy="Name at least one recipe."
-        )
+        remedy = "Name at least one recipe."
+        raise PolarguideError("compare", expected="a recipe", found="none", remedy=remedy)
     names = [recipe.name for recipe in found]
     if len(set(names)) < len(names):
-        raise PolarguideError(
-            "recipes", expected="every name once", found=" ".join(names), remedy="Name each once."
-        )
+        remedy = "Name each once."
+        raise PolarguideError("recipes", expected="every name once", found=" ".join(names), remedy=remedy)
     return found
 
 
@@ -209,3 +266,106 @@ def locked(folder: Path) -> Iterator[None]:
         found="another comparison at work in it",
     ):
         yield
+
+
+def collect(
+    comparison: Comparison,
+    scenes: Sequence[SceneEntry],
+    plan: Sequence[PlannedRun],
+    failures: Mapping[Path, str],
+) -> Results:
+    """The results of a comparison as far as its runs are.
+
+    Args:
+        comparison, scenes, plan: what was asked for.
+        failures: last words of runs that failed, by their folders.
+    """
+    options, settings = comparison.options, comparison.settings
+    content = {
+        "format": FORMAT,
+        "provenance": {
+            "version": __version__,
+            "commit": commit(),
+            "sources": scoring_digest(),
+            "command": comparison.command,
+            "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        },
+        "settings": {
+            "steps": comparison.steps,
+            "seeds": options.seeds,
+            "downscale": options.downscale,
+            "transfer": options.transfer,
+            "refractive_index": settings.refractive_index,
+            "threads": options.threads,
+            "jobs": options.parallel,
+            "against": options.against,
+            "background": settings.background,
+            "materials": settings.materials,
+        },
+        "scenes": [_scene_record(scene, comparison) for scene in scenes],
+        "recipes": [
+            {"name": row.name, "about": row.about, "data": row.recipe.data()}
+            | ({} if row.steps is None else {"steps": row.steps})
+            for row in comparison.rows
+        ],
+        "runs": [_run_record(comparison, run, failures.get(run.folder)) for run in plan],
+    }
+    return Results(decode(content, Record, "results.json", remedy=REMEDY))
+
+
+def _scene_record(scene: SceneEntry, comparison: Comparison) -> dict[str, Any]:
+    record: dict[str, Any] = {key: getattr(scene, key) for key in ("name", "digest", "views", "black_share")}
+    record["test_views"] = list(scene.test_views)
+    if scene.warnings:
+        record["warnings"] = list(scene.warnings)
+    if comparison.settings.refractive_index is None:
+        record["refractive_index"] = comparison.index_of(scene)
+    return record
+
+
+def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) -> dict[str, Any]:
+    record: dict[str, Any] = {"scene": run.scene.name, "recipe": run.row.name, "seed": run.settings.seed}
+    record["folder"] = run.folder.relative_to(comparison.out).as_posix()
+    scores = run.metrics() if run.state() == "done" else None
+    if scores is None:
+        state = "missing" if failure is None else "failed"
+        record |= {"state": state, "error": failure, "metrics": None, "views": {}}
+        return {**record, "lpips_reason": None, "mesh_reason": None}
+    metrics = {metric.key: scores.get(metric.key) for metric in COLUMNS}
+    if (run.folder / BESIDE_OTHERS).exists():
+        metrics["train_seconds"] = None
+    parts = {
+        kind: {
+            name: {"material": part.get("material"), "pixels": part["pixels"], "views": part["views"]}
+            | {"metrics": {m.key: part[m.key] for m in PART_METRICS if m.key in part}}
+            for name, part in (scores.get(kind) or {}).items()
+        }
+        for kind in ("objects", "materials")
+    }
+    return {
+        **record,
+        "state": "done",
+        "error": None,
+        "metrics": metrics,
+        "lpips_reason": scores.get("lpips_reason"),
+        "mesh_reason": scores.get("mesh_fscore_1_reason"),
+        "views": {
+            name: {m.key: of[m.key] for m in COLUMNS if m.key in of} for name, of in scores["views"].items()
+        },
+        **parts,
+    }
+
+
+def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results: Results) -> None:
+    """Write ``study.svg`` of a family of scenes, and ``exposures.svg`` of several kinds of captures."""
+    drawn = {"study.svg": study_svg(results, {scene.name: read_study(scene.path) for scene in scenes})}
+    if len(comparison.options.exposures) > 1:
+        counts = {
+            (scene.name, row.name): count_of(row.exposures, scene.views - len(scene.test_views))
+            for scene in scenes
+            for row in comparison.rows
+        }
+        drawn["exposures.svg"] = exposure_svg(results, counts)
+    for name, text in drawn.items():
+        if text is not None:
+            write_text(comparison.out / name, text)

@@ -5,21 +5,23 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
-from polarguide.experiments.aggregate import RunRecord, aggregate
-from polarguide.experiments.collect import write_tables
-from polarguide.experiments.report import REPORT, report_html
-from polarguide.experiments.results import (
+from polarguide.experiments.record import (
     FORMAT,
-    Results,
+    Provenance,
+    RecipeRecord,
+    Record,
+    RunRecord,
     SceneRecord,
-    differences_of,
     read_results,
-    validate_results,
 )
+from polarguide.experiments.report import REPORT, report_html
+from polarguide.experiments.results import Results
+from polarguide.experiments.writing import write_tables
 from polarguide.files import make_folder, write_text
 from polarguide.options import PathLike, check_choice
 from polarguide.records import shortened
@@ -42,30 +44,23 @@ def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None
         out: folder to write.
         against: a recipe; tables have the difference of every other one to it.
 
-    Returns:
-        The record as written.
-
     Raises:
-        PolarguideError: a record that is none, or would be written over; records of other code, settings, scenes or
-            recipes than the first; a run that two of them have; an unknown ``against``.
+        PolarguideError: a file that is not a record, or would be written over; records of other code, settings, scenes
+            or recipes than the first; a run that two of them have; an unknown ``against``.
     """
     paths = [Path(part) / RECORD if Path(part).is_dir() else Path(part) for part in parts]
     if not paths:
-        raise PolarguideError(
-            "tables", expected="a record", found="none", remedy="Name at least one results.json."
-        )
-    if len(paths) > 1 and any(
-        os.path.realpath(path) == os.path.realpath(Path(out) / RECORD) for path in paths
-    ):
+        remedy = "Name at least one results.json."
+        raise PolarguideError("tables", expected="a record", found="none", remedy=remedy)
+    written = os.path.realpath(Path(out) / RECORD)
+    if len(paths) > 1 and written in map(os.path.realpath, paths):
         raise PolarguideError(
             out,
             expected="a folder of its own",
             found=f"that of a part, whose {RECORD} would be written over",
             remedy="Give another --out.",
         )
-    joined = join_results(
-        [read_results(path) for path in paths], [str(path) for path in paths], against=against
-    )
+    joined = Results(join_records({str(path): read_results(path) for path in paths}, against=against))
     refuse_scene(Path(out))
     make_folder(Path(out))
     write_tables(Path(out), joined)
@@ -74,75 +69,69 @@ def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None
     return joined
 
 
-def join_results(records: Sequence[Results], names: Sequence[str], *, against: str | None = None) -> Results:
+def join_records(records: dict[str, Record], *, against: str | None = None) -> Record:
     """One record of the runs of several.
 
     Args:
-        records: as ``read_results`` gives them.
-        names: what error messages call each of them.
+        records: at least one, by what error messages call it.
         against: as for ``join_tables``.
 
     Raises:
         PolarguideError: as ``join_tables``.
     """
-    first = records[0]
-    for record, name in zip(records[1:], names[1:], strict=True):
-        _check_same_code(first, record, names[0], name)
-        for key, value in first["settings"].items():
-            if key not in _FREE:
-                _check_same(value, record["settings"].get(key), f"{name} (settings.{key})", names[0])
+    (name_of_first, first), *_ = records.items()
     scenes: dict[str, SceneRecord] = {}
-    recipes: dict[str, Any] = {}
+    recipes: dict[str, RecipeRecord] = {}
     runs: dict[tuple[str, str, int], RunRecord] = {}
-    for record, name in zip(records, names, strict=True):
-        for scene in record["scenes"]:
-            known = scenes.setdefault(scene["name"], scene)
-            where = f"{name} (scene {scene['name']}"
-            _check_same(known["digest"], scene["digest"], f"{where}, digest)", "another record")
-            _check_same(known["test_views"], scene["test_views"], f"{where}, test_views)", "another record")
-        for recipe in record["recipes"]:
-            known_recipe = recipes.setdefault(recipe["name"], recipe)
-            _check_same(
-                known_recipe["data"], recipe["data"], f"{name} (recipe {recipe['name']})", "another record"
-            )
-        for run in record["runs"]:
-            place = (run["scene"], run["recipe"], run["seed"])
-            if place in runs and "missing" not in (run["state"], runs[place]["state"]):
+    for name, record in records.items():
+        _check_same_code(first.provenance, record.provenance, name_of_first, name)
+        for key in record.settings.__struct_fields__:
+            if key not in _FREE:
+                ours, theirs = (getattr(of.settings, key) for of in (first, record))
+                _check_same(ours, theirs, f"{name} (settings.{key})", name_of_first)
+        for scene in record.scenes:
+            same = scenes.setdefault(scene.name, scene)
+            for key in ("digest", "test_views"):
+                where = f"{name} (scene {scene.name}, {key})"
+                _check_same(getattr(same, key), getattr(scene, key), where, "another record")
+        for recipe in record.recipes:
+            values_of = recipes.setdefault(recipe.name, recipe).data
+            _check_same(values_of, recipe.data, f"{name} (recipe {recipe.name})", "another record")
+        for run in record.runs:
+            place = (run.scene, run.recipe, run.seed)
+            earlier = runs.setdefault(place, run)
+            if earlier is not run and "missing" not in (run.state, earlier.state):
                 raise PolarguideError(
                     name,
                     expected="runs that no other record has",
-                    found=f"{run['scene']}, {run['recipe']}, seed {run['seed']} once more",
+                    found=f"{run.scene}, {run.recipe}, seed {run.seed} once more",
                     remedy="Name every record once.",
                 )
-            if place not in runs or runs[place]["state"] == "missing":
+            if earlier.state == "missing":
                 runs[place] = run
     if against is not None:
         check_choice("against", against, list(recipes))
-    order = list(recipes)
-    every = [runs[p] for p in sorted(runs, key=lambda p: (list(scenes).index(p[0]), order.index(p[1]), p[2]))]
-    joined = Results(
+    order = {name: index for names in (scenes, recipes) for index, name in enumerate(names)}
+    settings = [record.settings for record in records.values()]
+    made = [record.provenance for record in records.values()]
+    return Record(
         format=FORMAT,
-        provenance={
-            "version": first["provenance"]["version"],
-            "commit": first["provenance"]["commit"],
-            "sources": _each(r["provenance"]["sources"] for r in records),
-            "command": _each(r["provenance"]["command"] for r in records),
-            "date": max(r["provenance"]["date"] for r in records),
-        },
-        settings={
-            **first["settings"],
-            "seeds": max(r["settings"]["seeds"] for r in records),
-            "jobs": max(r["settings"]["jobs"] for r in records),
-            "against": against,
-        },
+        provenance=msgspec.structs.replace(
+            first.provenance,
+            sources=_each(of.sources for of in made),
+            command=_each(of.command for of in made),
+            date=max(of.date for of in made),
+        ),
+        settings=msgspec.structs.replace(
+            first.settings,
+            seeds=max(of.seeds for of in settings),
+            jobs=max(of.jobs for of in settings),
+            against=against,
+        ),
         scenes=list(scenes.values()),
         recipes=list(recipes.values()),
-        runs=every,
-        table=aggregate(every, list(scenes), order),
-        differences=[],
+        runs=[runs[place] for place in sorted(runs, key=lambda p: (order[p[0]], order[p[1]], p[2]))],
     )
-    joined["differences"] = differences_of(joined)
-    return validate_results(joined)
 
 
 def _each(texts: Iterable[str]) -> str:
@@ -150,19 +139,13 @@ def _each(texts: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(texts))
 
 
-def _check_same_code(first: Results, other: Results, known: str, name: str) -> None:
+def _check_same_code(ours: Provenance, theirs: Provenance, known: str, name: str) -> None:
     """Of one version, and of one commit or with equal digests: compilers may make other bytes of the same sources."""
-    ours, theirs = first["provenance"], other["provenance"]
-    _check_same(ours["version"], theirs["version"], f"{name} (provenance.version)", known)
-    if ours["sources"] != theirs["sources"] and (
-        ours["commit"] is None or ours["commit"] != theirs["commit"]
-    ):
-        _check_same(
-            f"{ours['sources']}, commit {ours['commit']}",
-            f"{theirs['sources']}, commit {theirs['commit']}",
-            f"{name} (provenance.sources)",
-            known,
-        )
+    _check_same(ours.version, theirs.version, f"{name} (provenance.version)", known)
+    if ours.commit is None or ours.commit != theirs.commit:
+        (wanted, found) = (f"{of.sources}, commit {of.commit}" for of in (ours, theirs))
+        if ours.sources != theirs.sources:
+            _check_same(wanted, found, f"{name} (provenance.sources)", known)
 
 
 def _check_same(wanted: object, found: object, where: str, known: str) -> None:

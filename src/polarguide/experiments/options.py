@@ -1,9 +1,11 @@
-"""What a comparison is asked for, beside scenes, recipes and the settings of its trainings. Does not import torch."""
+"""What a comparison and a bench are asked for, and the bench as data. Does not import torch."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from polarguide.errors import PolarguideError
 from polarguide.options import (
@@ -15,6 +17,8 @@ from polarguide.options import (
     check_choice,
     check_count,
 )
+from polarguide.synth.settings import SynthSettings
+from polarguide.training.settings import TrainSettings
 
 MOST_SEEDS = 1000
 """Each is a run of its own for every recipe and scene."""
@@ -65,3 +69,106 @@ class CompareOptions(SceneOptions):
     def parallel(self) -> int:
         """How many runs work at a time."""
         return self.jobs or max(1, (os.cpu_count() or 1) // self.threads)
+
+
+Half = Literal["development", "held-back"]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A fixed set of rendered scenes and of rows to compare on them.
+
+    Attributes:
+        development: presets or scene files that methods are developed beside.
+        held_back: those that nobody tunes on.
+        synth, views: how each is rendered.
+        rows: names of recipes in the order of the tables, and how many seeds each is trained with.
+        training: of every run; the first seed, from which others count up.
+    """
+
+    development: tuple[str, ...]
+    held_back: tuple[str, ...]
+    synth: SynthSettings
+    views: int
+    rows: Mapping[str, int]
+    training: TrainSettings
+
+    def scenes(self, half: Half) -> tuple[str, ...]:
+        """The scenes of a half."""
+        return self.held_back if half == "held-back" else self.development
+
+
+BENCH = Bench(
+    development=("figure", "kit", "car", "water", "metals-a", "ceramic-a", "cup"),
+    held_back=("metals-b", "ceramic-b", "rough", "lacquer"),
+    synth=SynthSettings(size="192x144", samples=64, seed=0, points=5000, test_every=7),
+    views=56,
+    rows={
+        "3dgs": 1,
+        "3dgs-dr": 1,
+        "3dgs-dr:consistent": 1,
+        "ref-gs": 1,
+        "polarguide-paper": 1,
+        "polarguide-paper:kind": 1,
+        "polarguide": 1,
+        "polarguide:unpolarized": 1,
+        "polarguide:unpolarized-without-consistency": 1,
+        "polarguide-stokes": 3,
+        "polarguide-stokes:unpolarized": 3,
+        "polarguide-stokes:unpolarized-without-consistency": 3,
+    },
+    training=TrainSettings(steps=2500, seed=0, refractive_index=1.5),
+)
+"""Numbers of different benches are not comparable: a change here makes all published tables old."""
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Which part of the bench to run, and on what.
+
+    Attributes:
+        held_back: The held-back half in place of the development half: once, at the end of a change that claims
+            something. Nobody tunes on it.
+        render_only: Render the scenes and train nothing.
+        scenes: Some scenes of the half; all if none is given.
+        jobs: Runs at a time; 0 takes as many as there are cores for their threads.
+        threads: Threads of each run. Rendering takes those of all runs together.
+        device: What to compute on.
+    """
+
+    held_back: bool = False
+    render_only: bool = False
+    scenes: tuple[str, ...] = ()
+    jobs: int = 0
+    threads: int = 1
+    device: DeviceName = "auto"
+
+    def __post_init__(self) -> None:
+        self.comparing(1)
+
+    @property
+    def half(self) -> Half:
+        """The half that is asked for."""
+        return "held-back" if self.held_back else "development"
+
+    def comparing(self, seeds: int) -> CompareOptions:
+        """The options of the comparison."""
+        return CompareOptions(seeds=seeds, jobs=self.jobs, threads=self.threads, device=self.device)
+
+    def chosen(self, bench: Bench) -> tuple[str, ...]:
+        """The scenes that are asked for, in the order of the bench.
+
+        Raises:
+            PolarguideError: a scene of the other half, or none of the bench.
+        """
+        half = bench.scenes(self.half)
+        for name in self.scenes:
+            if name in bench.held_back and not self.held_back:
+                raise PolarguideError(
+                    "scenes",
+                    expected=f"scenes of the development half ({', '.join(half)})",
+                    found=f"{name}, which is held back",
+                    remedy="Nobody tunes on it; --held-back runs it at the end of a change that claims something.",
+                )
+            check_choice("scenes", name, half)
+        return tuple(name for name in half if name in self.scenes or not self.scenes)

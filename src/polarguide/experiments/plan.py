@@ -53,9 +53,8 @@ class TableRow:
     @property
     def about(self) -> str:
         """In one line."""
-        about = (
-            self.recipe.about if self.name == self.recipe.name else f"{self.recipe.name}, {self.exposures}"
-        )
+        plain = self.name == self.recipe.name
+        about = self.recipe.about if plain else f"{self.recipe.name}, {self.exposures}"
         return about if self.steps is None else f"{about.removesuffix('.')}; {self.steps:,} steps."
 
 
@@ -90,21 +89,17 @@ class Comparison:
     @property
     def rows(self) -> tuple[TableRow, ...]:
         """What the tables compare, in their order."""
-        words, recipes = self.options.exposures, self.recipes
-        if not words:
-            return tuple(
-                TableRow(r.name, r, self.settings.exposures, self.steps_of.get(r.name)) for r in recipes
-            )
-        return tuple(
-            TableRow(
-                word if len(recipes) == 1 else f"{recipe.name} {word}",
-                _for(recipe, word),
-                word,
-                self.steps_of.get(recipe.name),
-            )
-            for recipe in recipes
-            for word in words
-        )
+        rows = []
+        for recipe in self.recipes:
+            steps, unpolarized = self.steps_of.get(recipe.name), f"{recipe.name}:unpolarized"
+            if not self.options.exposures:
+                rows.append(TableRow(recipe.name, recipe, self.settings.exposures, steps))
+            for word in self.options.exposures:
+                name = word if len(self.recipes) == 1 else f"{recipe.name} {word}"
+                # Without any polarization in the pictures, the recipe without its terms, if there is one.
+                others = [r for r in ablations_of(recipe.name) if word == "none" and r.name == unpolarized]
+                rows.append(TableRow(name, next(iter(others), recipe), word, steps))
+        return tuple(rows)
 
     def seeds(self, recipe: Method) -> range:
         """The seeds of a recipe."""
@@ -118,20 +113,24 @@ class Comparison:
     @property
     def command(self) -> str:
         """A command line that asks for the same."""
-        if self.asked:
-            return self.asked
         settings, options = self.settings, self.options
-        words = ["polarguide", "compare", *map(str, self.scenes)]
-        words += ["--recipes", *(recipe.name for recipe in self.recipes)]
-        words += ["--steps", str(self.steps), *(f"{name}={n}" for name, n in self.steps_of.items())]
-        words += ["--seeds", str(options.seeds), "--out", str(self.out)]
-        words += ["--downscale", str(options.downscale), "--transfer", options.transfer]
-        index = settings.refractive_index
-        words += [] if index is None else ["--refractive-index", str(index)]
-        words += ["--background", settings.background, "--split", options.split]
-        words += [] if settings.materials == "auto" else ["--materials", settings.materials]
-        words += ["--exposures", *options.exposures] if options.exposures else []
-        return shlex.join(words)
+        given: dict[str, Sequence[object]] = {
+            "--recipes": [recipe.name for recipe in self.recipes],
+            "--steps": [self.steps, *(f"{name}={n}" for name, n in self.steps_of.items())],
+            "--seeds": [options.seeds],
+            "--out": [self.out],
+            "--downscale": [options.downscale],
+            "--transfer": [options.transfer],
+            "--refractive-index": [settings.refractive_index]
+            if settings.refractive_index is not None
+            else [],
+            "--background": [settings.background],
+            "--split": [options.split],
+            "--materials": [settings.materials] if settings.materials != "auto" else [],
+            "--exposures": options.exposures,
+        }
+        words = [word for option, values in given.items() if values for word in (option, *values)]
+        return self.asked or shlex.join(map(str, ["polarguide", "compare", *self.scenes, *words]))
 
 
 @dataclass(frozen=True)
@@ -181,16 +180,24 @@ class PlannedRun:
         """How far it is, by what its folder holds."""
         if not (self.folder / CONFIGURATION).exists():
             return "new"
-        found = self._configuration()
-        if found is None:
+        try:
+            found = RunConfiguration.load(self.folder)
+        except PolarguideError:
             return "begun"  # going on with it will say what does not match
-        if self.metrics() is not None:
+        same = (
+            found.scene_digest == self.scene.digest
+            and found.recipe_data == self.recipe.data()
+            and found.settings.fit(self.settings)
+            and (found.recipe, found.downscale, found.transfer, found.test_views)
+            == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
+        )
+        if same and self.metrics() is not None:
             return "done"
         # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
         moved = found.scene != str(self.scene.path.resolve())
         leaves = family_of(self.recipe).leaves
         finished = (self.folder / leaves).exists() and trained_steps(self.folder) == self.steps
-        return "trained" if finished and not moved else "begun"
+        return "trained" if same and finished and not moved else "begun"
 
     def metrics(self) -> dict[str, Any] | None:
         """The record of its scores, or None where there is no valid one by this version."""
@@ -200,21 +207,6 @@ class PlannedRun:
             return None
         whole = record["steps"] == self.steps
         return record if whole and record["provenance"].get("sources") == scoring_digest() else None
-
-    def _configuration(self) -> RunConfiguration | None:
-        """What the folder's run was trained as, or None where that is not this run."""
-        try:
-            found = RunConfiguration.load(self.folder)
-        except PolarguideError:
-            return None
-        same = (
-            found.scene_digest == self.scene.digest
-            and found.recipe_data == self.recipe.data()
-            and found.settings.fit(self.settings)
-            and (found.recipe, found.downscale, found.transfer, found.test_views)
-            == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
-        )
-        return found if same else None
 
 
 def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[SceneEntry]:
@@ -229,16 +221,11 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
         if comparison.settings.background == "masked":
             scene = mask_background(scene)
         if scene.name in [entry.name for entry in entries]:
-            raise PolarguideError(
-                path,
-                expected="scenes with names of their own",
-                found=f"{scene.name} twice",
-                remedy="Rename a folder.",
-            )
+            expected, remedy = "scenes with names of their own", "Rename a folder."
+            raise PolarguideError(path, expected=expected, found=f"{scene.name} twice", remedy=remedy)
         if not scene.test_names:
-            raise PolarguideError(
-                path, expected="test views", found="none", remedy="Name some in split.json to score on."
-            )
+            remedy = "Name some in split.json to score on."
+            raise PolarguideError(path, expected="test views", found="none", remedy=remedy)
         if comparison.settings.refractive_index is None and scene.refractive_index is not None:
             reporter.say(f"{scene.name}: refractive index {scene.refractive_index:g}, as scene.json says")
         share = black_share(scene.test_views[0])
@@ -271,14 +258,6 @@ def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[Plan
     ]
 
 
-def _for(recipe: Method, exposures: Exposures) -> Method:
-    """What is trained on such pictures: without any of polarization, the recipe without its terms, if there is one."""
-    if exposures != "none":
-        return recipe
-    name = f"{recipe.name}:unpolarized"
-    return next((found for found in ablations_of(recipe.name) if found.name == name), recipe)
-
-
 def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int) -> PlannedRun:
     recipe, options = row.recipe, comparison.options
     steps = compared_steps(row.steps, comparison.settings.steps)
@@ -290,19 +269,12 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
         refractive_index=comparison.index_of(scene),
     )
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
-    code = f"{__version__} {training_digest()}{_own_digest(recipe)}"
+    own = model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else field_digest()
+    code = f"{__version__} {training_digest()}{own}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
-    folder = comparison.out / RUNS / scene.name / _folder_name(row.name) / f"{seed}-{key}"
+    name = row.name.replace(":", "__").replace(" ", "-")
+    folder = comparison.out / RUNS / scene.name / name / f"{seed}-{key}"
     return PlannedRun(scene, row, steps, settings, reading, folder)
-
-
-def _own_digest(recipe: Method) -> str:
-    """Of the code that trains this recipe and not others."""
-    return model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else field_digest()
-
-
-def _folder_name(name: str) -> str:
-    return name.replace(":", "__").replace(" ", "-")
 
 
 def run_key(

@@ -1,211 +1,157 @@
-"""The record of a comparison: ``results.json``, its types, and the check of it."""
+"""What a comparison found: its record, and the data frames that follow from it."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any, TypedDict, TypeVar
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from statistics import fmean, stdev
+from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
+import pandas as pd
 
-from polarguide.errors import PolarguideError
-from polarguide.experiments.aggregate import Row, RunRecord
-from polarguide.experiments.differences import Difference, differences
-from polarguide.files import write_text
-from polarguide.records import decode, read_record, shortened
+from polarguide.evaluation.table import COLUMNS, PART_METRICS, Metric
+from polarguide.experiments.record import PartScores, Record
+from polarguide.experiments.statistics import differences, known, metric_of_runs, values_of
 
-FORMAT = "polarguide-results-2"
-FORMER = "polarguide-results-1"
-"""Lacks objects, materials, black pixels, the recipe to compare with, and differences; it is read as if it had them."""
-STATES = ("done", "failed", "missing")
-_REMEDY = "Give the command again to write the record anew."
-_Item = TypeVar("_Item")
-_Filled = Annotated[list[_Item], msgspec.Meta(min_length=1)]
+COMPARED = tuple(column for column in COLUMNS if column.better is not None and not column.timed)
+"""The metrics of which differences are taken: those that have a better side and do not depend on the machine."""
+DIFFERENCE_FIELDS = (
+    "scene", "recipe", "other", "why", "metric", "mean", "low", "high", "over", "count", "seeds", "noise",
+)  # fmt: skip
 
 
-class Provenance(TypedDict):
-    """What made the record. ``sources``: digest of the code that trains and scores; ``date``: ISO 8601, UTC."""
+@dataclass(frozen=True)
+class Cell:
+    """A metric of a recipe on a scene: mean over seeds, sample standard deviation (None: of one seed), seeds."""
 
-    version: str
-    commit: str | None
-    sources: str
-    command: str
-    date: str
-
-
-class Settings(TypedDict):
-    """What all runs have in common; ``jobs`` of them worked at a time. ``against``: what others are compared with."""
-
-    steps: int
-    seeds: int
-    downscale: int
-    transfer: str
-    refractive_index: float | None
-    threads: int
-    jobs: int
-    against: str | None
-    background: str
-    materials: str
+    mean: float | None = None
+    spread: float | None = None
+    count: int = 0
 
 
-class _Scene(TypedDict):
-    name: str
-    digest: str
-    views: Annotated[int, msgspec.Meta(ge=0)]
-    test_views: list[str]
-    black_share: Annotated[float, msgspec.Meta(ge=0, le=1)] | None
+def cell_of(values: Sequence[float | None]) -> Cell:
+    """Mean and spread of what is not None."""
+    numbers = [value for value in values if value is not None]
+    spread = stdev(numbers) if len(numbers) > 1 else None
+    return Cell(fmean(numbers), spread, len(numbers)) if numbers else Cell()
 
 
-class SceneRecord(_Scene, total=False):
-    """A scene: the digest of its files, how many views it has, and the names of those that scores are means over.
+class Row(NamedTuple):
+    """One recipe on one scene (None: the mean over scenes), of ``finished`` runs; cells by metric."""
 
-    ``black_share`` is the share of black pixels in its first test view, None where that is not known.
-    ``warnings``, only where there are some, are what its scores do not mean because ground truth is missing.
-    ``refractive_index`` is that of its runs, where ``Settings`` have null: each scene its own.
+    scene: str | None
+    recipe: str
+    finished: int
+    cells: dict[str, Cell]
+
+
+@dataclass(frozen=True)
+class Results:
+    """A comparison. In each frame a value that is not there is NaN or None.
+
+    Attributes:
+        record: everything that ``results.json`` has, but the tables, which follow from it.
     """
 
-    warnings: list[str]
-    refractive_index: Annotated[float, msgspec.Meta(gt=1, lt=4)]
+    record: Record
+
+    @property
+    def scenes(self) -> list[str]:
+        """Names, in the order of the tables."""
+        return [scene.name for scene in self.record.scenes]
+
+    @property
+    def recipes(self) -> list[str]:
+        """Names, in the order of the tables."""
+        return [recipe.name for recipe in self.record.recipes]
+
+    @cached_property
+    def runs(self) -> pd.DataFrame:
+        """A row for every run: scene, recipe, seed, state (done, failed, missing), error, folder, and each metric."""
+        named = ("scene", "recipe", "seed", "state", "error", "folder")
+        rows = [{k: getattr(run, k) for k in named} | (run.metrics or {}) for run in self.record.runs]
+        return _frame(rows, named, [column.key for column in COLUMNS])
+
+    @cached_property
+    def scores(self) -> pd.DataFrame:
+        """A row for every scene (None: mean over scenes) and recipe: finished ``runs``, each metric and its spread."""
+        rows = [[row.scene, row.recipe, row.finished, *_pairs(row.cells.values())] for row in self.table]
+        return _frame(rows, ("scene", "recipe", "runs"), _with_spreads(COLUMNS))
+
+    @cached_property
+    def differences(self) -> pd.DataFrame:
+        """Paired differences ``recipe - other`` in a metric, with interval and noise; ``scene`` None: over scenes."""
+        frame = pd.DataFrame(self.compared, columns=[*DIFFERENCE_FIELDS])
+        return frame.astype({"mean": float, "low": float, "high": float})
+
+    @cached_property
+    def parts(self) -> pd.DataFrame:
+        """Scores by object and by material of every scene and recipe, means over its seeds with their spreads."""
+        found: dict[tuple[str, ...], list[PartScores]] = {}
+        for run in self.record.runs:
+            for kind, scored in (("object", run.objects), ("material", run.materials)):
+                for name, part in scored.items():
+                    found.setdefault((run.scene, run.recipe, kind, name), []).append(part)
+        rows = []
+        for place, seeds in found.items():
+            cells = [cell_of([part.metrics.get(column.key) for part in seeds]) for column in PART_METRICS]
+            rows.append(
+                [*place, seeds[0].material, seeds[0].pixels, seeds[0].views, len(seeds), *_pairs(cells)]
+            )
+        head = ("scene", "recipe", "part", "name", "material", "pixels", "views", "runs")
+        return _frame(rows, head, _with_spreads(PART_METRICS))
+
+    @cached_property
+    def compared(self) -> list[dict[str, Any]]:
+        """The differences as ``results.json`` has them."""
+        return differences(self.record, COMPARED)
+
+    @cached_property
+    def table(self) -> list[Row]:
+        """A row for every scene and recipe, and, with several scenes, one for the mean over scenes of every recipe.
+
+        In that mean every scene has one weight, and a quantity is given only where the recipe has it on every scene on
+        which any recipe has it: means over different scenes are not to be compared.
+        """
+        values = {column.key: values_of(self.record, metric_of_runs(column.key)) for column in COLUMNS}
+        rows = []
+        for scene in [*self.scenes, None] if len(self.scenes) > 1 else self.scenes:
+            for index, recipe in enumerate(self.recipes):
+                done = [r.scene for r in self.record.runs if r.recipe == recipe and r.metrics is not None]
+                cells = {}
+                for key, of in values.items():
+                    numbers = [v[index, :, 0] for s, v in of.items() if scene in (None, s)]
+                    cells[key] = cell_of(known(numbers[0])) if scene and numbers else _over_scenes(numbers)
+                finished = len(done) if scene is None else done.count(scene)
+                rows.append(Row(scene, recipe, finished, cells))
+        return rows
+
+    def content(self) -> dict[str, Any]:
+        """What ``results.json`` holds."""
+        table = [row._asdict() for row in self.table]
+        tables = msgspec.to_builtins({"table": table, "differences": self.compared})
+        return {**msgspec.to_builtins(self.record), **tables}
 
 
-class _Recipe(TypedDict):
-    name: str
-    about: str
-    data: dict[str, Any]
+def _over_scenes(numbers: Sequence[Any]) -> Cell:
+    """The mean over scenes of a recipe's values by seed; nothing where a scene has none."""
+    if not numbers or not all(known(seeds) for seeds in numbers):
+        return Cell()
+    complete = [fmean(seeds) for seeds in np.transpose(numbers).tolist() if not np.isnan(seeds).any()]
+    return replace(cell_of(complete), mean=fmean(fmean(known(seeds)) for seeds in numbers))
 
 
-class RecipeRecord(_Recipe, total=False):
-    """A recipe with all its values; ``steps`` only where it takes another number of them than ``Settings`` say."""
-
-    steps: Annotated[int, msgspec.Meta(ge=1)]
+def _frame(rows: list[Any], names: Sequence[str], numbers: Sequence[str]) -> pd.DataFrame:
+    return pd.DataFrame(rows, columns=[*names, *numbers]).astype(dict.fromkeys(numbers, float))
 
 
-class Results(TypedDict):
-    """A comparison.
-
-    ``table`` has a row for every scene and recipe, and with several scenes their means at the end; ``differences`` are
-    those that finished runs give.
-    """
-
-    format: str
-    provenance: Provenance
-    settings: Settings
-    scenes: _Filled[SceneRecord]
-    recipes: _Filled[RecipeRecord]
-    runs: _Filled[RunRecord]
-    table: _Filled[Row]
-    differences: list[Difference]
+def _with_spreads(columns: Sequence[Metric]) -> list[str]:
+    return [name for column in columns for name in (column.key, f"{column.key}_spread")]
 
 
-def write_results(path: Path, record: Results) -> None:
-    """Write ``results.json`` in one step: a reader sees the old file or the whole new one."""
-    write_text(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
-
-
-def read_results(path: Path) -> Results:
-    """Read ``results.json``, of this version or the one before.
-
-    Raises:
-        PolarguideError: there is none, or it is not what ``write_results`` writes.
-    """
-    record = read_record(path, dict[str, Any], remedy=_REMEDY)
-    settings = record.get("settings")
-    if isinstance(
-        settings, dict
-    ):  # the first records lack them: surroundings were taken to be there, metals not sought
-        record["settings"] = {"background": "scene", "materials": "dielectric", **settings}
-        if settings.get("refractive_index") == 0:  # as earlier records have it for null
-            record["settings"]["refractive_index"] = None
-    if record.get("format") != FORMER:
-        return validate_results(record, path)
-    results = validate_results(_completed(record), path)
-    results["differences"] = differences_of(results)
-    return results
-
-
-def _completed(record: dict[str, Any]) -> dict[str, Any]:
-    """A record of the former version with what it lacks; what is wrong with it is left for the check."""
-
-    def with_fields(items: Any, **fields: Any) -> Any:
-        if not isinstance(items, list):
-            return items
-        return [{**fields, **item} if isinstance(item, dict) else item for item in items]
-
-    settings = record.get("settings")
-    return {
-        **record,
-        "format": FORMAT,
-        "settings": {"against": None, **settings} if isinstance(settings, dict) else settings,
-        "scenes": with_fields(record.get("scenes"), black_share=None),
-        "runs": with_fields(record.get("runs"), objects={}, materials={}),
-        "differences": [],
-    }
-
-
-def differences_of(record: Results) -> list[Difference]:
-    """What belongs under ``differences``, from the runs of a record."""
-    return differences(
-        record["runs"],
-        {scene["name"]: scene["black_share"] for scene in record["scenes"]},
-        [recipe["name"] for recipe in record["recipes"]],
-        record["settings"]["against"],
-    )
-
-
-def validate_results(record: Any, where: str | Path = "results.json") -> Results:
-    """Check a record against the schema of ``results.json``.
-
-    Args:
-        record: the parsed file.
-        where: what an error message calls it.
-
-    Returns:
-        The record.
-
-    Raises:
-        PolarguideError: naming the first key at fault, what was expected there, and what was found.
-    """
-    results = decode(record, Results, where, remedy=_REMEDY)
-    if results["format"] != FORMAT:
-        raise _fault(f"{where} (format)", FORMAT, results["format"])
-    _check_relations(results, where)
-    return results
-
-
-def _check_relations(record: Results, where: str | Path) -> None:
-    """What the types do not say: names that occur once, runs of these names, and a row for each of them."""
-    scenes, recipes = ([item["name"] for item in items] for items in (record["scenes"], record["recipes"]))
-    for key, names in (("scenes", scenes), ("recipes", recipes)):
-        if len(set(names)) < len(names):
-            raise _fault(f"{where} ({key})", "every name once", names)
-    against = record["settings"]["against"]
-    if against is not None and against not in recipes:
-        raise _fault(f"{where} (settings.against)", f"one of the recipes {', '.join(recipes)}", against)
-    for index, run in enumerate(record["runs"]):
-        _check_run(run, scenes, recipes, where, f"runs[{index}]")
-    places: list[str | None] = [*scenes, *([None] if len(scenes) > 1 else [])]
-    wanted = [(scene, recipe) for scene in places for recipe in recipes]
-    found = [(row["scene"], row["recipe"]) for row in record["table"]]
-    if found != wanted:
-        raise _fault(
-            f"{where} (table)", f"a row for each of {len(wanted)} scenes and recipes, in order", found
-        )
-
-
-def _check_run(
-    run: RunRecord, scenes: Sequence[str], recipes: Sequence[str], where: object, place: str
-) -> None:
-    for key, name, names in (("scene", run["scene"], scenes), ("recipe", run["recipe"], recipes)):
-        if name not in names:
-            raise _fault(f"{where} ({place}.{key})", f"one of the {key}s {', '.join(names)}", name)
-    if run["state"] not in STATES:
-        raise _fault(f"{where} ({place}.state)", "one of " + ", ".join(STATES), run["state"])
-    if (run["metrics"] is not None) != (run["state"] == "done"):
-        raise _fault(
-            f"{where} ({place}.metrics)", "values for a run that is done and null for another", run["metrics"]
-        )
-
-
-def _fault(where: str, expected: str, found: object) -> PolarguideError:
-    return PolarguideError(where, expected=expected, found=shortened(found), remedy=_REMEDY)
+def _pairs(cells: Any) -> Iterator[float | None]:
+    """Mean and spread of every cell, in turn."""
+    return (value for cell in cells for value in (cell.mean, cell.spread))

@@ -1,211 +1,366 @@
-"""The scores of a comparison by scene, with what cannot be told from the best marked."""
+"""The tables of a comparison as people read them, before they become Markdown, LaTeX or HTML."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from statistics import fmean
+from typing import Any, NamedTuple
 
-from polarguide.evaluation.table import COLUMNS, MESH_LABEL, Metric
-from polarguide.experiments.aggregate import NO_VALUE, Cell, Row, RunRecord
-from polarguide.experiments.intervals import mean
-from polarguide.experiments.noise import known_scatter, training_noise
-from polarguide.experiments.results import Results
-from polarguide.experiments.shown import (
-    MEAN_TITLE,
-    NOT_APPLICABLE,
-    Block,
-    Label,
-    Section,
-    ShownCell,
-    formatted,
+import numpy as np
+
+from polarguide.evaluation.table import COLUMNS, MESH_LABEL, PART_METRICS, Metric
+from polarguide.experiments.record import RunRecord
+from polarguide.experiments.results import Cell, Results, Row
+from polarguide.experiments.statistics import (
+    Values,
+    controlled,
+    known,
+    metric_of_runs,
+    not_told_apart,
+    pair,
+    scatter_on,
+    seed_means,
+    values_of,
 )
-from polarguide.experiments.shown import Row as ShownRow
 
-BySceneAndSeed = Mapping[str, Mapping[int, float]]
+NOT_APPLICABLE = "n/a"
+MEAN_TITLE = "mean over scenes"
+OVER_SCENES = "over scenes"
+MINUS = "\N{MINUS SIGN}"
+_HOW = (
+    "Differences are taken at the same seed and test view. Bold: better, beyond noise; ≈: within noise, another seed, "
+    "other views or, over scenes, other scenes may turn it; ?: noise not known.",
+    "Brackets: 95 % confidence interval by Student's t, over scenes or seeds where these are at least three, else over "
+    "test views: that one holds for these trainings only, and what is noise is judged by the known scatter, too.",
+)
+_HOW_PARTS = (
+    "Scores on the pixels of a part, means over seeds. Bold: as above, but no scatter is known of parts, so that with "
+    "fewer than two paired seeds only the best is bold."
+)
+_HOW_BOLD = (
+    "Bold: the best of each scene and column, and whatever differs from it by no more than another seed may "
+    "change, with 95 % confidence: by the paired differences where three seeds are paired, else by the known "
+    "scatter of such differences; in a column without one, what shows the same digits."
+)
 
 
-def shown_columns(results: Results) -> tuple[Metric, ...]:
-    """The columns that people see: those with a value in some row."""
-    return tuple(
-        column
-        for column in COLUMNS
-        if column.shown == "tables" and any(_cell_of(row, column)["count"] for row in results["table"])
+TableCell = tuple[str, str, bool]
+"""A value, what stands after it (spread, interval; empty: nothing), and whether it is bold."""
+Label = tuple[str, bool, str]
+"""What a row is called: a name, whether it is one of code (a recipe), and a remark after it (empty: none)."""
+TableRow = tuple[list[Label], list[TableCell]]
+"""As many labels as its section has, and as many cells as that has headings."""
+EMPTY: TableCell = ("", "", False)
+
+
+class Section(NamedTuple):
+    """Blocks with the same columns.
+
+    Attributes:
+        key: name for links. title: heading; empty for the scores, which come first.
+        labels: headings of the labels. headings: those of the cells. blocks: titles and their rows.
+        notes: what a reader has to know, a sentence each.
+    """
+
+    key: str
+    title: str
+    labels: tuple[str, ...]
+    headings: list[str]
+    blocks: list[tuple[str, list[TableRow]]]
+    notes: list[str]
+
+
+def formatted(value: float, column: Metric) -> str:
+    """A recorded value as tables show it, without its unit."""
+    return f"{value * column.factor:,.{column.digits}f}"
+
+
+def signed(value: float, column: Metric) -> str:
+    """A difference of recorded values as tables show it, with a true minus sign and never a negative zero."""
+    text = f"{round(value * column.factor, column.digits) + 0.0:+,.{column.digits}f}"
+    return text.replace("-", MINUS)
+
+
+def sections(results: Results) -> list[Section]:
+    """All tables of a comparison, in the order in which they are shown; only those that have rows."""
+    made = (
+        scores_section(results),
+        control_section(results),
+        against_section(results),
+        part_section(results, "object"),
+        part_section(results, "material"),
     )
+    return [section for section in made if section.blocks]
 
 
 def scores_section(results: Results) -> Section:
-    """The table by scenes, formatted, with the leaders of every column marked."""
-    columns = shown_columns(results)
-    titles: dict[str | None, str] = {row["scene"]: row["scene"] or MEAN_TITLE for row in results["table"]}
-    steps = {recipe["name"]: recipe["steps"] for recipe in results["recipes"] if "steps" in recipe}
-    made = []
-    for scene, title in titles.items():
-        rows = [row for row in results["table"] if row["scene"] == scene]
-        bold = [leading_rows(rows, column, results) for column in columns]
-        shown = tuple(
-            ShownRow(
-                (Label(row["recipe"], code=True, remark=_remark(row, results, steps)),),
-                tuple(
-                    _cell(row, column, index in leaders, results["table"])
-                    for column, leaders in zip(columns, bold, strict=True)
-                ),
+    """The scores by scene, of every metric with a value, with the leaders of every column marked."""
+    columns = [
+        c for c in COLUMNS if c.shown == "tables" and any(row.cells[c.key].count for row in results.table)
+    ]
+    values = {column.key: values_of(results.record, metric_of_runs(column.key)) for column in columns}
+    blocks = []
+    for scene in dict.fromkeys(row.scene for row in results.table):
+        rows = [row for row in results.table if row.scene == scene]
+        bold = {}
+        for column in columns:
+            means = {i: m for i, row in enumerate(rows) if (m := row.cells[column.key].mean) is not None}
+            of = {s: v for s, v in values[column.key].items() if scene in (None, s)}
+            bold[column.key] = leaders(means, of, column, scatter_on(results.record, of, column))
+        made = [
+            (
+                [(row.recipe, True, _remark(row, results))],
+                [_score(row, column, index in bold[column.key], results) for column in columns],
             )
             for index, row in enumerate(rows)
-        )
-        made.append(Block(title, shown))
-    headings = tuple(column.heading for column in columns)
-    return Section("scores", "", ("recipe",), headings, tuple(made), tuple(notes(results)))
-
-
-def leading_rows(rows: Sequence[Row], column: Metric, results: Results) -> set[int]:
-    """Which rows of one scene (or of the mean over scenes) have the best value of a column, or one not told from it.
-
-    A row is told from the best by the differences at the same seeds, if they exceed ``training_noise``; where that is
-    not known, by the digits shown. None where fewer than two rows have a value, or the column has no better side.
-    """
-    means = {i: value for i, row in enumerate(rows) if (value := _cell_of(row, column)["mean"]) is not None}
-    if column.better is None or len(means) < 2:
-        return set()
-    scenes = {
-        scene["name"]: known_scatter(column.key, scene["black_share"])
-        for scene in results["scenes"]
-        if rows[0]["scene"] in (None, scene["name"])
-    }
-    values = {
-        i: _by_scene_and_seed(results["runs"], list(scenes), rows[i]["recipe"], column.key) for i in means
-    }
-    return leaders(means, values, column, scenes)
+        ]
+        blocks.append((scene or MEAN_TITLE, made))
+    return Section("scores", "", ("recipe",), [c.heading for c in columns], blocks, notes(results))
 
 
 def leaders(
-    means: Mapping[int, float],
-    values: Mapping[int, BySceneAndSeed],
-    column: Metric,
-    scatter: Mapping[str, float | None],
+    means: Mapping[int, float], values: Values, column: Metric, scatter: Sequence[float | None]
 ) -> set[int]:
-    """Which of several means are the best, or not told from it.
+    """Which of several recipes have the best mean of a metric, or one that is not told from it.
+
+    A recipe is told from the best by the differences at the same seeds, if they exceed ``training_noise``; where that
+    is not known, by the digits shown. None are where fewer than two have a value, or the metric has no better side.
 
     Args:
-        means: shown values. values: what each is a mean of, by scene and seed.
-        column: the metric; without a better side there are no leaders.
-        scatter: the known scatter by scene.
+        means: shown values, by the place of the recipe. values: what these are means of.
+        column: the metric. scatter: the known scatter on each scene of the values.
     """
-    if column.better is None or not means:
+    if column.better is None or len(means) < 2:
         return set()
     sign = 1.0 if column.better == "higher" else -1.0
     best = max(means, key=lambda index: sign * means[index])
     return {
         index
-        for index in means
-        if formatted(means[index], column) == formatted(means[best], column)
-        or _not_told(values[best], values[index], sign, scatter)
+        for index, mean in means.items()
+        if formatted(mean, column) == formatted(means[best], column)
+        or not_told_apart(values, best, index, sign, scatter)
     }
 
 
-def _not_told(
-    best: BySceneAndSeed, other: BySceneAndSeed, sign: float, scatter: Mapping[str, float | None]
-) -> bool:
-    """Whether the lead of the best over another, at the seeds that both have, is within noise."""
-    leads = {
-        scene: {
-            seed: sign * (value - other[scene][seed]) for seed, value in seeds.items() if seed in other[scene]
-        }
-        for scene, seeds in best.items()
-        if scene in other
-    }
-    if set(leads) != set(best) | set(other) or not all(leads.values()):
-        return False
-    half = training_noise(leads, scatter)
-    return half is not None and mean(mean(by_seed.values()) for by_seed in leads.values()) <= half
-
-
-def _by_scene_and_seed(
-    runs: Sequence[RunRecord], scenes: Sequence[str], recipe: str, key: str
-) -> BySceneAndSeed:
-    found: dict[str, dict[int, float]] = {}
-    for run in runs:
-        value = (run["metrics"] or {}).get(key)
-        if value is not None and run["scene"] in scenes and run["recipe"] == recipe:
-            found.setdefault(run["scene"], {})[run["seed"]] = value
-    return found
-
-
-def notes(results: Results) -> list[str]:
-    """What a reader of the scores has to know, a sentence each."""
-    said = [
-        "↑ higher is better, ↓ lower is better.",
-        "Bold: the best of each scene and column, and whatever differs from it by no more than another seed may "
-        "change, with 95 % confidence: by the paired differences where three seeds are paired, else by the known "
-        "scatter of such differences; in a column without one, what shows the same digits.",
-    ]
-    counts = seed_counts(results)
-    if len(counts) > 1:
-        said.append("The number of seeds differs between rows: it stands after the name.")
-    if max(counts) > 1:
-        number = f"{counts[0]} " if len(counts) == 1 else ""
-        said.append(f"Mean ± sample standard deviation over {number}seeds.")
-    if min(counts) < 2:
-        said.append("Of one seed, what another would change is not in the table.")
-    if len(results["scenes"]) > 1:
-        said.append(
-            "Mean over scenes: over those where any recipe has a value of the column, with one weight each."
-        )
-    said += [f"{scene['name']}: {text}" for scene in results["scenes"] for text in scene.get("warnings", ())]
-    done = [run for run in results["runs"] if run["state"] == "done"]
-    for label, reasons in (
-        ("LPIPS", (run["lpips_reason"] for run in done)),
-        (MESH_LABEL, (run.get("mesh_reason") for run in done)),
-    ):
-        said += [f"{label} {NOT_APPLICABLE}: {reason}." for reason in dict.fromkeys(reasons) if reason]
-    unfinished = [r for r in results["runs"] if r["state"] != "done"]
-    for run in unfinished:
-        what = "failed" if run["state"] == "failed" else "has not finished"
-        error = f": {run['error']}" if run["error"] else ""
-        said.append(f"{run['scene']}, {run['recipe']}, seed {run['seed']} {what}{error}")
-    return said
+def _score(row: Row, column: Metric, bold: bool, results: Results) -> TableCell:
+    cell: Cell = row.cells[column.key]
+    if cell.mean is None:
+        # A speed that was not measured alone, or a run that has not finished, is not "not applicable".
+        others = (r.cells[column.key].count for r in results.table if r.recipe == row.recipe)
+        empty = column.timed or not row.finished or (row.scene is None and any(others))
+        return "" if empty else NOT_APPLICABLE, "", False
+    spread = "" if cell.spread is None else f"± {formatted(cell.spread, column)}"
+    return formatted(cell.mean, column), spread, bold
 
 
 def seed_counts(results: Results) -> list[int]:
     """How many seeds were asked for: one number, or several where recipes or scenes differ in it; ascending."""
-    return sorted(set(Counter((run["scene"], run["recipe"]) for run in results["runs"]).values()))
+    return sorted(set(Counter((run.scene, run.recipe) for run in results.record.runs).values()))
 
 
-def _remark(row: Row, results: Results, steps: Mapping[str, int]) -> str:
-    """Its number of steps where that is not the others' number, and what is missing of a row."""
-    own = f"{steps[row['recipe']]:,} steps" if row["recipe"] in steps else ""
-    return ", ".join(filter(None, (own, _missing(row, results))))
+def _remark(row: Row, results: Results) -> str:
+    """Its number of steps where that is not the others', and what is missing of it, else its seeds if rows differ."""
+    (steps,) = (recipe.steps for recipe in results.record.recipes if recipe.name == row.recipe)
+    states = [r.state for r in results.record.runs if r.recipe == row.recipe and row.scene in (None, r.scene)]
+    done, missing = states.count("done"), ""
+    if states and not done:
+        missing = "failed" if "failed" in states else "missing"
+    elif done < len(states):
+        missing = f"{done} of {len(states)} {'runs' if row.scene is None else 'seeds'}"
+    elif row.scene is not None and len(seed_counts(results)) > 1:
+        missing = f"{done} seed{'' if done == 1 else 's'}"
+    return ", ".join(filter(None, (f"{steps:,} steps" if steps else "", missing)))
 
 
-def _missing(row: Row, results: Results) -> str:
-    """What is missing of a row; else how many seeds it has, where rows differ in that."""
-    planned = [
-        run
-        for run in results["runs"]
-        if run["recipe"] == row["recipe"] and row["scene"] in (None, run["scene"])
-    ]
-    done = sum(run["state"] == "done" for run in planned)
-    if planned and not done:
-        return "failed" if any(run["state"] == "failed" for run in planned) else "missing"
-    what = "runs" if row["scene"] is None else "seeds"
-    if done < len(planned):
-        return f"{done} of {len(planned)} {what}"
-    if row["scene"] is not None and len(seed_counts(results)) > 1:
-        return f"{done} seed{'' if done == 1 else 's'}"
-    return ""
-
-
-def _cell_of(row: Row, column: Metric) -> Cell:
-    """A record of an older version lacks the metrics that came later."""
-    return row["cells"].get(column.key, NO_VALUE)
-
-
-def _cell(row: Row, column: Metric, bold: bool, table: Sequence[Row]) -> ShownCell:
-    cell = _cell_of(row, column)
-    if cell["mean"] is None:
-        # A speed that was not measured alone, or a run that has not finished, is not "not applicable".
-        known = row["scene"] is None and any(
-            other["recipe"] == row["recipe"] and _cell_of(other, column)["count"] for other in table
+def notes(results: Results) -> list[str]:
+    """What a reader of the scores has to know, a sentence each."""
+    counts, record = seed_counts(results), results.record
+    number = f"{counts[0]} " if len(counts) == 1 else ""
+    stated = {
+        "↑ higher is better, ↓ lower is better.": True,
+        _HOW_BOLD: True,
+        "The number of seeds differs between rows: it stands after the name.": len(counts) > 1,
+        f"Mean ± sample standard deviation over {number}seeds.": max(counts) > 1,
+        "Of one seed, what another would change is not in the table.": min(counts) < 2,
+        "Mean over scenes: over those where any recipe has a value of the column, with one weight each.": len(
+            record.scenes
         )
-        return ShownCell("" if column.timed or not row["finished"] or known else NOT_APPLICABLE)
-    spread = "" if cell["spread"] is None else f"± {formatted(cell['spread'], column)}"
-    return ShownCell(formatted(cell["mean"], column), spread, bold)
+        > 1,
+    }
+    made = [text for text, holds in stated.items() if holds]
+    made += [f"{scene.name}: {text}" for scene in record.scenes for text in scene.warnings or ()]
+    done = [run for run in record.runs if run.state == "done"]
+    for label, field in (("LPIPS", "lpips_reason"), (MESH_LABEL, "mesh_reason")):
+        reasons = dict.fromkeys(getattr(run, field) for run in done)
+        made += [f"{label} {NOT_APPLICABLE}: {reason}." for reason in reasons if reason]
+    for run in record.runs:
+        if run.state != "done":
+            what = "failed" if run.state == "failed" else "has not finished"
+            made.append(
+                f"{run.scene}, {run.recipe}, seed {run.seed} {what}" + (f": {run.error}" if run.error else "")
+            )
+    return made
+
+
+def control_section(results: Results) -> Section:
+    """What polarization buys: a block for every recipe with controls, a row for every scene and one over scenes."""
+    found = [d for d in results.compared if d["why"] == "control"]
+    columns = _columns(found)
+    blocks, stated = [], []
+    for recipe, controls in controlled(results.recipes).items():
+        letters = dict(zip(controls, "abcdefghij", strict=False)) if len(controls) > 1 else {}
+        names = ", ".join(f"{letters[c]}: {c}" if letters else c for c in controls)
+        mine = [d for d in found if d["recipe"] == recipe]
+        rows = [
+            _row(s, False, [d for d in mine if d["scene"] == s], columns, letters) for s in _places(results)
+        ]
+        blocks.append((recipe, rows))
+        stated.append(
+            f"{recipe}: the difference to the better of its controls, metric by metric ({names})."
+            if letters
+            else f"{recipe}: the difference to its control, {names}."
+        )
+    stated += dict.fromkeys(
+        f"{d['scene'] or OVER_SCENES}, {d['recipe']}: chosen without {', '.join(d['left_out'])}, for want of "
+        "runs to pair."
+        for d in found
+        if d["left_out"]
+    )
+    headings = [column.heading for column in columns]
+    labels = ("scene", "interval over")
+    return Section("controls", "What polarization buys", labels, headings, blocks, [*stated, *_HOW])
+
+
+def against_section(results: Results) -> Section:
+    """Differences to a recipe that was asked for: a block for every scene, a row for every other recipe."""
+    against = results.record.settings.against
+    found = [d for d in results.compared if d["why"] == "against"]
+    columns = _columns(found)
+    blocks = []
+    for scene in _places(results) if against is not None else []:
+        mine = [d for d in found if d["scene"] == scene]
+        rows = [
+            _row(recipe, True, [d for d in mine if d["recipe"] == recipe], columns, {})
+            for recipe in results.recipes
+            if recipe != against
+        ]
+        blocks.append((scene or OVER_SCENES, rows))
+    headings = [column.heading for column in columns]
+    title = f"Differences to {against}"
+    return Section("against", title, ("recipe", "interval over"), headings, blocks, [*_HOW])
+
+
+def _places(results: Results) -> list[str | None]:
+    return [*results.scenes, None] if len(results.scenes) > 1 else [*results.scenes]
+
+
+def _columns(found: Sequence[Mapping[str, Any]]) -> list[Metric]:
+    there = {difference["metric"] for difference in found}
+    return [column for column in COLUMNS if column.shown == "tables" and column.key in there]
+
+
+def _row(
+    name: str | None,
+    code: bool,
+    found: Sequence[Mapping[str, Any]],
+    columns: Sequence[Metric],
+    letters: Mapping[str, str],
+) -> TableRow:
+    """The differences of one row; what most of its intervals are over is said once, the others in their cells."""
+    by_key = {difference["metric"]: difference for difference in found}
+    units = [_unit(by_key[column.key]) for column in columns if column.key in by_key]
+    usual = max(dict.fromkeys(units), key=units.count, default="")
+    cells = []
+    for column in columns:
+        of = by_key.get(column.key)
+        if of is None:
+            cells.append(EMPTY)
+            continue
+        unit, letter = _unit(of), letters.get(of["other"], "")
+        interval = "" if of["low"] is None else f"[{signed(of['low'], column)}, {signed(of['high'], column)}]"
+        more = " ".join(filter(None, (interval, "" if unit == usual else f"({unit})", letter)))
+        cells.append(_gain(of["mean"], of["noise"], column, more))
+    remark = "" if found else "no runs to pair"
+    return [(name or OVER_SCENES, code, remark), (usual, False, "")], cells
+
+
+def _unit(difference: Mapping[str, Any]) -> str:
+    """What the interval is over; without one, the number of seeds."""
+    seeds = f"{difference['seeds']} seed{'' if difference['seeds'] == 1 else 's'}"
+    if difference["over"] is None:
+        return f"none, {seeds}"
+    return f"{difference['count']} {difference['over']}" + (
+        f" of {seeds}" if difference["over"] == "views" else ""
+    )
+
+
+def _gain(value: float, noise: bool | None, column: Metric, more: str = "") -> TableCell:
+    """A difference with the mark of its noise: ≈ within it, ? not known; bold: better beyond it."""
+    text = ("≈ " if noise else "") + signed(value, column) + ("?" if noise is None else "")
+    return text, more, noise is False and (value > 0) == (column.better == "higher")
+
+
+def part_section(results: Results, kind: str) -> Section:
+    """Where the error is: a block for every metric, a row for every object of every scene, or for every material."""
+    with_controls = controlled(results.recipes)
+    places: dict[tuple[str, ...], dict[str, None]] = {}  # an object or a material -> its scenes
+    for scene, run in [(s, run) for s in results.scenes for run in results.record.runs if run.scene == s]:
+        for name, part in getattr(run, f"{kind}s").items():
+            labels: tuple[str, ...] = (scene, name, part.material or "") if kind == "object" else (name,)
+            places.setdefault(labels, {})[scene] = None
+    blocks = []
+    for column in (metric for metric in PART_METRICS if metric.shown == "tables"):
+        rows = []
+        for labels, scenes in places.items():
+            values = values_of(results.record, partial(_part_score, kind, labels, column.key), scenes)
+            if values:
+                cells = [*_means(values, column), *_gains(results, values, with_controls, column)]
+                names = labels if kind == "object" else (*labels, ", ".join(scenes))
+                rows.append(([(name, False, "") for name in names], cells))
+        if rows:
+            blocks.append((column.heading, rows))
+    made = [_HOW_PARTS]
+    if with_controls:
+        made.append(
+            "The last columns: what polarization buys, the difference to the better control; bold and ≈ as above."
+        )
+    if kind == "material":
+        made.append("Means over the scenes that have the material, with one weight each.")
+    headings = [*results.recipes, *(f"{recipe} {MINUS} control" for recipe in with_controls)]
+    titles = ("scene", "object", "material") if kind == "object" else ("material", "scenes")
+    return Section(f"{kind}s", f"By {kind}", titles, headings, blocks, made)
+
+
+def _part_score(kind: str, labels: Sequence[str], key: str, run: RunRecord) -> dict[str, float | None]:
+    """For ``values_of``: a metric of an object (scene, name, material), or of a material (name)."""
+    part = run.objects.get(labels[1]) if kind == "object" else run.materials.get(labels[0])
+    if part is None or (kind == "object" and (part.material or "") != labels[2]):
+        return {}
+    return {"": part.metrics.get(key)}
+
+
+def _means(values: Values, column: Metric) -> Iterator[TableCell]:
+    """A cell for every recipe; empty where it lacks a scene that another has."""
+    recipes = np.transpose([seed_means(v) for v in values.values()], (1, 0, 2))  # [recipes, scenes, seeds]
+    means = {
+        index: fmean(fmean(known(seeds)) for seeds in of)
+        for index, of in enumerate(recipes)
+        if all(known(seeds) for seeds in of)
+    }
+    bold = leaders(means, values, column, [None] * len(values))
+    for index in range(len(recipes)):
+        empty = index not in means
+        yield EMPTY if empty else (formatted(means[index], column), "", index in bold)
+
+
+def _gains(
+    results: Results, values: Values, recipes: Mapping[str, Sequence[str]], column: Metric
+) -> Iterator[TableCell]:
+    """What polarization buys of every recipe with controls."""
+    for recipe, controls in recipes.items():
+        found = None
+        if column.better is not None:
+            found = pair(results.record, values, recipe, controls, column, scatter=False)
+        yield EMPTY if found is None else _gain(found["mean"], found["noise"], column)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
-import html
 from collections.abc import Mapping, Sequence
-from string import Template
 from typing import Any
 
 import cv2
@@ -25,8 +23,9 @@ from polarguide.runs.point_cloud import gaussian_colors
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
-from polarguide.visualization.embedded import content_policy, page_part, script_json
+from polarguide.visualization.pages import page, page_part
 
+PACKAGE = "polarguide.export"
 SCRIPTS = (
     "algebra.js",
     "sorter.js",
@@ -81,45 +80,49 @@ def share_page(
     Returns:
         HTML that asks for nothing from outside; its own policy forbids it to.
     """
-    page = shading.page(gaussians, light)
+    shaded = shading.page(gaussians, light)
     layers: Sequence[str] = shading.layers
-    if page is None:
-        page, layers = baked_page(gaussians, light, shading), PLAIN_LAYERS
-    quantized = records(gaussians, page.values)
+    if shaded is None:
+        shaded, layers = baked_page(gaussians, light, shading), PLAIN_LAYERS
+    quantized = records(gaussians, shaded.values)
     scene: dict[str, Any] = {
-        "kind": page.kind,
+        "kind": shaded.kind,
         "texels": quantized.itemsize // TEXEL,
         "count": len(quantized),
         "layers": [
-            name for name in LAYERS if name in layers and (name != "metalness" or "metal" in page.values)
+            name for name in LAYERS if name in layers and (name != "metalness" or "metal" in shaded.values)
         ],
         "index": 1.5,
-        "resolution": int(page.light[0].shape[1]) if page.light else 1,
-        "levels": max(1, len(page.light)),
+        "resolution": int(shaded.light[0].shape[1]) if shaded.light else 1,
+        "levels": max(1, len(shaded.light)),
         **_frame(cameras, first, presentation),
-        **page.constants,
+        **shaded.constants,
     }
     arrays: dict[str, NDArray[np.generic] | None] = {
-        "light": light_numbers(page.light) if page.light else None,
-        "network": network_numbers(page.network) if page.network else None,
+        "light": light_numbers(shaded.light) if shaded.light else None,
+        "network": network_numbers(shaded.network) if shaded.network else None,
         "viridis": viridis(),
     }
-    script = '"use strict";\n' + "\n".join(page_part(__package__, name) for name in SCRIPTS)
-    return Template(page_part(__package__, "page.html")).substitute(
-        policy=content_policy(script, more=" blob:; worker-src blob:"),
-        version=html.escape(__version__),
-        title=html.escape(title),
-        caption=html.escape(caption),
-        notes="".join(f'<p class="note">{html.escape(note)}</p>' for note in (*notes, *page.notes)),
-        metrics="".join(
-            f"<tr><th>{html.escape(label)}</th><td>{html.escape(value)}</td></tr>" for label, value in metrics
-        ),
-        credit=_credit(presentation),
-        meta=_meta(presentation),
-        style=page_part(__package__, "page.css"),
+    script = '"use strict";\n' + "\n".join(page_part(PACKAGE, name) for name in SCRIPTS)
+    credit = (presentation.credit and f"© {presentation.credit}", presentation.provenance)
+    return page(
+        PACKAGE,
+        "page.html",
         script=script,
-        scene=script_json(scene),
-        shaders=script_json({name: page_part(__package__, file) for name, file in SHADERS.items()}),
+        more=" blob:; worker-src blob:",
+        version=__version__,
+        title=title,
+        caption=caption,
+        notes=(*notes, *shaded.notes),
+        metrics=metrics,
+        credit=" · ".join(text for text in credit if text),
+        meta={
+            "author": presentation.author,
+            "dcterms.license": presentation.license,
+            "dcterms.provenance": presentation.provenance,
+        },
+        scene=scene,
+        shaders={name: page_part(PACKAGE, file) for name, file in SHADERS.items()},
         records=_packed(planes(quantized)),
         **{name: "" if values is None else _packed(values.tobytes()) for name, values in arrays.items()},
     )
@@ -132,21 +135,6 @@ def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> Pa
         lambda directions: gaussian_colors(gaussians, light, shading, directions).cpu(), count
     )
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
-
-
-def _credit(presentation: Presentation) -> str:
-    """A line of whom the scene is owed to, and what machines read of it; empty where nobody is named."""
-    shown = presentation
-    lines = [text for text in (shown.credit and f"© {shown.credit}", shown.provenance) if text]
-    return f'<p class="credit">{html.escape(" · ".join(lines))}</p>' if lines else ""
-
-
-def _meta(presentation: Presentation) -> str:
-    names = {"author": presentation.author, "dcterms.license": presentation.license}
-    names["dcterms.provenance"] = presentation.provenance
-    return "".join(
-        f'<meta name="{name}" content="{html.escape(text)}">\n' for name, text in names.items() if text
-    )
 
 
 def _frame(cameras: Mapping[str, Camera], first: str, presentation: Presentation) -> dict[str, Any]:

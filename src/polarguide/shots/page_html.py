@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import base64
-import html
 import math
 import zlib
-from string import Template
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.shots.catalog import KINDS, REASON_COLORS, MapKind
+from polarguide.shots.catalog import KINDS, REASON_COLORS
 from polarguide.shots.maps import REASONS, Reason, ShotMaps
-from polarguide.shots.pictures import Stretch, drawn, stretch_of
+from polarguide.shots.pictures import drawn, stretch_of
 from polarguide.shots.surface import SurfaceMaps
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import content_policy, data_uri, page_part, script_json
+from polarguide.visualization.embedded import data_uri
+from polarguide.visualization.pages import page, page_part, script_json
 
 PAGE = "shot.html"
 SIDE = 816
@@ -36,36 +35,32 @@ def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
     """
     step = max(1, math.ceil(max(maps.size) / SIDE))
     shown = [kind for kind in KINDS if kind.key not in _HIDDEN]
-    layers, legends = [], []
+    layers, stretches = [], []
     for kind in shown:
         values = kind.values(maps, surface)
         stretch = stretch_of(kind, values, maps)
         picture = drawn(kind, values, maps, stretch, step)
         # What is listed as lossless there stays exact; the noise of the others would make the page large.
         layers.append(data_uri(picture, "normal" if kind.look == "reason" else "", SIDE))
-        legends.append(_legend(kind, stretch))
+        stretches.append(stretch)
     height, width = maps.reason[::step, ::step].shape
     packed, scales = _numbers(maps, surface, step)
     data = {"width": width, "height": height, "step": step, "layers": layers, "numbers": packed, **scales,
             "reasons": [REASONS[code] for code in Reason]}  # fmt: skip
-    script = Template(page_part(_PACKAGE, "shot.js")).substitute(data=script_json(data))
     w, h = maps.size
-    said = f"{w} x {h} pixels" + (f"; every {step}. pixel each way is on this page" if step > 1 else "")
-    return Template(page_part(_PACKAGE, "shot.html")).substitute(
-        policy=content_policy(script),
-        title=html.escape(maps.name),
-        summary=html.escape(said),
-        style=page_part(_PACKAGE, "shot.css"),
-        buttons="".join(
-            f'<button type="button" data-layer="{k}" aria-pressed="false">{html.escape(kind.label)}</button>'
-            for k, kind in enumerate(shown)
-        ),
-        legends="".join(legends),
+    return page(
+        _PACKAGE,
+        "shot.html",
+        script=page_part(_PACKAGE, "shot.js").replace("$data", script_json(data)),
+        title=maps.name,
+        summary=f"{w} x {h} pixels" + (f"; every {step}. pixel each way is on this page" if step > 1 else ""),
+        shown=list(zip(shown, stretches, strict=True)),
+        gradient=figures.color_gradient,
+        wheel=figures.aolp_wheel(),
+        reasons={code.name.lower(): color for code, color in REASON_COLORS.items()},
         width=width,
         height=height,
-        ratio=f"{width / height:.4f}",
         facts=_facts(maps, surface),
-        script=script,
     )
 
 
@@ -104,36 +99,13 @@ def _numbers(maps: ShotMaps, surface: SurfaceMaps, step: int) -> tuple[str, dict
     }
 
 
-def _legend(kind: MapKind, stretch: Stretch) -> str:
-    mark = ""
-    if kind.look == "scalar":
-        stops = figures.color_gradient(kind.color_map)
-        unit = f"&#8201;{kind.shown_unit.replace('deg', '°')}" if kind.shown_unit else ""
-        mark = (
-            f'<span>{stretch.low:g}</span><span class="ramp" style="background:linear-gradient(90deg,{stops})"></span>'
-            f"<span>{stretch.high:g}{unit}</span>"
-        )
-    elif kind.look == "angle":
-        mark = figures.aolp_wheel()
-    elif kind.look == "reason":
-        mark = "".join(
-            f'<span class="patch" style="background:rgb{color}"></span><span>{code.name.lower()}</span>'
-            for code, color in REASON_COLORS.items()
-        )
-    elif kind.look == "normal":
-        mark = "<span>right is red, up is green, toward the camera is blue; gray: no angle</span>"
-    said = "" if kind.fixed or not stretch.text else f"<span>stretch: {html.escape(stretch.text)}</span>"
-    note = f'<span class="note">{html.escape(kind.note)}</span>' if kind.note else ""
-    return f'<p class="legend" hidden>{mark}{said}{note}</p>'
-
-
-def _facts(maps: ShotMaps, surface: SurfaceMaps) -> str:
+def _facts(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, str]:
     counts = np.bincount(maps.reason.ravel(), minlength=len(Reason)) / maps.reason.size
     ratio = (
         "too dark to tell" if maps.pair_ratio is None else f"{maps.pair_ratio:.4f} (1 for ideal polarizers)"
     )
     wells = f", {1 / maps.noise.slope:,.0f} electrons at full scale" if maps.noise.slope > 0 else ""
-    facts = {
+    return {
         "pixels": ", ".join(f"{code.name.lower()} {counts[code]:.1%}" for code in Reason if counts[code] > 0),
         "median DoLP": f"{float(np.median(maps.dolp[maps.measured])):.4f}" if maps.measured.any() else "none",
         "(I0 + I90) / (I45 + I135)": ratio,
@@ -145,4 +117,3 @@ def _facts(maps: ShotMaps, surface: SurfaceMaps) -> str:
         "files": ", ".join(path.name for path in maps.files) or "a view of a scene",
         **({"notes": " ".join(maps.notes)} if maps.notes else {}),
     }
-    return "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())

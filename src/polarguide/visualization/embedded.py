@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
-from typing import Any
 
 import cv2
 
@@ -102,28 +98,3 @@ def chosen_views(names: Sequence[str], count: int) -> list[str]:
     if count >= len(names):
         return list(names)
     return [names[index * len(names) // count] for index in range(count)]
-
-
-def page_part(package: str | None, name: str) -> str:
-    """A file of the page that a package brings in its folder ``page``."""
-    return (resources.files(package or "") / "page" / name).read_text(encoding="utf-8")
-
-
-def script_json(data: Any) -> str:
-    """JSON that cannot end the script element that holds it."""
-    text = json.dumps(data, allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def content_policy(script: str = "", *, more: str = "") -> str:
-    """The policy of a page that asks for nothing: pictures within it, its styles, and this one script may be used.
-
-    Args:
-        script: all that stands between the page's script tags; empty: no script may run.
-        more: what else may run, beside the script; further directives after a semicolon.
-    """
-    allowed = ""
-    if script:
-        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-        allowed = f" script-src 'sha256-{digest}'{more};"
-    return f"default-src 'none';{allowed} img-src data:; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"

@@ -1,0 +1,68 @@
+"""Pages and files from the templates in the folders ``page`` of this package: HTML that asks for nothing outside."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from functools import lru_cache
+from typing import Any
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, select_autoescape
+
+BASE = "polarguide.visualization"
+"""Its folder ``page`` has what all pages share: ``base.html`` with the head, and ``chart.svg``."""
+
+
+@lru_cache
+def templates(package: str) -> Environment:
+    """The templates of a package's folder ``page``, and those that all share; texts in HTML and SVG are escaped."""
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(package, "page"), PackageLoader(BASE, "page")]),
+        autoescape=select_autoescape(["html", "svg"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["script_json"] = script_json
+    return environment
+
+
+def page_part(package: str, name: str) -> str:
+    """A file of the page that a package brings in its folder ``page``, as it is."""
+    loader = templates(package).loader
+    assert loader is not None
+    return loader.get_source(templates(package), name)[0]
+
+
+def page(package: str, name: str, *, script: str = "", more: str = "", **values: Any) -> str:
+    """An HTML page of a template that extends ``base.html``.
+
+    Args:
+        package, name: the template. script: all that stands between the page's script tags; empty: no script may run.
+        more: what else may run, beside the script; further directives after a semicolon.
+        values: what the template names; ``title`` at least.
+    """
+    policy = content_policy(script, more=more)
+    return templates(package).get_template(name).render(policy=policy, script=script, **values)
+
+
+def script_json(data: Any) -> str:
+    """JSON that cannot end the script element that holds it."""
+    text = json.dumps(data, allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def content_policy(script: str = "", *, more: str = "") -> str:
+    """The policy of a page that asks for nothing: pictures within it, its styles, and this one script may be used.
+
+    Args:
+        script: all that stands between the page's script tags; empty: no script may run.
+        more: what else may run, beside the script; further directives after a semicolon.
+    """
+    allowed = ""
+    if script:
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        allowed = f" script-src 'sha256-{digest}'{more};"
+    return f"default-src 'none';{allowed} img-src data:; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"
