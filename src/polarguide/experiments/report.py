@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 import msgspec
 import torch
+from msgspec import UNSET
 
 from polarguide.capture import Scene, View
 from polarguide.capture.ground_truth import METAL_CLASSES
@@ -215,7 +216,9 @@ def _summary(results: Results) -> str:
         return f"{count:,} {word}{'' if count == 1 else 's'}"
 
     seeds = " or ".join(plural(count, "seed") for count in seed_counts(results))
-    own = " unless a row says otherwise" if any(recipe.steps for recipe in record.recipes) else ""
+    own = (
+        " unless a row says otherwise" if any(recipe.steps is not UNSET for recipe in record.recipes) else ""
+    )
     counts = f"{plural(len(record.recipes), 'recipe')}, {plural(len(record.scenes), 'scene')}, {seeds}"
     return f"{counts}, {record.settings.steps:,} steps a run{own}"
 
@@ -228,7 +231,9 @@ def _facts(results: Results) -> dict[str, str]:
         facts["refractive_index"] = "that of each scene"
     stated = {key.replace("_", " "): "unknown" if v is None else str(v) for key, v in facts.items()}
     for scene in record.scenes:
-        index = f"; refractive index {scene.refractive_index:g}" if scene.refractive_index else ""
+        index = (
+            f"; refractive index {scene.refractive_index:g}" if scene.refractive_index is not UNSET else ""
+        )
         views = f"{scene.views} views, test: {', '.join(scene.test_views)}"
         stated[f"scene {scene.name}"] = f"{views}; digest {scene.digest[:16]}{index}"
     return stated

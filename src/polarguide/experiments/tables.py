@@ -9,6 +9,7 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 
 from polarguide.evaluation.table import COLUMNS, MESH_LABEL, PART_METRICS, Metric
 from polarguide.experiments.record import RunRecord
@@ -171,7 +172,7 @@ def _remark(row: Row, results: Results) -> str:
         missing = f"{done} of {len(states)} {'runs' if row.scene is None else 'seeds'}"
     elif row.scene is not None and len(seed_counts(results)) > 1:
         missing = f"{done} seed{'' if done == 1 else 's'}"
-    return ", ".join(filter(None, (f"{steps:,} steps" if steps else "", missing)))
+    return ", ".join(filter(None, (f"{steps:,} steps" if steps is not UNSET else "", missing)))
 
 
 def notes(results: Results) -> list[str]:
