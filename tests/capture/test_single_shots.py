@@ -16,8 +16,7 @@ from polarguide.capture.filter.exif_exposure import read_taken, taken
 from polarguide.capture.filter.single_shots import split_name
 from polarguide.capture.polarizer_angles import Angle, angle_labels, turned
 from polarguide.polarizer import malus
-from polarguide.synth.filter_shots import FilterShot, behind_filter, exif_tags, filter_jpeg
-from polarguide.synth.sensor import Sensor
+from polarguide.synth.sensor import FilterShot, Sensor, behind_filter, exif_tags, filter_jpeg
 
 
 @pytest.mark.parametrize(

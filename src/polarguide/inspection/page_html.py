@@ -6,10 +6,10 @@ import html
 from collections.abc import Sequence
 from string import Template
 
-from polarguide.inspection.angle_checks import AngleFindings
+from polarguide.inspection.angles import AngleFindings
+from polarguide.inspection.capture import ViewMeasurements
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.layers import LAYERS, SHOT_LAYERS, Layer, layer_uris
-from polarguide.inspection.measurements import ViewMeasurements
 from polarguide.inspection.shots import ShotFindings
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.progress import SILENT, Reporter

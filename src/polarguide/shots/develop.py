@@ -32,8 +32,7 @@ from polarguide.files import require_file
 from polarguide.preparation.mosaic_files import MosaicFiles
 from polarguide.preparation.mosaic_samples import block_intensities, sample_blocks
 from polarguide.shots.exposures import ExposureSet
-from polarguide.shots.maps import Map, NoiseModel
-from polarguide.shots.noise import estimated_noise, given_noise, interpolation_factors
+from polarguide.shots.maps import Map, NoiseModel, estimated_noise, given_noise, interpolation_factors
 from polarguide.shots.options import ShotOptions
 
 Mask = NDArray[np.bool_]

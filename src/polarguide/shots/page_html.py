@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.shots.catalog import KINDS, REASON_COLORS, MapKind
 from polarguide.shots.maps import REASONS, Reason, ShotMaps
-from polarguide.shots.pictures import Stretch, drawn, stretch_of
-from polarguide.shots.surface import SurfaceMaps
+from polarguide.shots.pictures import KINDS, REASON_COLORS, MapKind, Stretch, drawn, stretch_of
+from polarguide.shots.read import SurfaceMaps
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import content_policy, data_uri, page_part, script_json
 

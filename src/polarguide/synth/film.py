@@ -11,9 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera
-from polarguide.synth.rays import lens_stokes, opaque_value, pinhole, primary_rays
-from polarguide.synth.sampler import Sampler
-from polarguide.synth.transport import PathLimits, trace_paths
+from polarguide.synth.transport import (
+    PathLimits,
+    Sampler,
+    lens_stokes,
+    opaque_value,
+    pinhole,
+    primary_rays,
+    trace_paths,
+)
 
 PATHS_AT_ONCE = 1 << 20
 """Limits memory, and the delay of Ctrl-C."""

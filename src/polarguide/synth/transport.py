@@ -11,11 +11,158 @@ emitters are unpolarized, so only the first column of every Mueller matrix is ne
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.synth.bsdf_sampling import DirectionSampler, sample_bsdf, sample_cosine
-from polarguide.synth.sampler import Sampler
+from polarguide.camera import Camera
+
+
+def opaque_value(kind: Any, value: float) -> Any:
+    """A number that is not compiled into the kernel as a literal, so that one kernel serves all views."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return kind(value) if mi.variant().startswith("scalar") else dr.opaque(kind, value)
+
+
+def pinhole(camera: Camera) -> list[Any]:
+    """A camera in Mitsuba's types: width, (fx, fy, cx, cy), the axes of the camera in the world, and its center."""
+    import mitsuba as mi
+
+    inner = [opaque_value(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    # The rows of the world-to-camera rotation are the camera's axes in the world.
+    axes = [mi.Vector3f(*(opaque_value(mi.Float, float(v)) for v in row)) for row in camera.rotation]
+    origin = mi.Point3f(*(opaque_value(mi.Float, float(v)) for v in camera.center))
+    return [opaque_value(mi.UInt32, camera.width), inner, axes, origin]
+
+
+def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
+    """Rays through points in pixels.
+
+    Args:
+        camera: from ``pinhole``.
+        pixel: index of the pixel, row by row.
+        place: position in the pixel, [0, 1)^2.
+
+    Returns:
+        Mitsuba's rays, and the x axis of the lens frame of each ray (see ``optics.lens_frame``), in world axes.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    width, (fx, fy, cx, cy), axes, origin = camera
+    row = pixel // width
+    x = (mi.Float(pixel - row * width) + place.x - cx) / fx
+    y = (mi.Float(row) + place.y - cy) / fy
+    d = dr.normalize(mi.Vector3f(x, y, mi.Float(1.0)))
+    scale = 1 / (1 + d.z)
+    x_ref = mi.Vector3f(1 - d.x * d.x * scale, -d.x * d.y * scale, -d.x)
+    ray, right = (axes[0] * v.x + axes[1] * v.y + axes[2] * v.z for v in (d, x_ref))
+    return mi.Ray3f(origin, ray), right
+
+
+def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
+    """Convert Stokes vectors from Mitsuba's frame of ``-ray.d`` to our lens frame.
+
+    Mitsuba measures angles from its basis counter-clockwise as seen against the light, that is in the picture, as we
+    do; only the basis has to be rotated.
+    """
+    import mitsuba as mi
+
+    forward = -ray.d
+    turn = mi.mueller.rotate_stokes_basis(forward, mi.mueller.stokes_basis(forward), x_ref)
+    s0, s1, s2 = light
+    return [s0, s1 * turn[1, 1] + s2 * turn[1, 2], s1 * turn[2, 1] + s2 * turn[2, 2]]
+
+
+_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41)
+_WHOLE = 2**32
+
+
+class Sampler:
+    """Random numbers for one sample of each pixel.
+
+    The first dimensions follow a Kronecker sequence with the square roots of primes, with a random shift per pixel and
+    dimension (Cranley and Patterson 1976). Every single sample is uniform, so that estimates are unbiased.
+
+    Args:
+        pixel: index of the pixel.
+        sample: index of the sample in its pixel, counted over all passes.
+        seed: seed of the view, as Mitsuba's unsigned integer.
+
+    Attributes:
+        later: generator of independent numbers for the later dimensions.
+    """
+
+    def __init__(self, pixel: Any, sample: Any, seed: Any) -> None:
+        import mitsuba as mi
+
+        self._pixel, self._sample, self._seed = pixel, sample, seed
+        self._used = 0
+        state = mi.sample_tea_64(pixel, seed)
+        self.later = mi.PCG32(1, state + mi.UInt64(sample), mi.UInt64(sample))
+
+    def next(self) -> Any:
+        """The next dimension of the sequence, in [0, 1)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        step = int((_PRIMES[self._used] ** 0.5 % 1) * _WHOLE)
+        self._used += 1
+        shift = mi.sample_tea_32(self._pixel, self._seed + mi.UInt32(self._used))[0]
+        # In integers modulo 2^32, because floats lose digits as the index grows.
+        turned = mi.UInt32((self._sample * mi.UInt32(step) + shift) & mi.UInt32(_WHOLE - 1))
+        return dr.minimum(mi.Float(turned) * (1 / _WHOLE), 1 - 2.0**-24)
+
+    def pair(self) -> Any:
+        """The next two dimensions as a point."""
+        import mitsuba as mi
+
+        first = self.next()
+        return mi.Point2f(first, self.next())
+
+
+LEAST_DENSITY = 1e-5
+DirectionSampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
+
+
+def sample_bsdf(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
+    """Sample a direction by Mitsuba's BSDF.
+
+    Returns:
+        (value, density) for the direction ``toward`` a light; (direction, density, weight, delta) of the sampled one.
+    """
+    import mitsuba as mi
+
+    given = bsdf.eval_pdf(context, si, toward, active)
+    sample, weight = bsdf.sample(context, si, *numbers, active)
+    delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    return given, (sample.wo, sample.pdf, weight, delta)
+
+
+def sample_cosine(
+    bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any
+) -> tuple[Any, Any]:
+    """Sample a direction with a density proportional to the cosine; returns what ``sample_bsdf`` does.
+
+    Mitsuba 3.9 evaluates the diffuse lobe of a coated surface correctly, but if only this lobe is selected, its
+    densities are those of both lobes together.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    value = bsdf.eval(context, si, toward, active)
+    side = dr.sign(si.wi.z)  # surfaces have two sides
+    there = dr.maximum(toward.z * side, 0.0) * dr.inv_pi
+    wo = mi.warp.square_to_cosine_hemisphere(numbers[1])
+    wo = mi.Vector3f(wo.x, wo.y, wo.z * side)
+    density = dr.abs(wo.z) * dr.inv_pi
+    active = active & (density > LEAST_DENSITY)
+    inverse = dr.select(active, 1 / dr.maximum(density, LEAST_DENSITY), 0.0)
+    weight = bsdf.eval(context, si, wo, active) * inverse
+    return (value, there), (wo, dr.select(active, density, 0.0), weight, mi.Bool(False))
+
 
 TINY = 1e-30
 SHOWN = "shown"

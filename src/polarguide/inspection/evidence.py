@@ -1,0 +1,313 @@
+"""Evidence on the angles from surface normals.
+
+Specular light is polarized perpendicular to the plane of incidence, diffuse light parallel to it. The normals come from
+a short training on the photographs alone, which do not depend on the order of the four pictures. The AoLP agrees with
+their azimuth modulo 90 degrees; the multiple of 90 degrees follows from certainly specular pixels, whose DoLP exceeds
+that of diffuse light at their zenith.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate
+
+from polarguide import optics
+from polarguide.camera import Camera
+from polarguide.capture.colmap.model import ColmapModel
+from polarguide.inspection.angles import DEGREES, PAIRINGS, SENSES, Evidence, spatial_cells, sum_by_cluster
+from polarguide.inspection.capture import InspectedView
+from polarguide.vectors import dot, unit
+
+NORMALS = "normals of a short training"
+SAMPLES = 400
+"""Largest number of pixels that are sampled in a view."""
+ZENITH_MARGIN = math.radians(15.0)
+"""Error of a rendered zenith up to which a pixel still counts as certainly specular."""
+LEAST_ZENITH = math.radians(15.0)
+LEAST_DOLP = 0.03
+FEWEST = 500
+LEAST_INLIERS, LARGEST_ERROR, LEAST_CONCENTRATION = 0.5, math.radians(10.0), 0.25
+"""Limits for usable normals: share of pixels that agree, error of the normals there, and length of the mean of
+``exp(4 i (AoLP - azimuth))``, which is 1 for perfect agreement modulo 90 degrees and 0 for none."""
+_SPECULAR = 0.95
+_NORMAL_ERRORS = tuple(math.radians(angle) for angle in (3.0, 6.0, 10.0, 16.0))
+_INLIERS = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The surface that one view sees.
+
+    Attributes:
+        camera: at the size of the maps.
+        normal: unit normals in camera axes that face the camera, [H, W, 3]. depth: camera z, [H, W].
+        known: whether normal and depth are reliable, [H, W] bool.
+    """
+
+    camera: Camera
+    normal: Tensor
+    depth: Tensor
+    known: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSamples:
+    """Pixels with a normal and a measured polarization.
+
+    Attributes:
+        aolp, dolp: measured, [N]. noise: standard deviation of the DoLP, [N].
+        azimuth, zenith: angles of the normal in radians, [N]. position: in the world, [N, 3].
+    """
+
+    aolp: Tensor
+    dolp: Tensor
+    noise: Tensor
+    azimuth: Tensor
+    zenith: Tensor
+    position: Tensor
+
+    def certainly_specular(self, index: float) -> Tensor:
+        """Whether the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
+        most = optics.diffuse_dolp((self.zenith + ZENITH_MARGIN).clamp(max=math.pi / 2), index)
+        return self.dolp > most + 2 * self.noise
+
+
+def sample_surfaces(
+    pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0, seed: int = 0
+) -> SurfaceSamples:
+    """Sample pixels with a reliable normal and significant polarization, at most 400 per view.
+
+    Args:
+        pairs: views and their surfaces, whose maps may be smaller than the pictures.
+        pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
+        seed: of the random sampling.
+    """
+    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
+    generator = torch.Generator().manual_seed(seed)
+    found: list[Tensor] = []
+    for view, surface in pairs:
+        size = surface.known.shape
+        gray = view.intensities().mean(dim=-1)[order]
+        noise = optics.intensity_noise(gray)
+        planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
+        planes = interpolate(planes[None], size=size, mode="area")[0]
+        stokes, degree = planes[:3], optics.dolp(planes[:3])
+        spread = optics.dolp_noise(stokes, planes[3])
+        rays = surface.camera.rays()
+        zenith = optics.zenith(surface.normal, rays)
+        good = surface.known & (planes[4] < 1e-3) & (stokes[0] > 0.01) & (zenith > LEAST_ZENITH)
+        good &= (degree > LEAST_DOLP) & (degree > 3 * spread)
+        chosen = good.flatten().nonzero()[:, 0]
+        chosen = chosen[torch.randperm(len(chosen), generator=generator)[:SAMPLES]]
+        position = surface.camera.to_world(rays / rays[..., 2:] * surface.depth[..., None])
+        position = position + surface.camera.center.float()
+        rows = (optics.aolp(stokes), degree, spread, optics.azimuth(surface.normal, rays), zenith)
+        flat = torch.stack([*(row.flatten() for row in rows), *position.reshape(-1, 3).unbind(-1)])
+        found.append(flat[:, chosen])
+    rows_found = torch.cat(found, dim=1) if found else torch.zeros(8, 0)
+    aolp, dolp, noise_of, azimuth, zenith_of = rows_found[:5].unbind(0)
+    return SurfaceSamples(aolp, dolp, noise_of, azimuth, zenith_of, rows_found[5:].T)
+
+
+def normal_evidence(pixels: SurfaceSamples, index: float) -> Evidence:
+    """Log-likelihoods of all zeros and both senses, given the normals.
+
+    Twice a pixel's angle between AoLP and azimuth follows a mixture: a von Mises distribution about the perpendicular,
+    one about the parallel, and a uniform one. The first two have equal weights; for certainly specular pixels the first
+    has nearly all. Their width follows from the error of the normals over the sine of the zenith and from the noise of
+    the AoLP; that error and the uniform share are fitted by maximum likelihood.
+    """
+    count = len(pixels.aolp)
+    if count < FEWEST:
+        note = (
+            f"Only {count} pixels have a reliable normal and significant polarization; {FEWEST} are needed."
+        )
+        return Evidence(NORMALS, torch.zeros(1, len(SENSES), DEGREES), count, False, note)
+    must = pixels.certainly_specular(index)
+    coarse = torch.arange(0, DEGREES, 4)
+    fits = [
+        (float(_log_likelihood(pixels, must, coarse, error, inliers).sum(dim=0).max()), error, inliers)
+        for error in _NORMAL_ERRORS
+        for inliers in _INLIERS
+    ]
+    _, error, inliers = max(fits)
+    values = _log_likelihood(pixels, must, torch.arange(DEGREES), error, inliers)
+    coherent = _concentration(pixels)
+    note = (
+        f"{count} pixels, {int(must.sum())} of which are certainly specular; the AoLP of {inliers:.0%} agrees with the "
+        f"normals, whose error is about {math.degrees(error):.0f}° (agreement modulo 90°: {coherent:.2f} of 1)."
+    )
+    usable = inliers >= LEAST_INLIERS and error <= LARGEST_ERROR and coherent >= LEAST_CONCENTRATION
+    return Evidence(NORMALS, sum_by_cluster(values, spatial_cells(pixels.position)), count, usable, note)
+
+
+def _concentration(pixels: SurfaceSamples) -> float:
+    """Agreement of AoLP and azimuth modulo 90 degrees, for the better sense and the best zero, in [0, 1]."""
+    lengths = []
+    for sense in SENSES:
+        angle = 4 * (sense * pixels.aolp - pixels.azimuth)
+        lengths.append(float(torch.hypot(torch.cos(angle).mean(), torch.sin(angle).mean())))
+    return max(lengths)
+
+
+def _log_likelihood(
+    pixels: SurfaceSamples, must: Tensor, zeros: Tensor, error: float, inliers: float
+) -> Tensor:
+    """Log-density of the pixels' angles for both senses and zeros [Z] in degrees, [N, 2, Z]."""
+    aolp_noise = pixels.noise / (2 * pixels.dolp)
+    variance = (error / torch.sin(pixels.zenith)) ** 2 + aolp_noise**2
+    concentration = (1 / (4 * variance)).clamp(max=200.0)[:, None]
+    height = 1 / (math.pi * torch.special.i0e(concentration))
+    across = torch.where(must, _SPECULAR, 0.5)[:, None]
+    turn = torch.deg2rad(2 * zeros.float())[None]
+    found = []
+    for sense in SENSES:
+        cosine = torch.cos(2 * (sense * pixels.aolp - pixels.azimuth)[:, None] + turn)
+        lobes = across * torch.exp(-concentration * (1 + cosine))
+        lobes += (1 - across) * torch.exp(-concentration * (1 - cosine))
+        found.append(torch.log((1 - inliers) / math.pi + inliers * height * lobes))
+    return torch.stack(found, dim=1)
+
+
+POINTS = "points observed in several views"
+FEWEST_OBSERVATIONS = 4
+FEWEST_POINTS = 20
+LARGEST_MISFIT_DEG = 8.0
+"""Median angle in degrees between fields and their common plane above which the evidence is not used."""
+_LEAST_SCALE = 2e-4
+
+
+def point_evidence(
+    views: tuple[InspectedView, ...], model: ColmapModel, index: float, pairing: int = 0
+) -> tuple[Evidence, SurfaceSamples | None]:
+    """Log-likelihoods of all zeros and both senses, given the points of a COLMAP model.
+
+    Args:
+        views: the views with a pose.
+        model: points and their observations.
+        index: refractive index.
+        pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
+
+    Returns:
+        The evidence; and, if it is usable, the observations with the normals found at the best zero.
+    """
+    observations = model.observations([view.name for view in views])
+    fields, weights, degrees = _observed_fields(views, model.points.double(), observations, index, pairing)
+    keep = (weights > 0).sum(dim=1) >= FEWEST_OBSERVATIONS
+    count = int((weights[keep] > 0).sum())
+    if int(keep.sum()) < FEWEST_POINTS:
+        return Evidence(
+            POINTS, torch.zeros(1, 2, DEGREES), count, False, _too_few(int(keep.sum()), index)
+        ), None
+    weights, points = weights[keep].double(), model.points[keep]
+    spreads = torch.stack([_spread(fields[sense][keep].double(), weights) for sense in range(len(SENSES))])
+    observed = (weights > 0).sum(dim=1)
+    certainty = (weights.sum(dim=1) / observed)[None, :, None]
+    scale = max(float((spreads * certainty).amin(dim=(0, 2)).median()), _LEAST_SCALE)
+    likelihood = -0.5 * (observed - 2.0)[None, :, None] * torch.log1p(spreads * certainty / scale)
+    total = likelihood.sum(dim=1)
+    sense, zero = divmod(int(total.argmax()), DEGREES)
+    misfit = math.degrees(math.asin(min(1.0, float(spreads[sense, :, zero].median().sqrt()))))
+    note = (
+        f"{int(keep.sum())} points with {count} observations above the diffuse limit; at the best zero their fields "
+        f"lie within {misfit:.1f}° of a plane (median)."
+    )
+    clusters = sum_by_cluster(likelihood.movedim(1, 0), spatial_cells(points))
+    usable = misfit <= LARGEST_MISFIT_DEG
+    evidence = Evidence(POINTS, clusters.float(), count, usable, note)
+    if not usable:
+        return evidence, None
+    return evidence, _seen_pixels(
+        fields[sense][keep].double(), weights, degrees[keep].unbind(-1), points, zero
+    )
+
+
+def _seen_pixels(
+    fields: Tensor, weights: Tensor, degrees: tuple[Tensor, ...], points: Tensor, zero: int
+) -> SurfaceSamples:
+    """Observations as samples: their DoLP, and the zenith of the normal perpendicular to the fields of their point."""
+    e, p = fields.unbind(dim=2)
+    turned = math.cos(math.radians(zero)) * e + math.sin(math.radians(zero)) * p
+    moment = torch.einsum("pv,pvi,pvj->pij", weights, turned, turned)
+    normals = torch.linalg.eigh(moment)[1][:, :, 0]
+    across = math.cos(math.radians(zero)) * p - math.sin(math.radians(zero)) * e
+    # The ray is perpendicular to both axes; the normal's component along the second is the sine of the zenith.
+    sine = dot(across, normals[:, None].expand_as(across)).abs().clamp(max=1)
+    good = weights > 0
+    zenith = torch.asin(sine)[good].float()
+    nothing = torch.zeros_like(zenith)
+    return SurfaceSamples(
+        nothing, degrees[0][good], degrees[1][good], nothing, zenith, points[good.nonzero()[:, 0]]
+    )
+
+
+def _too_few(found: int, index: float) -> str:
+    limit = float(optics.diffuse_dolp_limit(index))
+    return (
+        f"Only {found} points have {FEWEST_OBSERVATIONS} observations with a DoLP above the diffuse limit "
+        f"{limit:.2f}; {FEWEST_POINTS} are needed."
+    )
+
+
+def _observed_fields(
+    views: tuple[InspectedView, ...], points: Tensor, seen: Tensor, index: float, pairing: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Fields in the world and the axes perpendicular to field and ray, [2, P, V, 2, 3]; weights [P, V]; DoLP and its
+    noise [P, V, 2].
+    """
+    limit = float(optics.diffuse_dolp_limit(index))
+    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
+    fields = torch.zeros(len(SENSES), len(points), len(views), 2, 3)
+    weights = torch.zeros(len(points), len(views))
+    degrees = torch.zeros(len(points), len(views), 2)
+    for column, view in enumerate(views):
+        camera = view.camera
+        assert camera is not None
+        local = points @ camera.rotation.T + camera.translation
+        depth = local[:, 2].clamp(min=1e-9)
+        u = (camera.fx * local[:, 0] / depth + camera.cx) / camera.width
+        v = (camera.fy * local[:, 1] / depth + camera.cy) / camera.height
+        inside = (local[:, 2] > 1e-9) & (torch.minimum(u, v) > 0.01) & (torch.maximum(u, v) < 0.99)
+        gray = view.intensities().mean(dim=-1)[order]
+        noise = optics.intensity_noise(gray)
+        planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
+        grid = torch.stack((2 * u - 1, 2 * v - 1), dim=-1).float()[None, None]
+        sampled = grid_sample(planes[None], grid, align_corners=False)[0, :, 0]
+        stokes, degree = sampled[:3], optics.dolp(sampled[:3])
+        spread = optics.dolp_noise(stokes, sampled[3])
+        degrees[:, column] = torch.stack((degree, spread), dim=-1)
+        certain = degree > limit + 3 * spread
+        good = seen[:, column] & inside & certain & (sampled[4] < 1e-3) & (stokes[0] > 0.02)
+        # Light that was polarized before the reflection turns the field by about sqrt(1 - d^2) / d times its DoLP,
+        # alike in many observations: hence the square of the inverse variance that this suggests.
+        weights[:, column] = good * (degree**2 / (1.05 - degree**2)) ** 2
+        x_ref, up_ref = optics.lens_frame(unit(local).float())
+        turn = camera.rotation.float()
+        angle = optics.aolp(stokes)
+        for k, sense in enumerate(SENSES):
+            cosine, sine = torch.cos(angle)[:, None], sense * torch.sin(angle)[:, None]
+            fields[k, :, column, 0] = (cosine * x_ref + sine * up_ref) @ turn
+            fields[k, :, column, 1] = (cosine * up_ref - sine * x_ref) @ turn
+    return fields, weights, degrees
+
+
+def _spread(fields: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean square of the fields' components along the best normal for every zero, [P, 180].
+
+    A field rotated by z is ``cos z e + sin z p``, so the moments of all zeros follow from three moments.
+    """
+    share = weights / weights.sum(dim=1, keepdim=True)
+    e, p = fields.unbind(dim=2)
+    moments = [torch.einsum("pv,pvi,pvj->pij", share, a, b) for a, b in ((e, e), (p, p), (e, p))]
+    mixed = moments[2] + moments[2].mT
+    found = []
+    for zero in range(DEGREES):
+        c, s = math.cos(math.radians(zero)), math.sin(math.radians(zero))
+        moment = c * c * moments[0] + s * s * moments[1] + s * c * mixed
+        found.append(torch.linalg.eigvalsh(moment)[:, 0].clamp(min=0))
+    return torch.stack(found, dim=1)
