@@ -27,7 +27,7 @@ from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, write_view
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file, write_whole, writing
-from polarguide.inspection.angles import AngleFindings, FileOrder, swaps
+from polarguide.inspection.angles import AngleFindings, swaps
 from polarguide.inspection.capture import Capture, InspectedView
 from polarguide.inspection.verdict import Check
 from polarguide.presentation import PRESENTATION_FILE
@@ -119,7 +119,9 @@ def _write(capture: Capture, change: Calibration, folder: Path, reporter: Report
             if change.zero:
                 _rotate_view(capture, change, folder, view)
             else:
-                _rename_view(capture, change.order, folder, view)
+                for named, angle in zip(ANGLES, change.order, strict=True):
+                    source = capture.layout.pictures[view][named]
+                    shutil.copy2(source, folder / "polar" / f"{view}_{angle:03d}{source.suffix}")
             advance(done)
     write_whole(folder / METADATA, _corrected_metadata(capture, change))
 
@@ -142,12 +144,6 @@ def _require_inside(root: Path, source: Path) -> None:
                 found=f"a link to {path.resolve()}",
                 remedy="Copy into the scene what it points to, or remove it; nothing was written.",
             )
-
-
-def _rename_view(capture: Capture, order: FileOrder, folder: Path, view: str) -> None:
-    for name, true in zip(ANGLES, order, strict=True):
-        source = capture.layout.pictures[view][name]
-        shutil.copy2(source, folder / "polar" / f"{view}_{true:03d}{source.suffix}")
 
 
 def _rotate_view(capture: Capture, change: Calibration, folder: Path, view: str) -> None:

@@ -201,9 +201,11 @@ def point_evidence(
     keep = (weights > 0).sum(dim=1) >= FEWEST_OBSERVATIONS
     count = int((weights[keep] > 0).sum())
     if int(keep.sum()) < FEWEST_POINTS:
-        return Evidence(
-            POINTS, torch.zeros(1, 2, DEGREES), count, False, _too_few(int(keep.sum()), index)
-        ), None
+        note = (
+            f"Only {int(keep.sum())} points have {FEWEST_OBSERVATIONS} observations with a DoLP above the diffuse "
+            f"limit {float(optics.diffuse_dolp_limit(index)):.2f}; {FEWEST_POINTS} are needed."
+        )
+        return Evidence(POINTS, torch.zeros(1, 2, DEGREES), count, False, note), None
     weights, points = weights[keep].double(), model.points[keep]
     spreads = torch.stack([_spread(fields[sense][keep].double(), weights) for sense in range(len(SENSES))])
     observed = (weights > 0).sum(dim=1)
@@ -243,14 +245,6 @@ def _seen_pixels(
     nothing = torch.zeros_like(zenith)
     return SurfaceSamples(
         nothing, degrees[0][good], degrees[1][good], nothing, zenith, points[good.nonzero()[:, 0]]
-    )
-
-
-def _too_few(found: int, index: float) -> str:
-    limit = float(optics.diffuse_dolp_limit(index))
-    return (
-        f"Only {found} points have {FEWEST_OBSERVATIONS} observations with a DoLP above the diffuse limit "
-        f"{limit:.2f}; {FEWEST_POINTS} are needed."
     )
 
 

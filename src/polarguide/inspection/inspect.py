@@ -203,7 +203,6 @@ def _trained_pixels(
     backend: Backend,
     reporter: Reporter,
 ) -> SurfaceSamples:
-    names = [view.name for view in capture.posed]
     scene = _training_scene(capture, settings, reporter)
     with reporter.track("short training", settings.steps) as advance:
         state = short_run(
@@ -214,7 +213,7 @@ def _trained_pixels(
             on_step=lambda report: advance(report.step + 1),
             refractive_index=index,
         )
-    with reporter.track("comparing with normals", len(names)) as advance:
+    with reporter.track("comparing with normals", len(capture.posed)) as advance:
 
         def surfaces() -> Iterator[tuple[InspectedView, Surface]]:
             for done, view in enumerate(capture.posed):

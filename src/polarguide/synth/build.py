@@ -22,7 +22,7 @@ from polarguide.synth.schema import (
     require_solid,
     require_unicode,
 )
-from polarguide.synth.settings import Variant
+from polarguide.synth.settings import Variant, mi
 from polarguide.synth.shapes import make_mesh, sphere
 from polarguide.synth.textures import make_environment, make_texture
 from polarguide.synth.transport import SHOWN
@@ -61,8 +61,6 @@ def _metal(index: tuple[float, float, float], channel: int | None) -> dict[str, 
 
 
 def _bitmap(picture: Array, channel: int | None) -> dict[str, Any]:
-    import mitsuba as mi
-
     part = picture if channel is None else picture[..., channel : channel + 1]
     # Rows of a picture go down, v goes up.
     data = np.ascontiguousarray(part[::-1], np.float32)
@@ -72,8 +70,6 @@ def _bitmap(picture: Array, channel: int | None) -> dict[str, Any]:
 
 def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
     """The environment emitter of a panorama [H, W, 3]."""
-    import mitsuba as mi
-
     part = panorama if channel is None else np.repeat(panorama[..., channel : channel + 1], 3, -1)
     # The left edge of Mitsuba's panoramas is its -z; y is up and columns proceed to the right.
     axes = np.array([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
@@ -92,8 +88,6 @@ def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> d
     Raises:
         PolarguideError: a field is missing or has another type; ``where`` names the scene.
     """
-    import mitsuba as mi
-
     try:
         position, toward = list(light["position"]), list(light["toward"])
         half = [float(s) / 2 for s in light["size"]]
@@ -145,8 +139,6 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
 
     The files are ``mesh/<thing>.ply`` and ``environment.hdr``.
     """
-    import mitsuba as mi
-
     make_folder(folder / "mesh")
     meshes = [_mesh(thing, spec) for thing in spec.things]
     for thing, mesh in zip(spec.things, meshes, strict=True):
@@ -234,8 +226,6 @@ def _user_mesh(path: Path) -> Mesh:
 
 def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
     """What Mitsuba reads of a mesh, by its names; ``flat`` leaves normals at points out."""
-    import mitsuba as mi
-
     try:
         return mi.traverse(mi.load_dict({"type": kind, "filename": str(path), "face_normals": flat}))
     except (
@@ -270,8 +260,6 @@ def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
 
 def _shape(thing: Thing, mesh: Mesh, path: Path, surface: dict[str, Any]) -> Any:
     """Mitsuba's shape with its BSDF and attributes."""
-    import mitsuba as mi
-
     if thing.shape.get("type") == "ball":
         radius = _radius(thing) * thing.scale
         return mi.load_dict({"type": "sphere", "center": list(thing.position), "radius": radius, **surface})

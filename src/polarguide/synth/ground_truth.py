@@ -15,8 +15,12 @@ from numpy.typing import NDArray
 from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.synth.build import BuiltScene
-from polarguide.synth.folder import display_encoded, write_file
+from polarguide.synth.folder import write_file
 from polarguide.synth.mesh import Array
+from polarguide.synth.settings import dr, mi
+from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture
+from polarguide.visualization.sheet import contact_sheet
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +40,6 @@ class Intersections:
 
 def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections:
     """Intersect rays with origins [N, 3] and unit directions [N, 3] with the scene."""
-    import mitsuba as mi
-
     if mi.variant().startswith("scalar"):
         pairs = zip(origins.tolist(), toward.tolist(), strict=True)
         rows = [_intersect(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in pairs]
@@ -53,9 +55,6 @@ def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections
 
 
 def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
-    import drjit as dr
-    import mitsuba as mi
-
     si = built.scenes[0].ray_intersect(mi.Ray3f(origin, direction))
     if mi.variant().startswith("scalar"):
         number = next((k + 1 for k, shape in enumerate(built.shapes) if shape == si.shape), 0)
@@ -86,55 +85,36 @@ def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[An
 
 COLUMNS = ("photograph", "DoLP", "AoLP", "specular", "diffuse", "normals", "depth")
 ROWS = 3
+WIDEST = 320
+"""Pixels of the width of one layer in the sheet, at most."""
 QUALITY = 82
 
 
-def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> Path:
+def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
     """Write ``sheet.jpg`` with up to three of these views; all must have ground truth."""
     chosen = sorted({round(k) for k in np.linspace(0, len(names) - 1, min(ROWS, len(names)))})
-    rows = [np.concatenate(_layers(out / "gt" / f"{names[k]}.npz", cameras[k]), axis=1) for k in chosen]
-    sheet = np.ascontiguousarray(np.concatenate(rows)[..., ::-1])
-    width = sheet.shape[1] // len(COLUMNS)
-    for number, label in enumerate(COLUMNS):
-        place, size = (number * width + 6, 15), width / 420
-        for color, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(sheet, label, place, cv2.FONT_HERSHEY_SIMPLEX, size, color, thick, cv2.LINE_AA)
-    _, data = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    rows = [_layers(out / "gt" / f"{names[k]}.npz", cameras[k]) for k in chosen]
+    sheet = contact_sheet(rows, [names[k] for k in chosen], COLUMNS, maximum_width=WIDEST)
+    _, data = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     write_file(out / "sheet.jpg", data.tobytes())
-    return out / "sheet.jpg"
 
 
-def _layers(path: Path, camera: Camera) -> list[NDArray[np.uint8]]:
+def _layers(path: Path, camera: Camera) -> list[Picture]:
     """The pictures of one view, [H, W, 3] each, in the order of ``COLUMNS``."""
     with np.load(path) as ground_truth:
-        stokes, specular, diffuse = (
-            ground_truth[name].astype(np.float64) for name in ("stokes", "specular", "diffuse")
+        stokes, specular, diffuse, normal, depth = (
+            torch.from_numpy(ground_truth[name].astype(np.float32))
+            for name in ("stokes", "specular", "diffuse", "normal", "depth")
         )
-        normal, depth, known = (
-            ground_truth["normal"].astype(np.float64),
-            ground_truth["depth"].astype(np.float64),
-            ground_truth["objid"] > 0,
-        )
-    mean = optics.luminance(torch.from_numpy(stokes))
-    degree, angle = optics.dolp(mean).numpy(), optics.aolp(mean).numpy()
-    facing = camera.to_camera(torch.from_numpy(normal)).numpy() * [1, -1, -1]
-    near, far = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
+    mean = optics.luminance(stokes)
+    degree, known = optics.dolp(mean), depth > 0
+    near, far = np.percentile(depth[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
     return [
-        display_encoded(stokes[0] / 2),
-        _gray(np.sqrt(degree)),
-        _hue(angle / np.pi, np.clip(degree * 4, 0, 1)),
-        display_encoded(specular / 2),
-        display_encoded(diffuse / 2),
-        np.where(known[..., None], np.round(127.5 * (facing + 1)), 0).astype(np.uint8),
-        _gray(np.where(known, 1 - 0.9 * np.clip((depth - near) / max(far - near, 1e-9), 0, 1), 0)),
+        figures.radiance_to_rgb(stokes[0] / 2),
+        figures.dolp_to_rgb(degree),
+        figures.aolp_to_rgb(optics.aolp(mean), degree * 4),
+        figures.radiance_to_rgb(specular / 2),
+        figures.radiance_to_rgb(diffuse / 2),
+        figures.normal_to_rgb(normal, camera),
+        figures.scalar_to_rgb(depth, near, max(far, near + 1e-6), "viridis"),
     ]
-
-
-def _gray(values: Array) -> NDArray[np.uint8]:
-    return np.repeat(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)[..., None], 3, axis=-1)
-
-
-def _hue(turn: Array, strength: Array) -> NDArray[np.uint8]:
-    """Angles in half turns as hues, dark where ``strength`` is small."""
-    codes = np.stack((turn * 180 % 180, np.full_like(turn, 255), 255 * strength), -1).astype(np.uint8)
-    return np.asarray(cv2.cvtColor(codes, cv2.COLOR_HSV2RGB), np.uint8)

@@ -177,7 +177,7 @@ def synthesize(
     if job.mosaics:
         gains = {str(45 * k): gain for k, gain in enumerate(job.sensor.gains)}
         folder.write_file(out / "calibration.json", json.dumps({"gains": gains}).encode())
-        record["sensor"] = {"name": settings.sensor.upper(), **job.sensor.data()}
+        record["sensor"] = {"name": settings.sensor.upper(), **asdict(job.sensor)}
     if settings.sensor == "filter":
         record["shots"] = {name: asdict(plan_shot(settings.seed, k)) for k, name in enumerate(names)}
     with_truth = [number for number, name in enumerate(names) if job.has_ground_truth(name)]

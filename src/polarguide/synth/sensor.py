@@ -7,9 +7,8 @@ read noise normal (EMVA 1288).
 from __future__ import annotations
 
 import struct
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
 import cv2
 import numpy as np
@@ -41,10 +40,6 @@ class Sensor:
     gains: tuple[float, float, float, float] = (1.0, 0.985, 1.01, 0.992)
     bits: int = 12
     black: int = 64
-
-    def data(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self)
 
 
 def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: Sensor) -> Array:

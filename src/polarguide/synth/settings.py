@@ -26,6 +26,20 @@ LONG_SECONDS = 3600.0
 """Longer than anybody who typed a command waits beside it: then it should be meant."""
 
 
+class _Library:
+    """A library of the extra ``synth``: it may be missing, and is imported when something in it is first used."""
+
+    def __init__(self, module: str) -> None:
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(optional_import(self._module, "synth", extra="synth"), name)
+
+
+dr: Any = _Library("drjit")
+mi: Any = _Library("mitsuba")
+
+
 @dataclass(frozen=True)
 class Variant:
     """A variant of Mitsuba that has been made current.
@@ -62,13 +76,11 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
         PolarguideError: Mitsuba is not installed.
     """
     with _silent_stderr():
-        mi = optional_import("mitsuba", "synth", extra="synth")
+        mi.variant()  # imports it
         missing = _missing_llvm()
     if not missing:
         mi.set_variant("llvm_ad_mono_polarized" if color == "rgb" else "llvm_ad_spectral_polarized")
         if threads:
-            import drjit as dr
-
             dr.set_thread_count(threads)
         speed = FAST_PATHS_PER_SECOND * (threads or os.cpu_count() or 1)
         return Variant(mi.variant(), color, True, speed)
@@ -97,15 +109,11 @@ def _silent_stderr() -> Iterator[None]:
 
 def _missing_llvm() -> str:
     """Why LLVM cannot be used; empty if it can."""
-    import mitsuba as mi
-
     path = os.environ.get("DRJIT_LIBLLVM_PATH")
     if path and not os.path.exists(path):  # otherwise the library prints messages
         return f"DRJIT_LIBLLVM_PATH names {path}, which does not exist"
     try:
         mi.set_variant("llvm_ad_mono_polarized")
-        import drjit as dr
-
         version = dr.detail.llvm_version()
     except (ImportError, RuntimeError):
         return "none was found"
