@@ -21,12 +21,10 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.color import srgb_encode_array
-from polarguide.inspection.angle_checks import combine_evidence, order_check, zero_check
-from polarguide.inspection.capture import Capture, read_capture
-from polarguide.inspection.measurements import measure_view
-from polarguide.inspection.orders import ORDERS
+from polarguide.inspection.angles import ORDERS, combine_evidence, order_check, zero_check
+from polarguide.inspection.capture import Capture, measure_view, read_capture
+from polarguide.inspection.evidence import point_evidence
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
-from polarguide.inspection.points import point_evidence
 from polarguide.polarizer import ANGLES
 
 Change = Callable[[NDArray[np.float32]], NDArray[np.float32]]

@@ -37,7 +37,10 @@ if TYPE_CHECKING:
     from polarguide.preparation.settings import PrepareSettings
     from polarguide.progress import Reporter
     from polarguide.sensor_calibration.settings import CalibrateSettings
-    from polarguide.shots import ShotMaps, ShotOptions, SurfaceMaps, find_shots, read_shot, surface_maps
+    from polarguide.shots.exposures import find_shots
+    from polarguide.shots.maps import ShotMaps
+    from polarguide.shots.options import ShotOptions
+    from polarguide.shots.read import SurfaceMaps, read_shot, surface_maps
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
 
@@ -70,7 +73,10 @@ _NAMES = {
     "preparation.settings": ("PrepareSettings",),
     "progress": ("Reporter",),
     "sensor_calibration.settings": ("CalibrateSettings",),
-    "shots": ("ShotMaps", "ShotOptions", "SurfaceMaps", "find_shots", "read_shot", "surface_maps"),
+    "shots.exposures": ("find_shots",),
+    "shots.maps": ("ShotMaps",),
+    "shots.options": ("ShotOptions",),
+    "shots.read": ("SurfaceMaps", "read_shot", "surface_maps"),
     "training.recipe": ("Recipe",),
     "training.settings": ("TrainSettings",),
 }

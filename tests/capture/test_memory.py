@@ -23,7 +23,8 @@ from polarguide.errors import PolarguideError
 from polarguide.preparation.mosaic_source import WORKED
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.shots import ShotOptions, read_shot
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import read_shot
 from polarguide.system import free_memory
 
 

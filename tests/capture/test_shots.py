@@ -29,8 +29,7 @@ from polarguide.errors import PolarguideError
 from polarguide.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.synth.filter_shots import FilterShot, behind_filter, exif_tags, filter_jpeg
-from polarguide.synth.sensor import Sensor
+from polarguide.synth.sensor import FilterShot, Sensor, behind_filter, exif_tags, filter_jpeg
 
 PLAIN = PrepareSettings(poses="none", gains="none", align=False)
 UNIT = (1.0, 1.0, 1.0)

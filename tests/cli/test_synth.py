@@ -12,7 +12,7 @@ import pytest
 from polarguide.cli.app import run
 from polarguide.installation import install_extra
 from polarguide.synth.schema import SceneSpec
-from polarguide.synth.variant import Variant, choose_variant
+from polarguide.synth.settings import Variant, choose_variant
 
 
 def test_without_mitsuba_the_extra_is_named(
@@ -56,7 +56,7 @@ def test_a_long_rendering_is_announced_and_asked_for_before_there_is_a_folder(
         started.append(out)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("polarguide.synth.variant._missing_llvm", lambda: "none was found")
+    monkeypatch.setattr("polarguide.synth.settings._missing_llvm", lambda: "none was found")
     monkeypatch.setattr("polarguide.synth.render.build_scene", build)
     monkeypatch.setattr("sys.stdin", Keyboard(typed) if terminal else io.StringIO(typed))
     monkeypatch.setattr("polarguide.cli.console.console._force_terminal", terminal)

@@ -20,7 +20,7 @@ from polarguide.experiments.join import join_tables
 from polarguide.experiments.options import BENCH, Bench, BenchOptions, CompareOptions
 from polarguide.recipes import recipe_named
 from polarguide.synth import render as renderer
-from polarguide.synth.manifest import scene_digest
+from polarguide.synth.folder import scene_digest
 from polarguide.synth.settings import PRESETS, SynthSettings, find_scene
 from polarguide.training.settings import TrainSettings
 from tests.helpers.heard import Heard

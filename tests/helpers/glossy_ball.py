@@ -15,7 +15,7 @@ from polarguide.camera import Camera
 from polarguide.capture import ColmapModel, checks
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.inspection.capture import InspectedView
-from polarguide.inspection.surfaces import Surface
+from polarguide.inspection.evidence import Surface
 from polarguide.polarizer import ANGLES
 
 WIDTH, HEIGHT, INDEX = 72, 64, 1.5

@@ -9,13 +9,18 @@ import torch
 from glossy_ball import INDEX, mistaken, model_of, surfaces, views_around
 
 from polarguide.capture.calibration import Calibration
-from polarguide.inspection.angle_checks import combine_evidence, handedness_check, order_check, zero_check
-from polarguide.inspection.dielectric import dielectric_check, exceeds_dielectric
-from polarguide.inspection.likelihood import posterior
-from polarguide.inspection.measurements import measure_view
-from polarguide.inspection.orders import ORDERS, PAIRINGS
-from polarguide.inspection.points import point_evidence
-from polarguide.inspection.surfaces import normal_evidence, sample_surfaces
+from polarguide.inspection.angles import (
+    ORDERS,
+    PAIRINGS,
+    combine_evidence,
+    handedness_check,
+    order_check,
+    posterior,
+    zero_check,
+)
+from polarguide.inspection.capture import measure_view
+from polarguide.inspection.evidence import normal_evidence, point_evidence, sample_surfaces
+from polarguide.inspection.picture_checks import dielectric_check, exceeds_dielectric
 
 FIRST = ORDERS[0].files()
 

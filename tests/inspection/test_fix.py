@@ -13,11 +13,9 @@ from captures import soft_intensities, write_scene
 
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.errors import PolarguideError
-from polarguide.inspection import fix
-from polarguide.inspection.angle_checks import AngleFindings
+from polarguide.inspection import corrections as fixing
+from polarguide.inspection.angles import ORDERS, PAIRINGS, AngleFindings, OrderPosterior
 from polarguide.inspection.capture import read_capture
-from polarguide.inspection.likelihood import OrderPosterior
-from polarguide.inspection.orders import ORDERS, PAIRINGS
 from polarguide.polarizer import ANGLES
 
 
@@ -47,9 +45,9 @@ def test_misnamed_files_get_their_names_back_byte_by_byte(tmp_path, order: int, 
     (root / "masks").mkdir()
     (root / "masks" / "v0.png").write_bytes((root / "polar" / "v0_000.png").read_bytes())
     before = hashes(root)
-    change = fix.correction(read_capture(root), decided(order, pairing=pairing))
+    change = fixing.correction(read_capture(root), decided(order, pairing=pairing))
     assert change == Calibration(order=files)
-    said = fix.fix_scene(read_capture(root), change, tmp_path / "fixed")
+    said = fixing.fix_scene(read_capture(root), change, tmp_path / "fixed")
     assert "was taken at" in said
     fixed = hashes(tmp_path / "fixed")
     assert {k: v for k, v in fixed.items() if k.startswith("polar")} == hashes(right)
@@ -69,10 +67,10 @@ def test_a_zero_is_turned_back_and_saturated_pixels_become_invalid(tmp_path) -> 
 
     root = write_scene(tmp_path / "turned", turned)
     (root / "scene.json").write_text('{"refractive_index": 1.4, "corrections": [{"change": "earlier"}]}')
-    change = fix.correction(read_capture(root), decided(0, offset=10.0))
+    change = fixing.correction(read_capture(root), decided(0, offset=10.0))
     assert change is not None
     assert change.zero == 10.0
-    fix.fix_scene(read_capture(root), change, tmp_path / "fixed")
+    fixing.fix_scene(read_capture(root), change, tmp_path / "fixed")
     found = read_capture(tmp_path / "fixed")
     assert found.refractive_index == 1.4
     view = found.views[1]
@@ -88,23 +86,23 @@ def test_a_zero_is_turned_back_and_saturated_pixels_become_invalid(tmp_path) -> 
 
 def test_what_is_right_is_left_alone(tmp_path) -> None:
     capture = read_capture(write_scene(tmp_path / "s"))
-    assert fix.correction(capture, decided(0)) is None
-    assert fix.correction(capture, decided(0, offset=2.0)) is None
-    assert fix.correction(capture, decided(0, offset=8.0, error=4.0)) is None
+    assert fixing.correction(capture, decided(0)) is None
+    assert fixing.correction(capture, decided(0, offset=2.0)) is None
+    assert fixing.correction(capture, decided(0, offset=8.0, error=4.0)) is None
 
 
 @pytest.mark.parametrize("angles", [decided(2, p=0.9), AngleFindings(0, (), None)])
 def test_what_is_not_decided_is_refused(tmp_path, angles: AngleFindings) -> None:
     capture = read_capture(write_scene(tmp_path / "s"))
     with pytest.raises(PolarguideError, match="a decided order of the angles"):
-        fix.correction(capture, angles)
+        fixing.correction(capture, angles)
 
 
 def test_a_folder_with_something_in_it_is_refused(tmp_path) -> None:
     capture = read_capture(write_scene(tmp_path / "s"))
     before = hashes(tmp_path)
     with pytest.raises(PolarguideError, match="a new folder"):
-        fix.fix_scene(capture, Calibration(order=(90, 45, 0, 135)), tmp_path / "s")
+        fixing.fix_scene(capture, Calibration(order=(90, 45, 0, 135)), tmp_path / "s")
     assert hashes(tmp_path) == before
 
 
@@ -114,9 +112,9 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path, monkeypatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(fix, "write_whole", full)
+    monkeypatch.setattr(fixing, "write_whole", full)
     with pytest.raises(PolarguideError, match="No space left"):
-        fix.fix_scene(capture, Calibration(order=(90, 45, 0, 135)), tmp_path / "fixed")
+        fixing.fix_scene(capture, Calibration(order=(90, 45, 0, 135)), tmp_path / "fixed")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s"]
 
 
@@ -132,7 +130,7 @@ def test_no_link_that_leaves_the_scene_is_copied(tmp_path, name: str) -> None:
     capture = replace(read_capture(write_scene(tmp_path / "right")), root=root)
     change = Calibration(order=ORDERS[3].files(PAIRINGS[0]))
     with pytest.raises(PolarguideError, match=r"found a link to .*secret.*nothing was written"):
-        fix.fix_scene(capture, change, tmp_path / "fixed")
+        fixing.fix_scene(capture, change, tmp_path / "fixed")
     assert not (tmp_path / "fixed").exists()
 
 
@@ -140,7 +138,7 @@ def test_a_link_within_the_scene_is_copied(tmp_path) -> None:
     root = write_scene(tmp_path / "scene")
     (root / "masks").mkdir()
     (root / "masks" / "v0.png").symlink_to(root / "polar" / "v0_000.png")
-    fix.fix_scene(read_capture(root), Calibration(order=ORDERS[3].files(PAIRINGS[0])), tmp_path / "fixed")
+    fixing.fix_scene(read_capture(root), Calibration(order=ORDERS[3].files(PAIRINGS[0])), tmp_path / "fixed")
     copy = tmp_path / "fixed" / "masks" / "v0.png"
     assert not copy.is_symlink()
     assert copy.read_bytes() == (root / "polar" / "v0_000.png").read_bytes()
@@ -153,12 +151,12 @@ def test_links_that_lead_in_a_circle_are_refused(tmp_path) -> None:
         (root / "masks" / name).symlink_to("../masks")
     change = Calibration(order=(90, 45, 0, 135))
     with pytest.raises(PolarguideError, match=r"masks/[ab]: expected a file of the scene"):
-        fix.fix_scene(read_capture(root), change, tmp_path / "fixed")
+        fixing.fix_scene(read_capture(root), change, tmp_path / "fixed")
     assert not (tmp_path / "fixed").exists()
 
 
 def test_corrections_that_are_none(tmp_path) -> None:
     root = write_scene(tmp_path / "scene")
     (root / "scene.json").write_text('{"corrections": 5}')
-    fix.fix_scene(read_capture(root), Calibration(order=(90, 45, 0, 135)), tmp_path / "fixed")
+    fixing.fix_scene(read_capture(root), Calibration(order=(90, 45, 0, 135)), tmp_path / "fixed")
     assert len(json.loads((tmp_path / "fixed" / "scene.json").read_text())["corrections"]) == 1

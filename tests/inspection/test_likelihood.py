@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 
-from polarguide.inspection.likelihood import (
+from polarguide.inspection.angles import (
     FAILURE,
+    ORDERS,
     Evidence,
     OrderPosterior,
     combine,
@@ -17,7 +18,6 @@ from polarguide.inspection.likelihood import (
     sum_by_cluster,
     tempered,
 )
-from polarguide.inspection.orders import ORDERS
 
 
 def test_honest_ratios_keep_their_worth() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from polarguide import optics
 from polarguide.capture.calibration import Calibration, oriented
-from polarguide.inspection.orders import IDENTITY, ORDERS, PAIRINGS, swaps
+from polarguide.inspection.angles import IDENTITY, ORDERS, PAIRINGS, swaps
 
 
 def test_three_pairings_of_eight_orders_are_all_permutations() -> None:

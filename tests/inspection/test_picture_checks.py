@@ -10,9 +10,8 @@ import pytest
 from captures import gained, one_view, write_scene
 from tiny_capture import encode_srgb
 
-from polarguide.inspection.capture import read_capture
-from polarguide.inspection.measurements import measure_view
-from polarguide.inspection.orders import PAIRINGS
+from polarguide.inspection.angles import PAIRINGS
+from polarguide.inspection.capture import measure_view, read_capture
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.verdict import Check
 from polarguide.polarizer import ANGLES

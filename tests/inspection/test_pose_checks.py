@@ -12,7 +12,7 @@ from glossy_ball import camera_at
 
 from polarguide.inspection import pose_checks
 from polarguide.inspection.capture import Capture, read_capture
-from polarguide.inspection.epipolar import PairError, _fundamental, epipolar_errors, view_errors
+from polarguide.inspection.pose_checks import PairError, _fundamental, epipolar_errors, view_errors
 
 
 def test_projections_of_one_point_lie_on_each_others_epipolar_lines() -> None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from camera_files import write_mosaics
 
-from polarguide.shots import NoiseModel, Reason, ShotMaps, ShotOptions
+from polarguide.shots.maps import NoiseModel, Reason, ShotMaps
+from polarguide.shots.options import ShotOptions
 
 MONO = ShotOptions(sensor="IMX250MZR", bits=12)
 

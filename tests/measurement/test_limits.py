@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.measurement.limits import Bound, faults, read_limits
+from polarguide.measurement.fields import Bound, faults, read_limits
 from polarguide.measurement.regions import Region, parse_regions, placed
 
 

@@ -9,10 +9,9 @@ import pytest
 from scipy import stats
 
 from polarguide.measurement.fields import FIELDS, KEYS
-from polarguide.measurement.reference import Reference, difference_figures
-from polarguide.measurement.region_figures import axial_mean, region_figures
-from polarguide.measurement.regions import Region
-from polarguide.shots import ExposureSet, Reason
+from polarguide.measurement.regions import Reference, Region, axial_mean, difference_figures, region_figures
+from polarguide.shots.exposures import ExposureSet
+from polarguide.shots.maps import Reason
 
 REGION = Region("part", 5, 7, 30, 21)
 

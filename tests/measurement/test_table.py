@@ -16,7 +16,7 @@ from polarguide.measurement.fields import FORMAT, KEYS
 from polarguide.measurement.line import measure_shots
 from polarguide.measurement.options import MeasureOptions
 from polarguide.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
-from polarguide.shots import ShotOptions
+from polarguide.shots.options import ShotOptions
 
 SETTINGS = {"threshold": 0.05}
 

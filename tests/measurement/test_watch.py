@@ -20,7 +20,7 @@ from polarguide.measurement.table import CSV, LINES
 from polarguide.measurement.watch import watch_folder
 from polarguide.polarizer import ANGLES
 from polarguide.progress import Reporter
-from polarguide.shots import ShotOptions
+from polarguide.shots.options import ShotOptions
 from tests.shots.test_read import PLAIN, write_four
 
 QUICK = WatchOptions(settle=0.1, patience=0.4, idle=0.2)

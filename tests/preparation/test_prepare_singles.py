@@ -29,7 +29,7 @@ from polarguide.polarizer import malus
 from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.synth.filter_shots import exif_tags
+from polarguide.synth.sensor import exif_tags
 
 PLAIN = PrepareSettings(poses="none", transfer="linear", align=False)
 

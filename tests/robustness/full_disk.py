@@ -88,7 +88,7 @@ def fix() -> None:
     calibration = importlib.import_module("polarguide.capture.calibration").Calibration(
         order=(90, 45, 0, 135)
     )
-    importlib.import_module("polarguide.inspection.fix").fix_scene(capture, calibration, Path("new"))
+    importlib.import_module("polarguide.inspection.corrections").fix_scene(capture, calibration, Path("new"))
 
 
 EXPORTS = ("ply", "spz", "sog", "environment", "cameras")

@@ -13,7 +13,9 @@ from made_sensor import made_sensor, true_calibration, write_codes
 from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.errors import PolarguideError
 from polarguide.measurement.line import measure_shots
-from polarguide.shots import ShotOptions, read_shot, write_shots
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import read_shot
+from polarguide.shots.write import write_shots
 
 SIZE = (64, 96)
 

@@ -10,7 +10,10 @@ import pytest
 
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES
-from polarguide.shots import ExposureSet, ShotOptions, find_shots, read_shot, write_shots
+from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import read_shot
+from polarguide.shots.write import write_shots
 from tests.shots.test_read import CUP, MONO, PLAIN, write_four, write_mosaic
 
 BARE = tuple(f"I{angle}.png" for angle in ANGLES)

@@ -15,7 +15,10 @@ from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.capture.write import write_view
 from polarguide.errors import PolarguideError
 from polarguide.polarizer import ANGLES, malus
-from polarguide.shots import Reason, ShotMaps, ShotOptions, find_shots, read_shot
+from polarguide.shots.exposures import find_shots
+from polarguide.shots.maps import Reason, ShotMaps
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import read_shot
 
 SHAPE = (64, 96)
 TINT = (0.8, 1.2, 1.0)  # of the filters; their mean is 1

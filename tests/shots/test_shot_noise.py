@@ -11,8 +11,9 @@ import pytest
 
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.polarizer import malus
-from polarguide.shots import Reason, ShotOptions, read_shot
-from polarguide.shots.noise import interpolation_factors
+from polarguide.shots.maps import Reason, interpolation_factors
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import read_shot
 
 FULL = 4095
 

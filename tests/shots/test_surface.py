@@ -13,18 +13,11 @@ import polarguide
 from polarguide import optics
 from polarguide.errors import PolarguideError
 from polarguide.rendering.priors import _guide
-from polarguide.shots import (
-    ExposureSet,
-    NoiseModel,
-    ShotMaps,
-    ShotOptions,
-    find_shots,
-    read_shot,
-    surface_maps,
-)
 from polarguide.shots.develop import Developed
-from polarguide.shots.read import maps_of
-from polarguide.shots.surface import TOWARD, camera_of, parse_intrinsics
+from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.maps import NoiseModel, ShotMaps
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import TOWARD, camera_of, maps_of, parse_intrinsics, read_shot, surface_maps
 from polarguide.vectors import unit
 
 VIEW = "v000"

@@ -19,20 +19,13 @@ from polarguide import optics
 from polarguide.capture.exposures import FOUR
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions
-from polarguide.shots import (
-    ShotMaps,
-    ShotOptions,
-    SurfaceMaps,
-    find_shots,
-    read_shot,
-    surface_maps,
-    write_shots,
-)
-from polarguide.shots.catalog import KINDS
-from polarguide.shots.maps import Reason
+from polarguide.shots.exposures import find_shots
+from polarguide.shots.maps import Reason, ShotMaps
+from polarguide.shots.options import ShotOptions
 from polarguide.shots.page_html import PAGE
-from polarguide.shots.pictures import drawn, stretch_of, with_legend
-from polarguide.shots.surface import parse_intrinsics
+from polarguide.shots.pictures import KINDS, drawn, stretch_of, with_legend
+from polarguide.shots.read import SurfaceMaps, parse_intrinsics, read_shot, surface_maps
+from polarguide.shots.write import write_shots
 from tests.helpers.browsers import chromium
 from tests.helpers.heard import Heard
 from tests.helpers.tiny_capture import NAMES, write_tiny_capture

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from polarguide.synth.variant import Variant, choose_variant
+from polarguide.synth.settings import Variant, choose_variant
 
 
 @pytest.fixture(scope="session", params=["compiled", "scalar"])
@@ -15,7 +15,7 @@ def variant(request: pytest.FixtureRequest) -> Iterator[Variant]:
     pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "scalar":
-            patch.setattr("polarguide.synth.variant._missing_llvm", lambda: "not wanted here")
+            patch.setattr("polarguide.synth.settings._missing_llvm", lambda: "not wanted here")
         chosen = choose_variant("rgb", threads=1)
         if chosen.fast != (request.param == "compiled"):
             pytest.skip("no LLVM for Mitsuba's compiled variants -> apt-get install libllvm19")

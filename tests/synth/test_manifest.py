@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.synth.folder import folder_state
-from polarguide.synth.manifest import MANIFEST, verify_scene
+from polarguide.synth.folder import MANIFEST, folder_state, verify_scene
 
 
 def scene(root: Path, listed: bytes = b"") -> Path:

@@ -11,16 +11,23 @@ import numpy as np
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.synth.bounds import only_fields, require_light, require_solid, require_unicode
-from polarguide.synth.cameras import place_cameras
-from polarguide.synth.environment import ENVIRONMENTS, directions, make_environment
+from polarguide.synth.build import area_light_dict
+from polarguide.synth.colmap import place_cameras
 from polarguide.synth.mesh import Mesh, write_ply
-from polarguide.synth.mitsuba_dicts import area_light_dict
-from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file, with_current_keys
+from polarguide.synth.render import parse_sweep
+from polarguide.synth.schema import (
+    SceneSpec,
+    only_fields,
+    parse_scene,
+    read_scene_file,
+    require_light,
+    require_solid,
+    require_unicode,
+    with_current_keys,
+)
 from polarguide.synth.settings import PRESETS, Overrides, find_scene
 from polarguide.synth.shapes import make_mesh
-from polarguide.synth.sweep import parse_sweep
-from polarguide.synth.textures import TEXTURES, make_texture
+from polarguide.synth.textures import ENVIRONMENTS, TEXTURES, directions, make_environment, make_texture
 
 SMALL = {
     "name": "small",

@@ -25,16 +25,18 @@ from polarguide.capture.colmap.model import read_model
 from polarguide.errors import PolarguideError
 from polarguide.progress import Reporter
 from polarguide.synth import render as runner
-from polarguide.synth import sweep as sweeps
-from polarguide.synth.filter_shots import behind_filter
-from polarguide.synth.folder import photograph
-from polarguide.synth.manifest import MANIFEST, scene_digest, verify_scene
-from polarguide.synth.render import synthesize
+from polarguide.synth.folder import MANIFEST, photograph, scene_digest, verify_scene
+from polarguide.synth.render import Sweep, sweep_scenes, synthesize
 from polarguide.synth.schema import SceneSpec, parse_scene
-from polarguide.synth.sensor import Sensor
-from polarguide.synth.settings import Overrides, SynthSettings
-from polarguide.synth.sweep import Sweep, sweep_scenes
-from polarguide.synth.variant import OLDEST_LLVM, Variant, choose_variant, rough_time
+from polarguide.synth.sensor import Sensor, behind_filter
+from polarguide.synth.settings import (
+    OLDEST_LLVM,
+    Overrides,
+    SynthSettings,
+    Variant,
+    choose_variant,
+    rough_time,
+)
 
 TINY = {
     "name": "tiny",
@@ -310,14 +312,14 @@ def test_members_of_a_sweep_sort_like_their_numbers(
         (out / "scene.json").write_text("{}")
         return out
 
-    monkeypatch.setattr(sweeps, "synthesize", written)
+    monkeypatch.setattr(runner, "synthesize", written)
     family = Sweep("noise", (0.0, 1.5, 12.0))
     folders = sweep_scenes(spec, tmp_path, SETTINGS, Overrides(), family, Reporter())
     assert [folder.name for folder in folders] == ["noise-00", "noise-01.5", "noise-12"]
 
 
 def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.synth.variant._missing_llvm", lambda: "none was found")
+    monkeypatch.setattr("polarguide.synth.settings._missing_llvm", lambda: "none was found")
     try:
         found = choose_variant("rgb")
         assert not found.fast

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from polarguide.camera import Camera
 from polarguide.synth.build import _mesh
-from polarguide.synth.cameras import place_cameras
+from polarguide.synth.colmap import place_cameras
 from polarguide.synth.settings import PRESETS, find_scene
 
 POINTS = 20_000

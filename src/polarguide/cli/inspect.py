@@ -63,7 +63,7 @@ def inspect(
 
 def _fix(found: Any, out: Path, reporter: ConsoleReporter) -> None:
     """Write the corrected copy, or say that there is nothing to correct."""
-    fixing = importlib.import_module("polarguide.inspection.fix")
+    fixing = importlib.import_module("polarguide.inspection.corrections")
     if not found.capture.four:
         raise PolarguideError(
             "--fix",

@@ -13,8 +13,7 @@ from polarguide.cli.console import console, say, use_threads
 from polarguide.cli.progress import ConsoleReporter
 from polarguide.errors import PolarguideError
 from polarguide.options import ThreadOptions
-from polarguide.synth.settings import Overrides, SynthSettings, find_scene
-from polarguide.synth.variant import LONG_SECONDS, rough_time
+from polarguide.synth.settings import LONG_SECONDS, Overrides, SynthSettings, find_scene, rough_time
 
 
 def synth(
@@ -43,22 +42,19 @@ def synth(
     spec, reporter = find_scene(scene), ConsoleReporter()
     render = importlib.import_module("polarguide.synth.render")
     if sweep is not None:
-        sweeps = importlib.import_module("polarguide.synth.sweep")
-        family = sweeps.parse_sweep(sweep)
-        plans = sweeps.sweep_plans(spec, out, settings, overrides, family)
+        family = render.parse_sweep(sweep)
+        plans = render.sweep_plans(spec, out, settings, overrides, family)
         _confirm(render.expected_time(plans, reporter, threads=compute.threads), yes)
-        folders = sweeps.sweep_scenes(
+        folders = render.sweep_scenes(
             spec, out, settings, overrides, family, reporter, threads=compute.threads
         )
         say(f"scenes: {' '.join(str(folder) for folder in folders)}")
         return
     plan = render.Plan(overrides.apply(spec), settings, out)
     _confirm(render.expected_time([plan], reporter, threads=compute.threads), yes)
-    manifest = importlib.import_module("polarguide.synth.manifest")
+    folder = importlib.import_module("polarguide.synth.folder")
     done = render.synthesize(plan.spec, out, settings, reporter, threads=compute.threads)
-    say(
-        f"scene: {done}   SHA-256 of its {manifest.MANIFEST}: {manifest.scene_digest(done)}",
-    )
+    say(f"scene: {done}   SHA-256 of its {folder.MANIFEST}: {folder.scene_digest(done)}")
     if settings.sensor == "ideal":
         say(f"next: polarguide train {done} --out runs/{done.name}")
     elif settings.sensor == "filter":

@@ -17,8 +17,7 @@ from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.synth.folder import State, folder_state, scene_request
-from polarguide.synth.manifest import scene_digest, verify_scene
+from polarguide.synth.folder import State, folder_state, scene_digest, scene_request, verify_scene
 from polarguide.synth.render import Plan, expected_time, synthesize
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Overrides, find_scene

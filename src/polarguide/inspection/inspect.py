@@ -11,25 +11,28 @@ from polarguide.capture import Scene, load_scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError
 from polarguide.files import check_out, require_inside
-from polarguide.inspection.analyzers import analyzer_check, corrected
-from polarguide.inspection.angle_checks import (
+from polarguide.inspection.angles import (
     AngleFindings,
+    Evidence,
     combine_evidence,
     handedness_check,
     order_check,
     zero_check,
 )
-from polarguide.inspection.capture import Capture, InspectedView, read_capture
-from polarguide.inspection.dielectric import dielectric_check
-from polarguide.inspection.likelihood import Evidence
-from polarguide.inspection.measurements import ViewMeasurements, measure_view
-from polarguide.inspection.picture_checks import find_pairing, light_checks, picture_checks
-from polarguide.inspection.points import point_evidence
+from polarguide.inspection.capture import Capture, InspectedView, ViewMeasurements, measure_view, read_capture
+from polarguide.inspection.corrections import analyzer_check, corrected
+from polarguide.inspection.evidence import (
+    Surface,
+    SurfaceSamples,
+    normal_evidence,
+    point_evidence,
+    sample_surfaces,
+)
+from polarguide.inspection.picture_checks import dielectric_check, find_pairing, light_checks, picture_checks
 from polarguide.inspection.pose_checks import coverage_check, pose_check
 from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.short_run import LONGEST, short_run, surface_of
 from polarguide.inspection.shots import ShotFindings, find_shots, pictures_check, shot_checks
-from polarguide.inspection.surfaces import Surface, SurfaceSamples, normal_evidence, sample_surfaces
 from polarguide.inspection.verdict import Check, Verdict, worst
 from polarguide.options import index_of
 from polarguide.progress import SILENT, Reporter
@@ -200,7 +203,6 @@ def _trained_pixels(
     backend: Backend,
     reporter: Reporter,
 ) -> SurfaceSamples:
-    names = [view.name for view in capture.posed]
     scene = _training_scene(capture, settings, reporter)
     with reporter.track("short training", settings.steps) as advance:
         state = short_run(
@@ -211,7 +213,7 @@ def _trained_pixels(
             on_step=lambda report: advance(report.step + 1),
             refractive_index=index,
         )
-    with reporter.track("comparing with normals", len(names)) as advance:
+    with reporter.track("comparing with normals", len(capture.posed)) as advance:
 
         def surfaces() -> Iterator[tuple[InspectedView, Surface]]:
             for done, view in enumerate(capture.posed):

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.inspection.capture import InspectedView
-from polarguide.inspection.measurements import ViewMeasurements, quantile
+from polarguide.inspection.capture import InspectedView, ViewMeasurements, quantile
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.figures import Picture

@@ -20,7 +20,7 @@ from polarguide.capture import Scene, View
 from polarguide.capture.exposures import FOUR
 from polarguide.errors import PolarguideError
 from polarguide.files import write_text
-from polarguide.inspection.surfaces import Surface
+from polarguide.inspection.evidence import Surface
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
 from polarguide.records import read_record

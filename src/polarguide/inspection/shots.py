@@ -288,7 +288,8 @@ def _each(found: ShotFindings, sense: int | None, offset: float) -> Check:
         verdict: Verdict = "wrong" if chaos else "ok" if _all_unknown(found) else "not verified"
         said = "The pictures contradict the angles that are said." if chaos else _too_few(found)
         return Check(key, title, verdict, said, _remedy_of_chaos() if chaos else "")
-    rows = [(j, _apart(j.angle, sense * said + offset), said) for j, said in found.telling]
+    # Differences are angles modulo 180 degrees, in [-90, 90).
+    rows = [(j, (j.angle - sense * said - offset + 90.0) % 180.0 - 90.0, said) for j, said in found.telling]
     typical = float(np.median([abs(apart) for _, apart, _ in rows]))
     certain = CERTAIN * float(np.median([j.modulation for j in found.judgments]))
     off = [
@@ -311,11 +312,6 @@ def _each(found: ShotFindings, sense: int | None, offset: float) -> Check:
         "Compare them with your notes; correct their lines of angles.csv, or write unknown.",
         tuple(dict.fromkeys(j.view for j, _ in off)), figures,
     )  # fmt: skip
-
-
-def _apart(first: float, second: float) -> float:
-    """Degrees between two angles modulo 180, in [-90, 90)."""
-    return (first - second + 90.0) % 180.0 - 90.0
 
 
 def _all_unknown(found: ShotFindings) -> bool:

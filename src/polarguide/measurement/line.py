@@ -13,13 +13,19 @@ import msgspec
 
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder, require_inside
-from polarguide.measurement.fields import FORMAT
-from polarguide.measurement.limits import NO_LIMITS, faults, read_limits
+from polarguide.measurement.fields import FORMAT, NO_LIMITS, Value, faults, read_limits
 from polarguide.measurement.options import MeasureOptions
 from polarguide.measurement.pictures import difference_picture, regions_picture
-from polarguide.measurement.reference import Differences, Reference, difference_figures
-from polarguide.measurement.region_figures import Value, region_figures
-from polarguide.measurement.regions import WHOLE, Region, parse_regions, placed
+from polarguide.measurement.regions import (
+    WHOLE,
+    Differences,
+    Reference,
+    Region,
+    difference_figures,
+    parse_regions,
+    placed,
+    region_figures,
+)
 from polarguide.measurement.table import Entry, FileStamp, Status, Table, stamps
 from polarguide.options import PathLike
 from polarguide.progress import SILENT, Reporter

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from polarguide.color import srgb_encode_array
-from polarguide.measurement.reference import Differences
-from polarguide.measurement.regions import Region
+from polarguide.measurement.regions import Differences, Region
 from polarguide.shots.maps import Map, ShotMaps
 from polarguide.visualization.sheet import FONT, INK, LINE_HEIGHT, Picture, contact_sheet
 

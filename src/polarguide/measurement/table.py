@@ -31,8 +31,7 @@ from polarguide.files import (
     write_whole,
     writing,
 )
-from polarguide.measurement.fields import FORMAT, KEYS
-from polarguide.measurement.region_figures import Value
+from polarguide.measurement.fields import FORMAT, KEYS, Value
 from polarguide.records import decode, read_record, shortened, to_json
 from polarguide.spreadsheet import csv_lines
 from polarguide.system import only_writer

@@ -14,8 +14,7 @@ from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
 from polarguide.progress import SILENT, Reporter
 from polarguide.sensor_calibration.fit import BlockChoice, choose_block, fit_pixels, shared
-from polarguide.sensor_calibration.picture import calibration_picture
-from polarguide.sensor_calibration.report import Position, lines, positions
+from polarguide.sensor_calibration.report import Position, calibration_picture, lines, positions
 from polarguide.sensor_calibration.settings import CalibrateSettings
 from polarguide.sensor_calibration.shots import Measured, Shots
 from polarguide.sensor_calibration.solve import ShotFit, solve_shots

@@ -33,8 +33,7 @@ from polarguide.errors import PolarguideError
 from polarguide.files import require_file
 from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
 from polarguide.shots.exposures import ExposureSet
-from polarguide.shots.maps import Map, NoiseModel
-from polarguide.shots.noise import estimated_noise, given_noise, interpolation_factors
+from polarguide.shots.maps import Map, NoiseModel, estimated_noise, given_noise, interpolation_factors
 from polarguide.shots.options import ShotOptions
 
 Mask = NDArray[np.bool_]

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.shots.catalog import KINDS, REASON_COLORS
 from polarguide.shots.maps import REASONS, Reason, ShotMaps
-from polarguide.shots.pictures import drawn, stretch_of
-from polarguide.shots.surface import SurfaceMaps
+from polarguide.shots.pictures import KINDS, REASON_COLORS, drawn, stretch_of
+from polarguide.shots.read import SurfaceMaps
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.pages import page, page_part, script_json

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from polarguide import optics
+from polarguide.camera import Camera
+from polarguide.capture.colmap.model import fit_camera, read_model
 from polarguide.capture.view import View
 from polarguide.errors import PolarguideError
+from polarguide.numerals import decimal
+from polarguide.options import check_finite, index_of
 from polarguide.shots.develop import Developed, develop, develop_view
 from polarguide.shots.exposures import ExposureSet, find_shots
-from polarguide.shots.maps import Reason, ShotMaps
+from polarguide.shots.maps import Map, Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
+from polarguide.vectors import dot, unit
 
 UNREADABLE = (PolarguideError, OSError, MemoryError)
 """What one bad file may raise; others come after it."""
@@ -124,3 +133,162 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         pair_ratio=developed.pair_ratio,
         notes=developed.notes,
     )
+
+
+TOWARD = (0.0, -0.5, -1.0)
+"""What a normal is guessed to be where polarization leaves a choice: toward the camera, and a little upward."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMaps:
+    """Normals and layers of one shot, for a smooth dielectric under unpolarized light.
+
+    Attributes:
+        zeniths: [3, H, W] float32, radians: of diffuse light, and of specular light below and above Brewster's angle,
+            whose degree of polarization is the pixel's. The six candidates of the normal have azimuth AoLP and AoLP +
+            pi (diffuse), AoLP + pi/2 and AoLP - pi/2 (specular). NaN for diffuse light where it cannot be so polarized.
+        normal: [H, W, 3] float32, the candidate nearest to ``TOWARD``, camera axes (x right, y down, z forward): a
+            guess among six, and 0 where the reason of the pixel says that it has no angle.
+        specular_paper, diffuse_paper: [H, W, C] float32, units of S0: the coarse cue of PolarGuide-GSDR, which needs no
+            normal (it takes the diffuse zenith of the DoLP); the two do not add up to S0.
+        specular_exact, diffuse_exact: [H, W, C] float32, units of S0: Fresnel's split, which needs the normal, and so
+            is as right as the guess above. They add up to S0.
+        conditioned: [H, W] bool, where the exact one is well conditioned.
+        refractive_index: of all surfaces.
+        perspective: whether the rays of the pixels are known; else all are parallel to the axis.
+    """
+
+    zeniths: Map
+    normal: Map
+    specular_paper: Map
+    diffuse_paper: Map
+    specular_exact: Map
+    diffuse_exact: Map
+    conditioned: NDArray[np.bool_]
+    refractive_index: float
+    perspective: bool
+
+
+def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
+    """A camera of ``fx,fy,cx,cy`` in pixels of a picture of ``size`` (width, height).
+
+    Raises:
+        PolarguideError: it is something else.
+    """
+    try:
+        fx, fy, cx, cy = (decimal(part) for part in text.split(","))
+        # A center may lie outside of a cut picture; beyond these bounds it is a slip.
+        centered = all(abs(c - n / 2) <= 10 * n for c, n in zip((cx, cy), size, strict=True))
+        known = centered and all(0 < f <= 1e6 for f in (fx, fy))
+    except ValueError:
+        known = False
+    if not known:
+        raise PolarguideError(
+            "--intrinsics",
+            expected="fx,fy,cx,cy in pixels of the developed picture",
+            found=repr(text),
+            remedy="Correct the value; the center of the first pixel is at 0.5.",
+        )
+    return Camera(
+        *size, fx, fy, cx, cy, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    )
+
+
+def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) -> Camera | None:
+    """The camera of a shot: by intrinsics given, else of a scene that has poses, else None.
+
+    Raises:
+        PolarguideError: the intrinsics or the scene's model cannot be used.
+    """
+    if intrinsics is not None:
+        return parse_intrinsics(intrinsics, size)
+    if shot.root is None or not (shot.root / "sparse").exists():
+        return None
+    model = read_model(shot.root)
+    if shot.view not in model.names:
+        return None
+    return fit_camera(model.camera(shot.view), *size, folder=model.folder, view=shot.view)
+
+
+@torch.no_grad()
+def surface_maps(
+    maps: ShotMaps, camera: Camera | None = None, refractive_index: float | None = None
+) -> SurfaceMaps:
+    """Candidates of the normals, one of them, and both separations.
+
+    Args:
+        maps: of the shot.
+        camera: of its pixels, for their rays; None takes rays parallel to the axis, which a long lens nearly has.
+        refractive_index: of all surfaces; None: ``INDEX``.
+
+    Raises:
+        PolarguideError: the refractive index is out of range.
+    """
+    refractive_index = index_of(refractive_index)
+    check_finite("refractive_index", refractive_index, 1.0001, 4.0)
+    channels, height, width = maps.intensities.shape[3], *maps.reason.shape
+    zeniths = torch.empty((3, height, width))
+    normal = torch.empty((3, height, width)).movedim(0, -1)
+    paper_specular, paper_diffuse, specular, diffuse = (
+        torch.empty((channels, height, width)).movedim(0, -1) for _ in range(4)
+    )
+    conditioned = torch.empty((height, width), dtype=torch.bool)
+    stokes, dolp, aolp = (torch.from_numpy(a) for a in (maps.stokes, maps.dolp, maps.aolp))
+    for part in tiles(height, width):
+        rays = torch.tensor([0.0, 0.0, 1.0]) if camera is None else camera.rays()[part]
+        s = optics.stokes(torch.from_numpy(maps.intensities[:, part]))
+        zenith, chosen = _chosen_normal(stokes[0, part], dolp[part], aolp[part], rays, refractive_index)
+        zeniths[:, part] = zenith
+        paper = optics.paper_separation(s, zenith[0], refractive_index)
+        exact = optics.exact_separation(s, chosen, rays, refractive_index)
+        paper_specular[part], paper_diffuse[part] = paper.specular, paper.diffuse
+        specular[part], diffuse[part] = exact.specular, exact.diffuse
+        conditioned[part] = exact.conditioned
+        usable = torch.from_numpy(maps.usable[part])
+        normal[part] = chosen * usable[..., None]
+    above = dolp > optics.diffuse_dolp_limit(refractive_index)
+    zeniths[0][above] = math.nan
+    return SurfaceMaps(
+        zeniths=zeniths.numpy(),
+        normal=normal.numpy(),
+        specular_paper=paper_specular.numpy(),
+        diffuse_paper=paper_diffuse.numpy(),
+        specular_exact=specular.numpy(),
+        diffuse_exact=diffuse.numpy(),
+        conditioned=conditioned.numpy(),
+        refractive_index=refractive_index,
+        perspective=camera is not None,
+    )
+
+
+def _chosen_normal(
+    s0: Tensor, dolp: Tensor, aolp: Tensor, rays: Tensor, index: float
+) -> tuple[Tensor, Tensor]:
+    """Zeniths [3, ...] of the candidates, and the one of ``optics.physical_candidates`` nearest to ``TOWARD``.
+
+    The same as ``optics.disambiguate`` finds, but without making all six: of two that lie half a turn apart the nearer
+    one is on the side of the guess.
+    """
+    below, above = optics.specular_zeniths(dolp, index)
+    zeniths = torch.stack((optics.diffuse_zenith(dolp, index), below, above))
+    guess = unit(torch.tensor(TOWARD))
+    x_ref, up_ref = optics.lens_frame(rays)
+    right, up, along = dot(x_ref, guess), dot(up_ref, guess), dot(rays, guess)
+    cosine, sine = torch.cos(aolp), torch.sin(aolp)
+    # Across the ray, toward the guess: with azimuth AoLP, and a quarter turn from it.
+    diffuse_side, specular_side = cosine * right + sine * up, cosine * up - sine * right
+    sines, cosines = torch.sin(zeniths), torch.cos(zeniths)
+    possible = (dolp <= optics.diffuse_dolp_limit(index)) | (s0 <= 0)
+    score = torch.where(possible, sines[0] * diffuse_side.abs() - cosines[0] * along, -4.0)
+    sine_z, cosine_z, specular = sines[0], cosines[0], torch.zeros_like(possible)
+    for sine_k, cosine_k in zip(sines[1:], cosines[1:], strict=True):
+        other = sine_k * specular_side.abs() - cosine_k * along
+        nearer = other > score
+        score, specular = torch.maximum(score, other), specular | nearer
+        sine_z, cosine_z = torch.where(nearer, sine_k, sine_z), torch.where(nearer, cosine_k, cosine_z)
+    sign = torch.where(torch.where(specular, specular_side, diffuse_side) < 0, -sine_z, sine_z)
+    x = torch.where(specular, -sine, cosine) * sign
+    y = torch.where(specular, cosine, sine) * sign
+    axes = zip(*(v.unbind(-1) for v in (x_ref, up_ref, rays)), strict=True)
+    # Component by component in memory, as all that follows reads them.
+    return zeniths, torch.stack([x * a + y * b - cosine_z * ray for a, b, ray in axes]).movedim(0, -1)

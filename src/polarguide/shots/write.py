@@ -16,7 +16,6 @@ from polarguide.errors import PolarguideError, optional_import
 from polarguide.files import atomic, in_utf8, make_folder, require_inside, write_text, write_whole
 from polarguide.progress import SILENT, Reporter
 from polarguide.records import to_json
-from polarguide.shots.catalog import KINDS
 from polarguide.shots.develop import check_files
 from polarguide.shots.exposures import (
     ExposureSet,
@@ -28,9 +27,8 @@ from polarguide.shots.exposures import (
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.page_html import PAGE, shot_page
-from polarguide.shots.pictures import drawn, stretch_of, with_legend
-from polarguide.shots.read import UNREADABLE, fault_of, read_shot
-from polarguide.shots.surface import SurfaceMaps, camera_of, surface_maps
+from polarguide.shots.pictures import KINDS, drawn, stretch_of, with_legend
+from polarguide.shots.read import UNREADABLE, SurfaceMaps, camera_of, fault_of, read_shot, surface_maps
 from polarguide.visualization import figures
 
 FORMATS = ("png", "exr", "npy", "page")

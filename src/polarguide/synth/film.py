@@ -11,9 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.camera import Camera
-from polarguide.synth.rays import lens_stokes, opaque_value, pinhole, primary_rays
-from polarguide.synth.sampler import Sampler
-from polarguide.synth.transport import PathLimits, trace_paths
+from polarguide.synth.settings import dr, mi
+from polarguide.synth.transport import (
+    PathLimits,
+    Sampler,
+    lens_stokes,
+    opaque_value,
+    pinhole,
+    primary_rays,
+    trace_paths,
+)
 
 PATHS_AT_ONCE = 1 << 20
 """Limits memory, and the delay of Ctrl-C."""
@@ -83,8 +90,6 @@ def _render_pass(
     scene: Any, camera: Camera, part: tuple[int, int], seed: int, limits: PathLimits, center: bool
 ) -> NDArray[np.float64]:
     """Sums over some samples of each pixel: [pixels, 7, 3 or 1]."""
-    import mitsuba as mi
-
     pixels = camera.width * camera.height
     first, count = part
     lens, start = pinhole(camera), opaque_value(mi.UInt32, seed * SCATTER % 2**32)
@@ -104,8 +109,6 @@ def _render_pass(
 def _compiled() -> Callable[..., list[Any]]:
     """``_sums``, traced once per scene and picture size instead of once per pass: tracing costs as much time as
     100,000 paths."""
-    import drjit as dr
-
     return dr.freeze(_sums, warn_after=1 << 30)
 
 
@@ -120,9 +123,6 @@ def _sums(
     center: bool,
 ) -> list[Any]:
     """Sums over ``count`` samples of each pixel, all at once."""
-    import drjit as dr
-    import mitsuba as mi
-
     first, per_pixel = part
     index = dr.arange(mi.UInt32, pixels * count)
     pixel = index // per_pixel
@@ -137,8 +137,6 @@ def _path(
     scene: Any, lens: list[Any], pixel: Any, sample: Any, seed: Any, limits: PathLimits, center: bool
 ) -> list[list[Any]]:
     """One sample in color: S0, S1, S2 of the specular and of the diffuse lobe, and the directly visible emission."""
-    import mitsuba as mi
-
     sampler = Sampler(mi.UInt32(pixel), mi.UInt32(sample), seed)
     spread, place = sampler.next(), sampler.pair()
     if center:
@@ -157,8 +155,5 @@ def _path(
 
 def _shifted(sample: Any) -> Any:
     """Four equally spaced numbers modulo 1, one for each wavelength of a ray."""
-    import drjit as dr
-    import mitsuba as mi
-
     values = (sample + k / 4 for k in range(4))
     return mi.UnpolarizedSpectrum(*(dr.select(value >= 1.0, value - 1.0, value) for value in values))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import importlib.metadata
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,15 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide import __version__
 from polarguide.capture.write import picture_name
 from polarguide.color import srgb_encode_array
 from polarguide.errors import PolarguideError
-from polarguide.files import holds_files, make_folder, write_whole
+from polarguide.files import holds_files, make_folder, read_file, write_whole
 from polarguide.polarizer import ANGLES, malus
 from polarguide.records import read_record, shortened
 from polarguide.synth.mesh import Array
 from polarguide.synth.schema import SceneSpec, with_current_keys
-from polarguide.synth.settings import SynthSettings
+from polarguide.synth.settings import SynthSettings, Variant
 
 State = Literal["new", "begun", "finished"]
 REQUEST = "request.json"
@@ -120,3 +123,122 @@ def photograph(out: Path, name: str) -> NDArray[np.uint8]:
 def display_encoded(linear: Array) -> NDArray[np.uint8]:
     """Linear values in [0, 1] as 8-bit sRGB."""
     return np.asarray(np.round(255 * srgb_encode_array(np.clip(linear, 0, 1))), np.uint8)
+
+
+MANIFEST = "checksums.txt"
+_REMEDY = "Remove the folder to render the scene again, or give another --out."
+_FOLDERS = ("gt", "mesh", "polar", "raw", "sparse")
+_FILES = ("calibration.json", "environment.hdr", "request.json", "sheet.jpg", "split.json")
+
+
+def write_manifest(out: Path) -> str:
+    """Write the list of a scene that is complete except ``scene.json``; returns the SHA-256 of the list."""
+    lines = [f"{_digest(path)}  {path.relative_to(out).as_posix()}\n" for path in sorted(_written(out))]
+    data = "".join(lines).encode()
+    write_file(out / MANIFEST, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def verify_scene(out: Path) -> str:
+    """Compare a finished scene with its list; returns the SHA-256 of the list.
+
+    Raises:
+        PolarguideError: a file is missing or has changed, or the list has.
+    """
+    data = read_file(out / MANIFEST, remedy=_REMEDY)
+    if hashlib.sha256(data).hexdigest() != scene_digest(out):
+        raise _changed(out / MANIFEST, "the list of checksums whose digest scene.json names")
+    for line in data.decode(errors="replace").splitlines():
+        expected, _, name = line.partition("  ")
+        path = out / name
+        if not path.resolve().is_relative_to(out.resolve()):
+            raise _changed(out / MANIFEST, "a list of files of this scene")
+        if not path.is_file() or _digest(path) != expected:
+            raise _changed(path, f"the file that {MANIFEST} lists")
+    return scene_digest(out)
+
+
+def scene_digest(out: Path) -> str:
+    """The digest in ``scene.json``, or an empty string."""
+    return str(read_record(out / "scene.json", dict[str, Any], remedy=_REMEDY).get("sha256", ""))
+
+
+def _written(out: Path) -> Iterator[Path]:
+    """The files that rendering writes; others in the folder are the user's."""
+    for name in _FOLDERS:
+        yield from (path for path in (out / name).rglob("*") if path.is_file() and path.name[0] != ".")
+    yield from (out / name for name in _FILES if (out / name).is_file())
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(read_file(path, remedy=_REMEDY)).hexdigest()
+
+
+def _changed(path: Path, expected: str) -> PolarguideError:
+    return PolarguideError(
+        path,
+        expected=expected,
+        found="another" if path.is_file() else "no file",
+        remedy=_REMEDY,
+    )
+
+
+CONVENTION = {
+    "intensity": "I_a = (S0 + S1 cos 2a + S2 sin 2a) / 2 is PNG value / 65535, linear",
+    "aolp": "atan2(S2, S1) / 2 from the image's horizontal, counter-clockwise as displayed, in the lens frame of "
+    "each ray (docs/explanation/conventions.md)",
+    "camera": "OpenCV axes, world to camera x_cam = R x_world + t, pixel centers at 0.5",
+    "truth": "gt/<view>.npz: stokes, specular and diffuse as S0 of the lobes of the first surface, exposed like "
+    "the pictures, whose sum is S0 on surfaces; normal (world), depth (camera z), mask, objid at pixel centers",
+    "environment": "environment.hdr: rows from +z down, columns clockwise seen from above, from +x; scene units",
+}
+
+
+def scene_record(
+    spec: SceneSpec,
+    settings: SynthSettings,
+    variant: Variant,
+    names: list[str],
+    tests: list[str],
+    *,
+    exposure: float,
+    clipped: float,
+) -> dict[str, Any]:
+    """The content of ``scene.json``."""
+    objects = []
+    for number, thing in enumerate(spec.things, 1):
+        source = thing.material
+        material: dict[str, Any] = {"type": source.type, "diffuse": source.color}
+        if source.type == "plastic":
+            material |= {"alpha": source.roughness, "ior": source.index}
+        elif source.type == "metal":
+            material = {"type": "metal", "alpha": source.roughness, "eta": source.eta, "k": source.k}
+        objects.append({"id": number, "name": thing.name, "mesh": f"mesh/{thing.name}.ply",
+                        "foreground": thing.foreground, "material": material})  # fmt: skip
+    return {
+        "scene": spec.name,
+        "about": spec.about,
+        "width": settings.width,
+        "height": settings.height,
+        "fov_x_deg": spec.camera.fov,
+        "views": names,
+        "train": [name for name in names if name not in tests],
+        "test": tests,
+        "exposure": exposure,
+        "exposure_note": "radiance * exposure = values in polar/ and gt/; I_a clips at 1",
+        "clipped_share": round(clipped, 6),
+        "noise": {"enabled": settings.noise > 0, "level": settings.noise},
+        "stokes_frame": "lens",
+        "stokes_convention": CONVENTION,
+        "objects": objects,
+        "world_up": "+z",
+        "spp": settings.samples,
+        "max_depth": spec.depth,
+        "seed": settings.seed,
+        "renderer": {
+            "mitsuba": importlib.metadata.version("mitsuba"),
+            "variant": variant.name,
+            "polarguide": __version__,
+        },
+        "settings": settings.data(),
+    }

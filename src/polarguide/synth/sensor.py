@@ -6,13 +6,17 @@ read noise normal (EMVA 1288).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+import struct
+from dataclasses import dataclass
+from fractions import Fraction
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
+from polarguide.color import srgb_encode_array
 from polarguide.polarizer import malus
 from polarguide.synth.mesh import Array
 
@@ -36,10 +40,6 @@ class Sensor:
     gains: tuple[float, float, float, float] = (1.0, 0.985, 1.01, 0.992)
     bits: int = 12
     black: int = 64
-
-    def data(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self)
 
 
 def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: Sensor) -> Array:
@@ -79,3 +79,95 @@ def mosaic(
     value = noisy(value, noise, random, sensor) * np.array(sensor.gains)[angles // 45]
     top = (1 << sensor.bits) - 1
     return np.clip(np.round(sensor.black + value * (top - sensor.black)), 0, top).astype(np.uint16)
+
+
+STOPS = 0.3
+"""Automatic exposure differs by up to this from the mean, each way."""
+STEP = 15
+"""Degrees between the marks of the filter's ring."""
+QUALITY = 95
+_TIME = Fraction(1, 60)
+_TURNS = (1, 1, 1, 6, 8, 3)
+_BACK = {1: 1, 3: 3, 6: 8, 8: 6}
+
+
+@dataclass(frozen=True)
+class FilterShot:
+    """How a view is photographed.
+
+    Attributes:
+        angle: of the filter's axis, degrees counter-clockwise as displayed from the picture's horizontal.
+        stops: how much more light than the mean the automatic exposure lets in, as a power of two.
+        orientation: EXIF orientation of the stored picture: 1, 3, 6 or 8.
+        noted: whether the file says the exposure time.
+    """
+
+    angle: float
+    stops: float = 0.0
+    orientation: int = 1
+    noted: bool = True
+
+    @property
+    def body_angle(self) -> int:
+        """The angle relative to the camera's body (the rows of the stored picture), 0 to 179 degrees."""
+        return round(self.angle - orientation_calibration(self.orientation).zero) % 180
+
+
+def plan_shot(seed: int, number: int) -> FilterShot:
+    """How the view with a number is photographed."""
+    random = np.random.default_rng((seed, 47, number))
+    angle = STEP * int(random.integers(0, 180 // STEP))
+    return FilterShot(angle, float(random.uniform(-STOPS, STOPS)), int(random.choice(_TURNS)))
+
+
+def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
+    """Intensities behind an ideal sheet before the lens, [H, W, 3].
+
+    The sheet absorbs along an axis ``c`` in the plane of the picture. A ray ``d`` keeps the field perpendicular to
+    ``d`` and ``c``; its angle in the lens frame of the ray, which Stokes vectors refer to, differs from pixel to pixel.
+
+    Args:
+        stokes: [3, H, W, 3] in the lens frame. rays: [H, W, 3] unit, camera axes.
+        degrees: the filter's transmission axis, counter-clockwise as displayed.
+    """
+    angle = np.radians(degrees)
+    absorbed = np.array([np.sin(angle), np.cos(angle), 0.0])
+    field = np.cross(rays, absorbed)
+    x, y, z = np.moveaxis(rays, -1, 0)
+    right = np.stack([1 - x * x / (1 + z), -x * y / (1 + z), -x], axis=-1)
+    up = np.stack([x * y / (1 + z), y * y / (1 + z) - 1, y], axis=-1)
+    passed = np.arctan2((field * up).sum(-1), (field * right).sum(-1))
+    return np.asarray(malus(stokes, passed[..., None]))
+
+
+def filter_jpeg(
+    stokes: Array, rays: Array, shot: FilterShot, noise: float, random: np.random.Generator, sensor: Sensor
+) -> bytes:
+    """The JPEG file that a camera stores of a view: noise, sRGB, 8 bits, turned as the camera was held.
+
+    Args:
+        stokes: [3, H, W, 3] of the upright picture, full scale 1, in the lens frame.
+        rays: [H, W, 3] unit, of the upright picture.
+        shot: angle, exposure and orientation.
+        noise, random, sensor: as in ``sensor.noisy``.
+    """
+    light = behind_filter(stokes, rays, shot.angle) * 2.0**shot.stops
+    shown = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
+    stored = apply_orientation(np.rint(255 * shown).astype(np.uint8), _BACK[shot.orientation])
+    options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), options)
+    time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None
+    block = b"Exif\0\0" + exif_tags(shot.orientation, time)
+    segment = b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block
+    return data[:2].tobytes() + segment + data[2:].tobytes()
+
+
+def exif_tags(orientation: int, time: Fraction | None) -> bytes:
+    """A TIFF structure with the orientation and, in its EXIF directory, exposure time, f-number and ISO speed."""
+    if time is None:
+        return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
+    head = b"MM\0*" + struct.pack(">I", 8)
+    first = struct.pack(">HHHIHHHHIII", 2, 274, 3, 1, orientation, 0, 34665, 4, 1, 38, 0)
+    entries = struct.pack(">HHHIIHHIIHHIHHI", 3, 33434, 5, 1, 80, 33437, 5, 1, 88, 34855, 3, 1, 100, 0, 0)
+    seconds = time.limit_denominator(1_000_000)
+    return head + first + entries + struct.pack(">IIII", seconds.numerator, seconds.denominator, 8, 1)

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.synth.implicit_surface import solid
-from polarguide.synth.makers import make
-from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals
-from polarguide.synth.noise import fractal_noise
+from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals, solid
+from polarguide.synth.schema import make
+from polarguide.synth.textures import fractal_noise
 from polarguide.vectors import unit_array as unit
 
 

@@ -11,11 +11,137 @@ emitters are unpolarized, so only the first column of every Mueller matrix is ne
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.synth.bsdf_sampling import DirectionSampler, sample_bsdf, sample_cosine
-from polarguide.synth.sampler import Sampler
+from polarguide.camera import Camera
+from polarguide.synth.settings import dr, mi
+
+
+def opaque_value(kind: Any, value: float) -> Any:
+    """A number that is not compiled into the kernel as a literal, so that one kernel serves all views."""
+    return kind(value) if mi.variant().startswith("scalar") else dr.opaque(kind, value)
+
+
+def pinhole(camera: Camera) -> list[Any]:
+    """A camera in Mitsuba's types: width, (fx, fy, cx, cy), the axes of the camera in the world, and its center."""
+    inner = [opaque_value(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    # The rows of the world-to-camera rotation are the camera's axes in the world.
+    axes = [mi.Vector3f(*(opaque_value(mi.Float, float(v)) for v in row)) for row in camera.rotation]
+    origin = mi.Point3f(*(opaque_value(mi.Float, float(v)) for v in camera.center))
+    return [opaque_value(mi.UInt32, camera.width), inner, axes, origin]
+
+
+def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
+    """Rays through points in pixels.
+
+    Args:
+        camera: from ``pinhole``.
+        pixel: index of the pixel, row by row.
+        place: position in the pixel, [0, 1)^2.
+
+    Returns:
+        Mitsuba's rays, and the x axis of the lens frame of each ray (see ``optics.lens_frame``), in world axes.
+    """
+    width, (fx, fy, cx, cy), axes, origin = camera
+    row = pixel // width
+    x = (mi.Float(pixel - row * width) + place.x - cx) / fx
+    y = (mi.Float(row) + place.y - cy) / fy
+    d = dr.normalize(mi.Vector3f(x, y, mi.Float(1.0)))
+    scale = 1 / (1 + d.z)
+    x_ref = mi.Vector3f(1 - d.x * d.x * scale, -d.x * d.y * scale, -d.x)
+    ray, right = (axes[0] * v.x + axes[1] * v.y + axes[2] * v.z for v in (d, x_ref))
+    return mi.Ray3f(origin, ray), right
+
+
+def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
+    """Convert Stokes vectors from Mitsuba's frame of ``-ray.d`` to our lens frame.
+
+    Mitsuba measures angles from its basis counter-clockwise as seen against the light, that is in the picture, as we
+    do; only the basis has to be rotated.
+    """
+    forward = -ray.d
+    turn = mi.mueller.rotate_stokes_basis(forward, mi.mueller.stokes_basis(forward), x_ref)
+    s0, s1, s2 = light
+    return [s0, s1 * turn[1, 1] + s2 * turn[1, 2], s1 * turn[2, 1] + s2 * turn[2, 2]]
+
+
+_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41)
+_WHOLE = 2**32
+
+
+class Sampler:
+    """Random numbers for one sample of each pixel.
+
+    The first dimensions follow a Kronecker sequence with the square roots of primes, with a random shift per pixel and
+    dimension (Cranley and Patterson 1976). Every single sample is uniform, so that estimates are unbiased.
+
+    Args:
+        pixel: index of the pixel.
+        sample: index of the sample in its pixel, counted over all passes.
+        seed: seed of the view, as Mitsuba's unsigned integer.
+
+    Attributes:
+        later: generator of independent numbers for the later dimensions.
+    """
+
+    def __init__(self, pixel: Any, sample: Any, seed: Any) -> None:
+        self._pixel, self._sample, self._seed = pixel, sample, seed
+        self._used = 0
+        state = mi.sample_tea_64(pixel, seed)
+        self.later = mi.PCG32(1, state + mi.UInt64(sample), mi.UInt64(sample))
+
+    def next(self) -> Any:
+        """The next dimension of the sequence, in [0, 1)."""
+        step = int((_PRIMES[self._used] ** 0.5 % 1) * _WHOLE)
+        self._used += 1
+        shift = mi.sample_tea_32(self._pixel, self._seed + mi.UInt32(self._used))[0]
+        # In integers modulo 2^32, because floats lose digits as the index grows.
+        turned = mi.UInt32((self._sample * mi.UInt32(step) + shift) & mi.UInt32(_WHOLE - 1))
+        return dr.minimum(mi.Float(turned) * (1 / _WHOLE), 1 - 2.0**-24)
+
+    def pair(self) -> Any:
+        """The next two dimensions as a point."""
+        first = self.next()
+        return mi.Point2f(first, self.next())
+
+
+LEAST_DENSITY = 1e-5
+DirectionSampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
+
+
+def sample_bsdf(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
+    """Sample a direction by Mitsuba's BSDF.
+
+    Returns:
+        (value, density) for the direction ``toward`` a light; (direction, density, weight, delta) of the sampled one.
+    """
+    given = bsdf.eval_pdf(context, si, toward, active)
+    sample, weight = bsdf.sample(context, si, *numbers, active)
+    delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    return given, (sample.wo, sample.pdf, weight, delta)
+
+
+def sample_cosine(
+    bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any
+) -> tuple[Any, Any]:
+    """Sample a direction with a density proportional to the cosine; returns what ``sample_bsdf`` does.
+
+    Mitsuba 3.9 evaluates the diffuse lobe of a coated surface correctly, but if only this lobe is selected, its
+    densities are those of both lobes together.
+    """
+    value = bsdf.eval(context, si, toward, active)
+    side = dr.sign(si.wi.z)  # surfaces have two sides
+    there = dr.maximum(toward.z * side, 0.0) * dr.inv_pi
+    wo = mi.warp.square_to_cosine_hemisphere(numbers[1])
+    wo = mi.Vector3f(wo.x, wo.y, wo.z * side)
+    density = dr.abs(wo.z) * dr.inv_pi
+    active = active & (density > LEAST_DENSITY)
+    inverse = dr.select(active, 1 / dr.maximum(density, LEAST_DENSITY), 0.0)
+    weight = bsdf.eval(context, si, wo, active) * inverse
+    return (value, there), (wo, dr.select(active, density, 0.0), weight, mi.Bool(False))
+
 
 TINY = 1e-30
 SHOWN = "shown"
@@ -55,9 +181,6 @@ def trace_paths(
         (specular, diffuse, emitted): [S0, S1, S2] of either lobe in Mitsuba's frame of the direction ``-ray.d``; the
         directly visible radiance of light sources and environment.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     si = scene.ray_intersect(ray)
     seen = _shown(si) if limits.shown_only else mi.Bool(True)
     emitted = _emitted(scene, si, mi.Bool(True))
@@ -82,9 +205,6 @@ def _continue_paths(
     scene: Any, light: list[Any], after: tuple[Any, ...], sampler: Sampler, limits: PathLimits
 ) -> list[Any]:
     """Add to ``light`` what the paths collect after the first surface: [S0, S1, S2]."""
-    import drjit as dr
-    import mitsuba as mi
-
     both = mi.BSDFContext()
 
     def alive(depth: Any, s0: Any, s1: Any, s2: Any, active: Any, *_: Any) -> Any:
@@ -135,9 +255,6 @@ def _scatter(
     Returns:
         [S0, S1, S2] at the camera, and (active, ray, gain, place, density, delta) of the ray that leaves.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     if active is False:  # the scalar variant: there is no surface
         dark = [mi.UnpolarizedSpectrum(0.0)] * 3
         return dark, (False, mi.Ray3f(ray), gain, mi.Interaction3f(si), 0.0, False)
@@ -162,8 +279,6 @@ def _scatter(
 
 def _russian_roulette(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]:
     """Russian roulette: end paths of small throughput at random, and raise the weight of the others."""
-    import drjit as dr
-
     active, ray, gain, *rest = state
     chance = dr.select(where, dr.clip(dr.max(gain[0, 0]), 0.1, 1.0), 1.0)
     return active & (number < chance), ray, gain * (1 / chance), *rest
@@ -171,16 +286,12 @@ def _russian_roulette(state: tuple[Any, ...], number: Any, where: Any) -> tuple[
 
 def _emitted(scene: Any, si: Any, active: Any) -> Any:
     """Unpolarized radiance of the light source or environment at an intersection."""
-    import mitsuba as mi
-
     emitter = si.emitter(scene)
     return mi.UnpolarizedSpectrum(0.0) if emitter is None else emitter.eval(si, active)[0, 0]
 
 
 def _shown(si: Any) -> Any:
     """Whether the camera sees the surface at an intersection; lights and the environment are not among them."""
-    import mitsuba as mi
-
     if si.shape is None:  # the scalar variant
         return False
     return si.shape.eval_attribute_1(SHOWN, si, mi.Bool(si.is_valid())) > 0.5
@@ -188,8 +299,6 @@ def _shown(si: Any) -> Any:
 
 def _limited(light: list[Any], limit: float, where: Any) -> list[Any]:
     """A Stokes vector scaled so that no wavelength of its S0 exceeds the limit."""
-    import drjit as dr
-
     if limit <= 0:
         return light
     peak = dr.max(light[0])
@@ -198,7 +307,5 @@ def _limited(light: list[Any], limit: float, where: Any) -> list[Any]:
 
 
 def _point(random: Any) -> Any:
-    import mitsuba as mi
-
     first = random.next_float32()
     return mi.Point2f(first, random.next_float32())

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.synth.build import BuiltScene
+from polarguide.synth.folder import write_file
 from polarguide.synth.mesh import Array
+from polarguide.synth.settings import dr, mi
+from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture
+from polarguide.visualization.sheet import contact_sheet
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +40,6 @@ class Intersections:
 
 def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections:
     """Intersect rays with origins [N, 3] and unit directions [N, 3] with the scene."""
-    import mitsuba as mi
-
     if mi.variant().startswith("scalar"):
         pairs = zip(origins.tolist(), toward.tolist(), strict=True)
         rows = [_intersect(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in pairs]
@@ -47,9 +55,6 @@ def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections
 
 
 def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
-    import drjit as dr
-    import mitsuba as mi
-
     si = built.scenes[0].ray_intersect(mi.Ray3f(origin, direction))
     if mi.variant().startswith("scalar"):
         number = next((k + 1 for k, shape in enumerate(built.shapes) if shape == si.shape), 0)
@@ -76,3 +81,40 @@ def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[An
         "mask": front[hits.thing].reshape(shape),
         "objid": (shown * hits.thing).reshape(shape),
     }
+
+
+COLUMNS = ("photograph", "DoLP", "AoLP", "specular", "diffuse", "normals", "depth")
+ROWS = 3
+WIDEST = 320
+"""Pixels of the width of one layer in the sheet, at most."""
+QUALITY = 82
+
+
+def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
+    """Write ``sheet.jpg`` with up to three of these views; all must have ground truth."""
+    chosen = sorted({round(k) for k in np.linspace(0, len(names) - 1, min(ROWS, len(names)))})
+    rows = [_layers(out / "gt" / f"{names[k]}.npz", cameras[k]) for k in chosen]
+    sheet = contact_sheet(rows, [names[k] for k in chosen], COLUMNS, maximum_width=WIDEST)
+    _, data = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    write_file(out / "sheet.jpg", data.tobytes())
+
+
+def _layers(path: Path, camera: Camera) -> list[Picture]:
+    """The pictures of one view, [H, W, 3] each, in the order of ``COLUMNS``."""
+    with np.load(path) as ground_truth:
+        stokes, specular, diffuse, normal, depth = (
+            torch.from_numpy(ground_truth[name].astype(np.float32))
+            for name in ("stokes", "specular", "diffuse", "normal", "depth")
+        )
+    mean = optics.luminance(stokes)
+    degree, known = optics.dolp(mean), depth > 0
+    near, far = np.percentile(depth[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
+    return [
+        figures.radiance_to_rgb(stokes[0] / 2),
+        figures.dolp_to_rgb(degree),
+        figures.aolp_to_rgb(optics.aolp(mean), degree * 4),
+        figures.radiance_to_rgb(specular / 2),
+        figures.radiance_to_rgb(diffuse / 2),
+        figures.normal_to_rgb(normal, camera),
+        figures.scalar_to_rgb(depth, near, max(far, near + 1e-6), "viridis"),
+    ]
