@@ -10,8 +10,8 @@ import torch
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.visualization import figures
+from polarguide.visualization.figures import contact_sheet
 from polarguide.visualization.layers import clipping_exposure
-from polarguide.visualization.sheet import contact_sheet
 
 # A camera that looks along world +x, with world +z up: its right is world -y.
 ROTATION = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)

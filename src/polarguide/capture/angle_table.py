@@ -13,9 +13,9 @@ from polarguide.capture.exposures import Exposure, normalized
 from polarguide.capture.polarizer_angles import LARGEST, Angle, parse_angle
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
-from polarguide.numerals import decimal
 from polarguide.records import shortened
 from polarguide.spreadsheet import csv_lines
+from polarguide.text import decimal
 
 TABLE = "angles.csv"
 _COLUMNS = ("file", "view", "angle", "gain", "modulation", "note")

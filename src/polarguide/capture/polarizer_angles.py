@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from polarguide.capture.calibration import Calibration
-from polarguide.numerals import decimal
+from polarguide.text import decimal
 
 Angle = float | Literal["unknown", "none"]
 """Degrees counter-clockwise from the picture's horizontal, modulo 180; or a word."""

@@ -16,8 +16,8 @@ from polarguide.capture.datasets.cameras import checked_pose, pinhole_camera, re
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.capture.formats.pictures import read_file
 from polarguide.errors import PolarguideError
-from polarguide.numerals import decimal
 from polarguide.records import read_record
+from polarguide.text import decimal
 
 SUFFIXES = (".json", ".xml", ".npz")
 _SQUARE = ((3, 4), (4, 4))

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from polarguide.cli.console import console, say, use_threads
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.console import ConsoleReporter, console, say, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.inspection.settings import InspectSettings
 from polarguide.options import ComputeOptions

@@ -18,7 +18,7 @@ from polarguide.errors import PolarguideError, optional_import, require_package
 from polarguide.evaluation.table import MESH_LABEL
 from polarguide.evaluation.target import jumps
 from polarguide.options import EXPORT_PACKAGES
-from polarguide.rendering.fusion import NoSurfaceError, Surface, seen_points
+from polarguide.rendering.mesh import NoSurfaceError, Surface, seen_points
 
 THRESHOLDS = {"05": 0.005, "1": 0.01}
 """Distances that count as right, as shares of the object's diagonal, by the end of their keys."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from polarguide import __version__
-from polarguide.evaluation.sources import commit, scoring_digest
+from polarguide.evaluation.sources import code_digest, commit
 from polarguide.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.experiments.aggregate import PartScores, RunRecord, aggregate
 from polarguide.experiments.forms import csv_text, differences_csv, latex, markdown, parts_csv
@@ -49,7 +49,7 @@ def collect(
         provenance={
             "version": __version__,
             "commit": commit(),
-            "sources": scoring_digest(),
+            "sources": code_digest(),
             "command": comparison.command,
             "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         },

@@ -11,8 +11,8 @@ from polarguide.experiments.part_tables import material_section, object_section
 from polarguide.experiments.results import Results
 from polarguide.experiments.shown import MINUS, Label, Section, ShownCell
 from polarguide.experiments.tables import scores_section
-from polarguide.printable import printable
 from polarguide.spreadsheet import csv_lines
+from polarguide.text import printable
 
 _LATEX = {
     "\\": r"\textbackslash{}",

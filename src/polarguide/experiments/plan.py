@@ -18,9 +18,9 @@ from polarguide import __version__
 from polarguide.capture import View
 from polarguide.capture.background import black_pixels, mask_background
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.record import read_metrics
-from polarguide.evaluation.sources import field_digest, model_digest, scoring_digest, training_digest
+from polarguide.evaluation.sources import code_digest, model_digest
+from polarguide.evaluation.target import SceneFacts
 from polarguide.experiments.options import CompareOptions
 from polarguide.options import Exposures, SceneOptions, index_of
 from polarguide.progress import SILENT, Reporter
@@ -199,7 +199,7 @@ class PlannedRun:
         except (OSError, PolarguideError):
             return None
         whole = record["steps"] == self.steps
-        return record if whole and record["provenance"].get("sources") == scoring_digest() else None
+        return record if whole and record["provenance"].get("sources") == code_digest() else None
 
     def _configuration(self) -> RunConfiguration | None:
         """What the folder's run was trained as, or None where that is not this run."""
@@ -290,15 +290,11 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
         refractive_index=comparison.index_of(scene),
     )
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
-    code = f"{__version__} {training_digest()}{_own_digest(recipe)}"
+    plugin = model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else ""
+    code = f"{__version__} {code_digest()}{plugin}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     folder = comparison.out / RUNS / scene.name / _folder_name(row.name) / f"{seed}-{key}"
     return PlannedRun(scene, row, steps, settings, reading, folder)
-
-
-def _own_digest(recipe: Method) -> str:
-    """Of the code that trains this recipe and not others."""
-    return model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else field_digest()
 
 
 def _folder_name(name: str) -> str:

@@ -25,7 +25,7 @@ _Filled = Annotated[list[_Item], msgspec.Meta(min_length=1)]
 
 
 class Provenance(TypedDict):
-    """What made the record. ``sources``: digest of the code that trains and scores; ``date``: ISO 8601, UTC."""
+    """What made the record. ``sources``: digest of the program; ``date``: ISO 8601, UTC."""
 
     version: str
     commit: str | None

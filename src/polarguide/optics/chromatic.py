@@ -19,8 +19,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.optics._arrays import for_arrays
-from polarguide.optics._numerics import check_leading, check_refractive_index, safe_atan2, window_mean
+from polarguide.optics._numerics import (
+    check_leading,
+    check_refractive_index,
+    for_arrays,
+    safe_atan2,
+    window_mean,
+)
 from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith
 from polarguide.optics.stokes import dolp, luminance
 

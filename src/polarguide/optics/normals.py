@@ -13,8 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.optics._arrays import for_arrays
-from polarguide.optics._numerics import check_leading, safe_normalize, safe_sqrt, window_mean
+from polarguide.optics._numerics import check_leading, for_arrays, safe_normalize, safe_sqrt, window_mean
 from polarguide.optics.frames import normal_from_angles
 from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
 from polarguide.optics.stokes import aolp, dolp

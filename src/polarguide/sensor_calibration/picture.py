@@ -14,8 +14,7 @@ from polarguide.capture.sensor.pattern import Pattern
 from polarguide.polarizer import ANGLES
 from polarguide.sensor_calibration.report import COUNTLESS, Position, spread
 from polarguide.sensor_calibration.solve import ShotFit
-from polarguide.visualization.figures import scalar_to_rgb, scale_bar
-from polarguide.visualization.sheet import FONT, INK, Picture, contact_sheet
+from polarguide.visualization.figures import FONT, INK, Picture, contact_sheet, scalar_to_rgb, scale_bar
 
 _CURVES = {0: (204, 51, 51), 45: (46, 134, 46), 90: (51, 102, 204), 135: (190, 120, 20)}
 _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 340, 70, 30, 78, 48

@@ -16,7 +16,7 @@ from polarguide.shots.catalog import REASON_COLORS, MapKind
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.read import tiles
 from polarguide.visualization import figures
-from polarguide.visualization.sheet import FONT, INK, Picture
+from polarguide.visualization.figures import FONT, INK, Picture
 
 NOTHING = (96, 100, 110)
 """Color of pixels without a measurement."""

@@ -14,11 +14,11 @@ from polarguide import optics
 from polarguide.camera import Camera
 from polarguide.capture.colmap.model import fit_camera, read_model
 from polarguide.errors import PolarguideError
-from polarguide.numerals import decimal
 from polarguide.options import check_finite, index_of
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Map, ShotMaps
 from polarguide.shots.read import tiles
+from polarguide.text import decimal
 from polarguide.vectors import dot, unit
 
 TOWARD = (0.0, -0.5, -1.0)

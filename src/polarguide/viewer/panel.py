@@ -8,9 +8,9 @@ from typing import Any
 
 from polarguide.presentation import Crop, Presentation, Vector
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.appearance import MEASURED, Appearance
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.presenting import PresentingControls
+from polarguide.viewer.scenery import MEASURED, Appearance
 
 FREE_VIEW = "(free)"
 STEPS = ("previous", "next")

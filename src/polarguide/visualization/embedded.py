@@ -12,7 +12,7 @@ from typing import Any
 
 import cv2
 
-from polarguide.visualization.sheet import Picture, check_picture
+from polarguide.visualization.figures import Picture, check_picture
 
 LAYERS: dict[str, str] = {
     "final": "final",
