@@ -125,7 +125,7 @@ def require_package(module: str, what: str) -> None:
     """
     try:
         there = importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):  # a package that says itself that it is none
+    except (ImportError, ValueError):  # a package whose own metadata is broken
         there = False
     if not there:
         raise _missing(module, what)

@@ -67,7 +67,7 @@ def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     """Check an option's value.
 
     Raises:
-        PolarguideError: it is none of the choices.
+        PolarguideError: it is not one of the choices.
     """
     known = list(choices)
     if value not in known:
@@ -81,7 +81,7 @@ _SIZE = re.compile(r"(?P<count>\d+(\.\d*)?|\.\d+) ?(?P<unit>[kmgt])(?P<binary>i?
 
 
 def gibibytes(text: str) -> float | None:
-    """A size such as 4GB, 600MB or 3.5GiB in GiB; None where it is none, a number without a unit too."""
+    """A size such as 4GB, 600MB or 3.5GiB in GiB; None for other texts, and for a number without a unit."""
     found = _SIZE.fullmatch(text.strip())
     if found is None:
         return None

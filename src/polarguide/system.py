@@ -238,7 +238,7 @@ UNBOUNDED = MemoryBound()
 
 
 def keep_freed_memory() -> None:
-    """Tell the allocator, for the rest of this process, to keep what is freed; only glibc's does as told.
+    """Tell the allocator, for the rest of this process, to keep what is freed; only glibc's can.
 
     Each step of a training frees and asks for the same hundred megabytes, which glibc would hand to the system and
     fetch again, page by page, cleared. A process that is ours alone calls this, never a module as it is imported.
@@ -346,7 +346,7 @@ def _no_rank(name: str, expected: str, found: str) -> PolarguideError:
 
 _SIZE = re.compile(r"[0-9]{1,18}(KB|Kb|kb|MB|Mb|mb)?")
 _SIZES = re.compile(r"OPENCV_(IO_MAX_IMAGE_[A-Z]+|IMGCODECS_[A-Z]+_MAX_FILE_SIZE)")
-"""Read by OpenCV as it is loaded, which ends the process where one is no size."""
+"""Read by OpenCV as it is loaded, which ends the process where one is not a size."""
 
 
 def check_variables() -> None:

@@ -13,9 +13,9 @@ from rich.console import Console
 from polarguide.cli import console
 from polarguide.cli.app import run
 from polarguide.cli.console import ConsoleReporter, JobReporter, Lines, bars, say, size_text, warnings_printed
-from polarguide.cli.evaluate import _errors, _table, _without_value
+from polarguide.cli.evaluate import _errors, print_scores
 from polarguide.errors import PolarguideWarning
-from polarguide.evaluation.table import METRICS, OBJECT_METRICS, shown_metrics
+from polarguide.evaluation.table import METRICS, OBJECT_METRICS
 from polarguide.text import printable
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
@@ -46,22 +46,17 @@ def test_sizes_of_files() -> None:
     ]
 
 
-def test_what_has_no_value_is_named_once() -> None:
+def test_what_has_no_value_is_named_once_and_a_reason_keeps_its_brackets(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     record = {metric.key: 1.0 for metric in METRICS} | {"mesh_fscore_1": None, "normal_mae_deg": None}
-    assert _without_value(record) == [
-        "no ground truth, or no such layer, for: normal error, mesh F-score 1 %"
-    ]
-    record["mesh_fscore_1_reason"] = "skimage is not installed"
-    assert _without_value(record) == ["no ground truth, or no such layer, for: normal error"]
-    assert dict(shown_metrics(record))["mesh F-score 1 %"] == "n/a (skimage is not installed)"
-
-
-def test_a_reason_keeps_its_brackets() -> None:
-    record = {metric.key: 1.0 for metric in METRICS} | {"mesh_fscore_1": None}
+    print_scores(record | {"objects": {}}, "scores")
+    assert "for: normal error, mesh F-score 1 %\n" in capsys.readouterr().out
     record["mesh_fscore_1_reason"] = "pip install 'a[b]'"
-    shown = Console(file=io.StringIO(), width=400)
-    shown.print(_table(record, "scores"))
-    assert "n/a (pip install 'a[b]')" in shown.file.getvalue()  # type: ignore[attr-defined]
+    print_scores(record | {"objects": {}}, "scores")
+    printed = capsys.readouterr().out
+    assert "for: normal error\n" in printed
+    assert "n/a (pip install 'a[b]')" in printed
 
 
 def test_lines_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,10 +67,11 @@ def test_lines_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_objects_of_any_name_are_rows_of_the_table() -> None:
+    columns = [metric for metric in METRICS if metric.key in OBJECT_METRICS]
     values = {key: 0.5 for key in OBJECT_METRICS}
     named = {f"[/red]{HOSTILE}": {"pixels": 3, **values}}
     shown = Console(file=io.StringIO(), width=400)
-    shown.print(_errors({"objects": named, "materials": {}}))
+    shown.print(_errors({"objects": named, "materials": {}}, columns))
     assert r"[/red]\x1b[2J" in shown.file.getvalue()  # type: ignore[attr-defined]
 
 

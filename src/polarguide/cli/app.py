@@ -103,7 +103,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _stopped() -> int:
-    """Say that a signal ended the command, if anybody can be told; returns the exit status."""
+    """Print that a signal ended the command, if stderr can be written; returns the exit status."""
     with contextlib.suppress(OSError):
         print("stopped.", file=sys.stderr)
     return 130
@@ -119,7 +119,7 @@ def _from_a_signal(error: BaseException | None) -> bool:
 
 
 def _failed(text: str) -> int:
-    """Print an error, if anybody can be told; returns the exit status."""
+    """Print an error, if stderr can be written; returns the exit status."""
     with contextlib.suppress(OSError):
         print_error(text)
     return 2

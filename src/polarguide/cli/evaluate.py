@@ -34,6 +34,19 @@ def evaluate(
     title = (
         f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
     )
+    print_scores(record, title)
+    found = trained.health
+    for warning in () if found is None else found.warnings:
+        warn(warning)
+    say(f"polarization: {trained.polarization}")
+    say("health: not recorded, the training was not checked" if found is None else found.summary)
+    sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE
+    say(f"metrics: {run / 'metrics.json'}")
+    say(f"where the errors are: {run / sheet}")
+
+
+def print_scores(record: dict[str, Any], title: str) -> None:
+    """Print a run's record as tables: its metrics, and its errors by object and material."""
     metrics = importlib.import_module("polarguide.evaluation.table")
     table = Table(title=Text(printable(title)))
     table.add_column("metric")
@@ -50,14 +63,6 @@ def evaluate(
             say(
                 f"the {_MOST_OBJECTS} largest of {len(record['objects']):,} objects; metrics.json has all of them"
             )
-    found = trained.health
-    for warning in () if found is None else found.warnings:
-        warn(warning)
-    say(f"polarization: {trained.polarization}")
-    say("health: not recorded, the training was not checked" if found is None else found.summary)
-    sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE
-    say(f"metrics: {run / 'metrics.json'}")
-    say(f"where the errors are: {run / sheet}")
 
 
 def _errors(record: dict[str, Any], columns: list[Any]) -> Table:
@@ -67,15 +72,15 @@ def _errors(record: dict[str, Any], columns: list[Any]) -> Table:
     table.add_column("pixels", justify="right", no_wrap=True)
     for metric in columns:
         table.add_column(metric.heading, justify="right", min_width=8)
-    told = any(errors.get("metal_share") is not None for errors in record["objects"].values())
-    if told:
+    has_metals = any(errors.get("metal_share") is not None for errors in record["objects"].values())
+    if has_metals:
         table.add_column("metal", justify="right", no_wrap=True)
 
     def add(name: str, errors: dict[str, Any]) -> None:
         values = [errors[metric.key] for metric in columns]
         texts = ["n/a" if v is None else f"{v:.{m.digits}f}" for m, v in zip(columns, values, strict=True)]
         share = errors.get("metal_share")
-        texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if told else []
+        texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if has_metals else []
         table.add_row(Text(printable(name)), f"{errors['pixels']:,}", *texts)
 
     largest = sorted(record["objects"], key=lambda name: -record["objects"][name]["pixels"])[:_MOST_OBJECTS]

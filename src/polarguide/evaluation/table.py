@@ -256,7 +256,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
 )
 OBJECT_METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr", "stokes_error")
-"""Keys of those that are told apart by object and by material."""
+"""Keys of the metrics that are recorded by object and by material."""
 VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")
 """Those of one view, which are averaged over views."""
 RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")

@@ -41,7 +41,7 @@ class SceneFacts:
 
     Attributes:
         extent: 1.1 times the largest distance between two cameras, in world units.
-        objects: those that errors are told apart by: the foreground's, if numbers and table of objects are known.
+        objects: whose errors are recorded one by one: the foreground's, if numbers and table of objects are known.
         masks: foreground of each test view [H, W] bool, of the ground truth or else the user's; None if a view has
             none.
         object_only: whether nothing but the foreground is in the pictures: more than 99 % of the pixels outside the
@@ -121,7 +121,7 @@ def _partly_known(views: Sequence[View]) -> list[str]:
 
 
 def _unlisted(scene: Scene, views: Sequence[View]) -> list[str]:
-    """Sentences about object numbers that no table explains, or whose material is not said."""
+    """Sentences about object numbers that no table explains, or whose material is not specified."""
     if not scene.objects:
         return [
             f"The ground truth numbers objects (objid), but {scene.root / 'scene.json'} lists none (objects: id, name, "

@@ -204,6 +204,8 @@ def rewrite_splats(
         PlyData([made], byte_order="<").write(temporary)
 
 
+SUFFIX = ".png"
+"""Of the images that a view's name stands for."""
 # nerfstudio's cameras look along -z with y up: OpenGL's axes, not OpenCV's.
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
@@ -213,7 +215,6 @@ def write_colmap(
     cameras: Mapping[str, Camera],
     points: Tensor,
     colors: Tensor,
-    suffix: str = ".png",
     *,
     comments: Sequence[str] = (),
 ) -> None:
@@ -221,7 +222,6 @@ def write_colmap(
 
     Args:
         folder: made if there is none. cameras: by view. points: [M, 3]. colors: [M, 3] uint8.
-        suffix: the images are called the view's name and this.
         comments: lines for the head of each file.
     """
     model = pycolmap.Reconstruction()
@@ -232,7 +232,7 @@ def write_colmap(
         )
         model.add_camera_with_trivial_rig(inner)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(camera.rotation.numpy()), camera.translation.numpy())
-        image = pycolmap.Image(name=name + suffix, camera_id=number, image_id=number)
+        image = pycolmap.Image(name=name + SUFFIX, camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pose)
     for place, color in zip(points.double().numpy(), colors.numpy().astype(np.uint8), strict=True):
         model.add_point3D(place, pycolmap.Track(), color)
@@ -260,7 +260,7 @@ def _require_whole(folder: Path, images: int, points: int) -> None:
         raise OSError("a file that was cut short, as on a full disk")
 
 
-def transforms(cameras: Mapping[str, Camera], suffix: str = ".png") -> dict[str, Any]:
+def transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     """The record of ``transforms.json``: intrinsics and camera-to-world matrices in OpenGL's axes, one frame a view."""
     frames = []
     for name, camera in cameras.items():
@@ -268,7 +268,7 @@ def transforms(cameras: Mapping[str, Camera], suffix: str = ".png") -> dict[str,
         pose[:3, :3], pose[:3, 3] = camera.rotation.T, camera.center
         frames.append(
             {
-                "file_path": f"images/{name}{suffix}",
+                "file_path": f"images/{name}{SUFFIX}",
                 **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
                 **{"w": camera.width, "h": camera.height},
                 "transform_matrix": (pose @ _OPENGL).tolist(),

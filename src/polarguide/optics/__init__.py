@@ -4,7 +4,6 @@ They are differentiable, and value and gradient stay finite at every degenerate 
 polarization, normal and grazing incidence).
 """
 
-from polarguide.optics.chromatic import ChromaticNormals, chromatic_normals
 from polarguide.optics.frames import azimuth, lens_frame, normal_from_angles, zenith
 from polarguide.optics.fresnel import (
     brewster,
@@ -24,8 +23,10 @@ from polarguide.optics.fresnel import (
 )
 from polarguide.optics.normals import (
     Candidates,
+    ChromaticNormals,
     Disambiguated,
     PhysicalCandidates,
+    chromatic_normals,
     disambiguate,
     dolp_noise,
     intensity_noise,

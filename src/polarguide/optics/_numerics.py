@@ -79,7 +79,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def for_arrays(function: F) -> F:
-    """Let a function on tensors take NumPy arrays, too, and then return arrays.
+    """Let a function on tensors also take NumPy arrays, for which it returns arrays.
 
     Whole numbers become floating-point ones (float32 up to 16 bits, else float64), floats are float32 or float64,
     Booleans stay. Where any argument is a tensor the result is tensors; with neither, what the function makes of it.

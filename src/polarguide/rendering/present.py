@@ -71,10 +71,10 @@ def present(
         reporter: told what takes long.
 
     Returns:
-        What is now said of the folder: for a run, its own over its scene's.
+        The presentation of the folder: for a run, its own over its scene's.
 
     Raises:
-        PolarguideError: no such folder, or a value that is none; nothing is written then.
+        PolarguideError: no such folder, or a value that cannot be read; nothing is written then.
     """
     place = _Place(Path(folder), device, reporter)
     own = read_presentation(place.folder)
@@ -160,7 +160,7 @@ class _Place:
         """Point and normal of the surface at a pixel of a view.
 
         Raises:
-            PolarguideError: there is none, or no run that would know of one.
+            PolarguideError: no surface is there, or the folder is not a run's.
         """
         if not self._is_run:
             raise PolarguideError(
@@ -184,7 +184,7 @@ class _Place:
         """A PLACE as a point [3] in the world.
 
         Raises:
-            PolarguideError: it is none.
+            PolarguideError: the text is not a PLACE.
         """
         pixel = self.pixel(text)
         if pixel is not None:
@@ -271,7 +271,7 @@ def _wrong(where: str, expected: str, found: str) -> PolarguideError:
 
 
 def described(presentation: Presentation) -> list[str]:
-    """What is set, a line each; one that says so where nothing is."""
+    """The fields that are set, a line each; "nothing is set" for an empty presentation."""
     lines = {
         "white balance": _listed(presentation.white_balance),
         "up axis": _listed(presentation.up_axis),

@@ -37,7 +37,7 @@ class Gate:
         origins: pages that may ask, as ``https://NAME`` or ``NAME``, besides those that the viewer itself sends.
 
     Raises:
-        PolarguideError: a name is none.
+        PolarguideError: one of the names is not a host name or an address.
     """
 
     def __init__(self, listening: str, hosts: Iterable[str] = (), origins: Iterable[str] = ()) -> None:
@@ -102,7 +102,7 @@ MESSAGES_PER_SECOND = 200.0
 BURST = 400.0  # messages
 SENDING_SECONDS = 30.0  # a browser that takes nothing for so long is let go
 # viser's page goes to whatever server the address names (?websocket=, ?playbackPath=), and does what that one says, in
-# the name of this one: it may talk to nobody but where it came from. Not every browser takes 'self' for sockets, too.
+# the name of this one: it may talk to nobody but where it came from. Not every browser applies 'self' to sockets.
 POLICY = (
     "frame-ancestors 'self'; connect-src 'self' ws://{host} wss://{host} blob: data:; object-src 'none'; "
     "base-uri 'none'; form-action 'none'"

@@ -64,10 +64,10 @@ class Viewer:
         shading: model of the recipe. trains: whether the panel can pause a training.
         host, port: address to listen at; another port is used if this one is taken.
         visitors: who may look besides pages of this machine.
-        presentation: as it was saved. save: writes what a visitor chose to the run, and says so, in plain text; None:
-            visitors can download it. They can only do that, too, where others than this machine may look.
+        presentation: as it was saved. save: writes a choice to the run, and returns a message in plain text; None:
+            visitors can download it. That is all they can do where other machines may look.
         title: plain text.
-        warn: told why a browser was let go.
+        warn: called with the reason why a browser was disconnected.
 
     Raises:
         PolarguideError: viser is not installed or not as it was tested, or the server cannot listen at the address.

@@ -107,7 +107,7 @@ class Session:
         client: viser's handle. photographs: by name. scene_frame: of the scene.
         options: of the panel. wake: called when a picture may be due.
         gray_world: gives the gains of the photographs' mean.
-        save: writes a presentation to the run, and says so; None: the browser downloads it.
+        save: writes a presentation to the run, and returns a message; None: the browser downloads it.
         drop: called with what a callback has raised, to let the browser go.
     """
 
@@ -144,7 +144,7 @@ class Session:
             save=self._save_presentation,
             distance=scene_frame.distance,
             changed=self._changed,
-            said=lambda: self.panel.show_note(self._presenting.note),
+            noted=lambda: self.panel.show_note(self._presenting.note),
             caught=self._caught,
         )
         self._frusta = Frusta(
@@ -193,7 +193,7 @@ class Session:
         return called
 
     def _soon_again(self, what: str) -> bool:
-        """Whether this was asked for only just now, too: what takes time or memory is passed over then."""
+        """Whether the same was requested less than ``BETWEEN_FILES`` ago; such a request is ignored."""
         now = time.monotonic()
         with self._lock:
             soon = now - self._asked.get(what, -BETWEEN_FILES) < BETWEEN_FILES

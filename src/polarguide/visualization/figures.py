@@ -17,7 +17,6 @@ from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.color import shown
-from polarguide.errors import PolarguideError
 from polarguide.files import write_whole
 
 Picture = NDArray[np.uint8]
@@ -191,8 +190,6 @@ def scalar_to_rgb(
     low: float,
     high: float,
     colormap: str = "viridis",
-    *,
-    invert: bool = False,
 ) -> Picture:
     """A map of numbers in false colors.
 
@@ -200,27 +197,18 @@ def scalar_to_rgb(
         values: [H, W].
         low, high: the values at the two ends of the color map, ``low < high``; beyond them colors saturate.
         colormap: a name in ``COLOR_MAPS``.
-        invert: give ``low`` the last color and ``high`` the first, for example to make near depths bright.
 
     Returns:
         uint8 [H, W, 3]; black where the value is not finite.
 
     Raises:
         ValueError: an empty range.
-        PolarguideError: an unknown color map.
     """
     if not low < high:
         raise ValueError(f"range: expected low < high, found {low} and {high}")
-    if colormap not in COLOR_MAPS:
-        raise PolarguideError(
-            "colormap",
-            expected=f"one of {', '.join(COLOR_MAPS)}",
-            found=repr(colormap),
-            remedy="Choose one of these.",
-        )
     numbers = values.detach().to("cpu", torch.float64)
     place = ((numbers - low) / (high - low)).nan_to_num(0.0).clamp(0, 1)
-    colors = cv2.applyColorMap(_to_uint8(1 - place if invert else place), COLOR_MAPS[colormap])
+    colors = cv2.applyColorMap(_to_uint8(place), COLOR_MAPS[colormap])
     picture = np.ascontiguousarray(colors[..., ::-1], dtype=np.uint8)
     picture[~numbers.isfinite().numpy()] = 0
     return picture
@@ -320,15 +308,10 @@ def write_png(
 
     Raises:
         ValueError: not such a picture.
-        PolarguideError: the folder does not exist.
+        PolarguideError: it cannot be written.
     """
     check_picture(rgb8, "picture")
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise PolarguideError(
-            path.parent, expected="a folder", found="none", remedy="Create it, or choose another place."
-        )
-    write_whole(path, with_texts(png_bytes(rgb8, alpha8), about))
+    write_whole(Path(path), with_texts(png_bytes(rgb8, alpha8), about))
 
 
 def png_bytes(rgb8: Picture, alpha8: Picture | None = None) -> bytes:
