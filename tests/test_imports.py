@@ -13,16 +13,13 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / PACKAGE
 
 # From the top down. A room may import from itself and from every room before it.
 ROOMS = (
-    "installation",
     "errors",
-    "numerals",
-    "printable",
+    "text",
     "options",
-    "variables",
+    "system",
     "files",
     "records",
     "spreadsheet",
-    "system",
     "progress",
     "color",
     "polarizer",

@@ -1,4 +1,4 @@
-"""Signals, locks and what the system tells of processes; and how it is done without where the system has none."""
+"""Signals, locks, memory and variables; and how it is done where the system has none of it."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from polarguide.errors import PolarguideError
 from polarguide.system import (
     MemoryBound,
     StopSignals,
+    check_variables,
     exclusive_lock,
     free_memory,
     keep_freed_memory,
@@ -255,3 +256,31 @@ def test_memory_that_holds_files_is_free(tmp_path: Path) -> None:
     (tmp_path / "memory.max").write_text("max\n")
     whole = free_memory(tmp_path)
     assert whole is None or whole > 4_000_000
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "refused"),
+    [
+        ("POLARGUIDE_THREADS", "1000000000", True),
+        ("POLARGUIDE_THREADS", "1025", True),
+        ("POLARGUIDE_THREADS", "1024", False),
+        ("POLARGUIDE_THREADS", "many", False),  # passed over
+        ("OPENCV_IO_MAX_IMAGE_PIXELS", "many", True),
+        ("OPENCV_IO_MAX_IMAGE_PIXELS", "1099511627776", False),
+        ("OPENCV_IO_MAX_IMAGE_PIXELS", "64MB", False),
+        ("OPENCV_IO_MAX_IMAGE_WIDTH", "-1", True),
+        ("OPENCV_IO_MAX_IMAGE_HEIGHT", "1e6", True),
+        ("OPENCV_IMGCODECS_WEBP_MAX_FILE_SIZE", "64 MB", True),
+        ("OPENCV_LOG_LEVEL", "SILENT", False),
+    ],
+)
+def test_what_would_end_the_process_is_refused(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, refused: bool
+) -> None:
+    monkeypatch.setenv(name, value)
+    try:
+        check_variables()
+        found = None
+    except PolarguideError as error:
+        found = error.where
+    assert found == (f"the variable {name}" if refused else None)

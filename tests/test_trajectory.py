@@ -14,7 +14,7 @@ from torch import Tensor
 from polarguide.camera import Camera, look_at
 from polarguide.errors import PolarguideError
 from polarguide.scene_frame import scene_frame
-from polarguide.trajectory import camera_record, interpolated, orbit, read_path, spiral
+from polarguide.trajectory import camera_record, interpolated, orbit, read_path
 
 EYE = torch.eye(3, dtype=torch.float64)
 LENS = Camera(64, 48, 70.0, 70.0, 32.0, 24.0, EYE, EYE[0])
@@ -90,16 +90,16 @@ def angle_between(a: Tensor, b: Tensor) -> float:
     return math.degrees(math.acos(max(-1.0, min(1.0, float(a @ b / (a.norm() * b.norm()))))))
 
 
-@pytest.mark.parametrize("path", [orbit, spiral])
-def test_paths_around_look_at_the_center_upright(path) -> None:  # type: ignore[no-untyped-def]
-    cameras = path(around(), 16)
+@pytest.mark.parametrize("swing", [0.0, 0.25])
+def test_paths_around_look_at_the_center_upright(swing: float) -> None:
+    cameras = orbit(around(), 16, swing=swing)
     assert len(cameras) == 16
     for camera in cameras:
         assert angle_between(CENTER - camera.center, camera.rotation[2]) < 1e-5
         assert angle_between(-camera.rotation[1], UP) < 60
         assert abs(float(camera.rotation[0] @ UP)) < 1e-6  # no roll
         assert float(torch.linalg.det(camera.rotation)) == pytest.approx(1)
-    if path is orbit:
+    if not swing:
         torch.testing.assert_close(cameras[0].center, around()[0].center)
         steps = torch.stack([camera.center for camera in cameras])
         gaps = (steps - steps.roll(1, 0)).norm(dim=1)

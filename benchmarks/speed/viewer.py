@@ -24,10 +24,10 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import LAYERS
 from polarguide.trajectory import orbit
-from polarguide.viewer import shown_run
-from polarguide.viewer.appearance import Appearance, Painter
+from polarguide.viewer import run_scenery
+from polarguide.viewer.cameras import letterbox
+from polarguide.viewer.scenery import Appearance, Painter
 from polarguide.viewer.session import JPEG_QUALITY
-from polarguide.viewer.viewport import fit
 
 SKIPPED = 3
 
@@ -42,7 +42,7 @@ def main() -> None:
     arguments = parser.parse_args()
     width, height = (int(side) for side in arguments.size.split("x"))
     opened = open_run(arguments.run)
-    shown = shown_run(opened)
+    shown = run_scenery(opened)
     generator = torch.Generator().manual_seed(0)
     chosen = torch.randint(len(shown.gaussians), (arguments.gaussians,), generator=generator)
     if arguments.gaussians <= len(shown.gaussians):
@@ -50,7 +50,7 @@ def main() -> None:
     rows = {name: shown.gaussians[name].detach()[chosen] for name in shown.gaussians.names}
     shown = replace(shown, gaussians=Gaussians(rows, opened.recipe.rates))
     cameras = list(opened.cameras.values())
-    path = [fit(c, (width, height)).camera(c) for c in orbit(cameras, arguments.pictures + SKIPPED)]
+    path = [letterbox(c, (width, height)).camera(c) for c in orbit(cameras, arguments.pictures + SKIPPED)]
     print(
         f"{shown.status}; {len(shown.gaussians):,} of them, {width} x {height}, {torch.get_num_threads()} threads"
     )

@@ -7,7 +7,7 @@ import signal
 import sys
 
 # Threads that wait should sleep: torch's OpenMP workers must not fight the kernels' threads for cores by spinning.
-# OpenMP reads this when it is loaded, so it has to be said before torch is imported.
+# OpenMP reads this when it is loaded, so it has to be set before torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 try:
@@ -30,7 +30,7 @@ def main() -> None:
     keep_freed_memory()
     try:
         status = run(sys.argv[1:])
-    except KeyboardInterrupt:  # one more, while it was said that the first had stopped the command
+    except KeyboardInterrupt:  # a second one, while the message about the first was printed
         status = 130
     if status == 130:
         for number in (signal.SIGINT, *stop_signals()):  # nothing is left to stop

@@ -39,7 +39,7 @@ from polarguide.shots.options import ShotOptions
 from polarguide.shots.write import FORMATS, WrittenShots, check_formats, write_shots, write_view_maps
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.viewer import watch
+from polarguide.viewer import server
 
 _OF_MAPS = ("full_well", "read_noise", "snr")
 """Options of shots that maps of views of a scene depend on."""
@@ -61,7 +61,7 @@ class Run(OpenedRun):
     export = formats.export
     relight = relight.relight
     share = formats.share
-    view = watch.view_run
+    view = server.view_run
     write_film = film.write_film
     write_pictures = pictures.write_pictures
 
@@ -106,7 +106,7 @@ def train(
     """
 
     looking = partial(
-        watch.watched,
+        server.watched,
         host=session.viewer_host,
         port=session.viewer_port,
         visitors=VisitorOptions(session.allow_host, session.allow_origin),
@@ -148,7 +148,7 @@ def priors(
     Args:
         scene: a scene with poses, or its folder, which is read as ``reading`` says.
         out: folder to write.
-        run, views, threshold, reading: as ``rendering.priors.write_priors`` takes them.
+        run, views, threshold: as ``rendering.priors.write_priors`` takes them.
         refractive_index: of the surfaces; None: as ``scene.json`` says, else 1.5.
         formats: of maps as ``shot_priors`` writes them, a folder for each view: png, exr, npy, page.
         shots: ``full_well``, ``read_noise`` and ``snr`` for the maps.

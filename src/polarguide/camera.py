@@ -33,8 +33,8 @@ LENS = (
 
 
 def can_be_lens(size: ArrayLike, focal: ArrayLike, center: ArrayLike) -> bool:
-    """Whether a lens can have these numbers in pixels, in single precision, too; false for NaN."""
-    side = max(float(np.max(size)), 1.0)  # that a picture has no pixels is said elsewhere
+    """Whether a lens can have these numbers in pixels, also in single precision; false for NaN."""
+    side = max(float(np.max(size)), 1.0)  # pictures without pixels are refused elsewhere
     lengths, places = np.asarray(focal, np.float64), np.abs(np.asarray(center, np.float64))
     sound = (lengths <= FARTHEST).all() and (places <= min(FARTHEST, FARTHEST_CENTER * side)).all()
     alike = lengths.max() <= MOST_STRETCH * lengths.min()

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from polarguide.errors import PolarguideError
+from polarguide.system import process_is_alive
 
 LARGEST_FILE = 1 << 31
 _MASK = os.umask(0)  # what rights new files do not get; it can only be asked for by setting it
@@ -90,7 +91,7 @@ def _temporary(path: Path) -> Path:
         for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp*"):
             process = old.name.removeprefix(f".{path.name}.").partition(".")[0]
             ours = process.isascii() and process.isdigit()
-            if ours and (int(process) == os.getpid() or not _is_alive(int(process))):
+            if ours and (int(process) == os.getpid() or not process_is_alive(int(process))):
                 with contextlib.suppress(OSError):
                     shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -113,19 +114,6 @@ def in_utf8(path: Path) -> Iterator[Path]:
 def holds_files(folder: Path) -> bool:
     """Whether there is anything in a folder but what a process that was killed left half-written."""
     return any(re.fullmatch(r"\..+\.\d+\.tmp", path.name) is None for path in folder.iterdir())
-
-
-def _is_alive(process: int) -> bool:
-    """Whether there may be such a process; elsewhere than on POSIX, asking would end it."""
-    if os.name != "posix":
-        return True
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        return True
-    return True
 
 
 def write_whole(path: Path, data: bytes) -> int:

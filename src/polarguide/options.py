@@ -46,14 +46,9 @@ def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> No
     Raises:
         PolarguideError: it is less than ``minimum`` or more than ``most``.
     """
-    if value < minimum:
-        raise PolarguideError(
-            name, expected=f"{minimum} or more", found=str(value), remedy="Give a larger number."
-        )
-    if value > most:
-        raise PolarguideError(
-            name, expected=f"up to {most}", found=str(value), remedy="Give a smaller number."
-        )
+    if not minimum <= value <= most:
+        expected, change = (f"up to {most}", "smaller") if value > most else (f"{minimum} or more", "larger")
+        raise PolarguideError(name, expected=expected, found=str(value), remedy=f"Give a {change} number.")
 
 
 def check_finite(name: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
@@ -68,23 +63,11 @@ def check_finite(name: str, value: float, least: float = -math.inf, most: float 
         raise PolarguideError(name, expected=expected, found=str(value), remedy="Correct the number.")
 
 
-def check_range(name: str, value: int, least: int, most: int) -> None:
-    """Check an option's value.
-
-    Raises:
-        PolarguideError: it is less than ``least`` or more than ``most``.
-    """
-    if not least <= value <= most:
-        raise PolarguideError(
-            name, expected=f"{least} to {most}", found=str(value), remedy="Choose such a number."
-        )
-
-
 def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     """Check an option's value.
 
     Raises:
-        PolarguideError: it is none of the choices.
+        PolarguideError: it is not one of the choices.
     """
     known = list(choices)
     if value not in known:
@@ -98,7 +81,7 @@ _SIZE = re.compile(r"(?P<count>\d+(\.\d*)?|\.\d+) ?(?P<unit>[kmgt])(?P<binary>i?
 
 
 def gibibytes(text: str) -> float | None:
-    """A size such as 4GB, 600MB or 3.5GiB in GiB; None where it is none, a number without a unit too."""
+    """A size such as 4GB, 600MB or 3.5GiB in GiB; None for other texts, and for a number without a unit."""
     found = _SIZE.fullmatch(text.strip())
     if found is None:
         return None
@@ -195,4 +178,4 @@ class SessionOptions(VisitorOptions, ComputeOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("checkpoint_every", self.checkpoint_every)
-        check_range("viewer_port", self.viewer_port, 1, 65535)
+        check_finite("viewer_port", self.viewer_port, 1, 65535)

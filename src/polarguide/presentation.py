@@ -181,18 +181,15 @@ def parse_length(text: str, where: str = "distance") -> float:
     """Meters of a length such as ``85mm``, ``8.5 cm``, ``0.085``; ``where`` is for messages.
 
     Raises:
-        PolarguideError: it is none.
+        PolarguideError: the text is not a length.
     """
-    match = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([a-z]*)\s*", text)
+    match = re.fullmatch(r"\s*((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([a-z]*)\s*", text)
     unit = LENGTHS.get((match[2] or "m") if match else "")
-    try:
-        meters = float(match[1]) * unit if match and unit else math.nan
-    except ValueError:
-        meters = math.nan
+    meters = float(match[1]) * unit if match and unit else math.nan
     if not 0 < meters <= MOST_METERS:
         raise PolarguideError(
             where,
-            expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m if none is said)",
+            expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m without one)",
             found=repr(text),
             remedy="Correct the length.",
         )

@@ -1,4 +1,4 @@
-"""How long work says what it does; silent unless somebody listens, as the command line does."""
+"""Progress reporting for long operations. Silent by default; the command line installs a reporter."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 class Advance(Protocol):
-    """Takes how far a piece of work is."""
+    """Records how much of a piece of work is done."""
 
     def __call__(self, done: int, *, total: int | None = None, note: str = "") -> None:
         """``done`` so far, of ``total`` if that has become known, and a few words about it."""

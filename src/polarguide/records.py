@@ -238,7 +238,7 @@ def _plain(text: str) -> str:
 
 
 def _require_finite(value: Any, where: object, remedy: str, path: str = "") -> None:
-    """Refuse NaN and infinity, which Python's JSON reads though they are none.
+    """Refuse NaN and infinity, which Python's JSON reads although JSON has no such numbers.
 
     Raises:
         PolarguideError: there is one.

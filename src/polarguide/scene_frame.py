@@ -84,7 +84,7 @@ def _common_up(cameras: Sequence[Camera]) -> Tensor:
     values, axes = torch.linalg.eigh(rows.T @ rows / len(rows))
     axis = axes[:, 0]
     # The rows have to spread over a plane, with little out of it, and the cameras to be upright rather than on end.
-    told = float(values[1]) > _LEAST_FAN and float(values[0]) < _MOST_ROLL * float(values[1])
-    if not told or abs(float(axis @ mean)) < 0.5:
+    is_level = float(values[1]) > _LEAST_FAN and float(values[0]) < _MOST_ROLL * float(values[1])
+    if not is_level or abs(float(axis @ mean)) < 0.5:
         return mean
     return axis if float(axis @ mean) > 0 else -axis

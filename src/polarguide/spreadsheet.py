@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Iterable
 
-from polarguide.printable import printable
+from polarguide.text import printable
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 

@@ -1,4 +1,4 @@
-"""Signals, and what only some operating systems offer: elsewhere a function returns None, or does nothing."""
+"""Signals, memory and processes, what only some operating systems offer, and variables that would end a process."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import ctypes
 import importlib
 import math
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -15,6 +16,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from polarguide.errors import PolarguideError
+from polarguide.options import MOST_THREADS
 
 MEBIBYTE = 1 << 20
 LAST_WORDS_SECONDS = 5.0
@@ -96,18 +98,6 @@ class StopSignals:
             timer.start()
         else:
             interrupt(number, frame)
-
-
-@contextlib.contextmanager
-def signals_as_interrupts() -> Iterator[None]:
-    """SIGTERM and SIGHUP act like Ctrl-C."""
-
-    old = {number: signal.signal(number, interrupt) for number in stop_signals()}
-    try:
-        yield
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -212,7 +202,7 @@ class MemoryBound:
         self._bound, self._most, self._waits = self._least, 0.0, 0
 
     def keep(self) -> None:
-        """Called between steps that each take and free the like of what the one before took."""
+        """Call once per step, when allocations of successive steps have similar sizes."""
         held = resident_memory()
         if held is None:
             return
@@ -224,7 +214,7 @@ class MemoryBound:
             self._most, self._waits = 0.0, SETTLED
 
     def clear(self) -> None:
-        """Called between two works that take and free other sizes, as a view's targets and a step do."""
+        """Call between two operations whose allocations have different sizes, such as a view's targets and a step."""
         held = resident_memory()
         if held is not None and held > PARTLY * self._limit:
             return_freed_memory()
@@ -248,7 +238,7 @@ UNBOUNDED = MemoryBound()
 
 
 def keep_freed_memory() -> None:
-    """Tell the allocator, for the rest of this process, to keep what is freed; only glibc's does as told.
+    """Tell the allocator, for the rest of this process, to keep what is freed; only glibc's can.
 
     Each step of a training frees and asks for the same hundred megabytes, which glibc would hand to the system and
     fetch again, page by page, cleared. A process that is ours alone calls this, never a module as it is imported.
@@ -297,7 +287,7 @@ def process_is_alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):  # the latter of a number that no process has
         return False
     except (OSError, IndexError):  # not ours to signal, or a system without /proc
         return True
@@ -305,7 +295,7 @@ def process_is_alive(pid: int) -> bool:
 
 
 def process_rank() -> int:
-    """The number of this process among those that torchrun started; 0 without it, or where it is none."""
+    """The number of this process among those that torchrun started; 0 without it, or for no number."""
     text = os.environ.get("RANK", "")
     return int(text) if _is_count(text) else 0
 
@@ -352,3 +342,31 @@ def _is_count(text: str) -> bool:
 def _no_rank(name: str, expected: str, found: str) -> PolarguideError:
     remedy = "Unset WORLD_SIZE and RANK, or start the training with torchrun."
     return PolarguideError(name, expected=expected, found=found[:100], remedy=remedy)
+
+
+_SIZE = re.compile(r"[0-9]{1,18}(KB|Kb|kb|MB|Mb|mb)?")
+_SIZES = re.compile(r"OPENCV_(IO_MAX_IMAGE_[A-Z]+|IMGCODECS_[A-Z]+_MAX_FILE_SIZE)")
+"""Read by OpenCV as it is loaded, which ends the process where one is not a size."""
+
+
+def check_variables() -> None:
+    """Validate variables that OpenCV and the kernels read when they are loaded: a wrong value would end the process.
+
+    Raises:
+        PolarguideError: the kernels would start more threads than any machine has, or OpenCV would end the process.
+    """
+    threads = os.environ.get("POLARGUIDE_THREADS", "").strip()
+    if threads.isdecimal() and len(threads) < 1000 and int(threads) > MOST_THREADS:
+        raise _wrong("POLARGUIDE_THREADS", f"a number up to {MOST_THREADS}", threads)
+    for name, text in os.environ.items():
+        if _SIZES.fullmatch(name) and not _SIZE.fullmatch(text):
+            raise _wrong(name, "a whole number", text)
+
+
+def _wrong(name: str, expected: str, found: str) -> PolarguideError:
+    return PolarguideError(
+        f"the variable {name}",
+        expected=expected,
+        found=repr(found[:100]),
+        remedy=f"Correct it, or unset {name}.",
+    )

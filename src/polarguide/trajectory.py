@@ -58,11 +58,6 @@ def orbit(
     return path
 
 
-def spiral(cameras: Sequence[Camera], frames: int, *, around: SceneFrame | None = None) -> list[Camera]:
-    """An orbit that goes up and down by a quarter of the distance, twice."""
-    return orbit(cameras, frames, swing=0.25, around=around)
-
-
 def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A smooth path through cameras in their order: cubic splines of place and rotation (SciPy's ``RotationSpline``).
 

@@ -12,8 +12,7 @@ from random_runs import ring
 from polarguide.export.mesh import write_mesh
 from polarguide.export.placement import Placement
 from polarguide.presentation import Presentation
-from polarguide.rendering.fusion import Surface
-from polarguide.rendering.mesh import ColoredMesh
+from polarguide.rendering.mesh import ColoredMesh, Surface
 from polarguide.scene_frame import scene_frame
 
 trimesh = pytest.importorskip("trimesh")

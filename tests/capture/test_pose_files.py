@@ -14,7 +14,7 @@ from polarguide.camera import Camera
 from polarguide.capture.colmap.files import colmap_camera
 from polarguide.capture.pose_files import read_pose_file
 from polarguide.errors import PolarguideError
-from polarguide.export.cameras import write_transforms
+from polarguide.export.placement import write_transforms
 
 VIEWS = ["a", "b", "c", "d"]
 LENS = {

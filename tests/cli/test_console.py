@@ -1,19 +1,22 @@
-"""What the console shows of names that come from files, of sizes, and of what has no value."""
+"""What the console shows of messages, warnings and progress."""
 
 from __future__ import annotations
 
 import io
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from polarguide.cli import console
 from polarguide.cli.app import run
-from polarguide.cli.console import say, size_text
-from polarguide.cli.evaluate import _errors, _table, _without_value
-from polarguide.evaluation.table import METRICS, OBJECT_METRICS, shown_metrics
-from polarguide.printable import printable
+from polarguide.cli.console import ConsoleReporter, JobReporter, Lines, bars, say, size_text, warnings_printed
+from polarguide.cli.evaluate import _errors, print_scores
+from polarguide.errors import PolarguideWarning
+from polarguide.evaluation.table import METRICS, OBJECT_METRICS
+from polarguide.text import printable
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
 
@@ -43,22 +46,17 @@ def test_sizes_of_files() -> None:
     ]
 
 
-def test_what_has_no_value_is_named_once() -> None:
+def test_what_has_no_value_is_named_once_and_a_reason_keeps_its_brackets(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     record = {metric.key: 1.0 for metric in METRICS} | {"mesh_fscore_1": None, "normal_mae_deg": None}
-    assert _without_value(record) == [
-        "no ground truth, or no such layer, for: normal error, mesh F-score 1 %"
-    ]
-    record["mesh_fscore_1_reason"] = "skimage is not installed"
-    assert _without_value(record) == ["no ground truth, or no such layer, for: normal error"]
-    assert dict(shown_metrics(record))["mesh F-score 1 %"] == "n/a (skimage is not installed)"
-
-
-def test_a_reason_keeps_its_brackets() -> None:
-    record = {metric.key: 1.0 for metric in METRICS} | {"mesh_fscore_1": None}
+    print_scores(record | {"objects": {}}, "scores")
+    assert "for: normal error, mesh F-score 1 %\n" in capsys.readouterr().out
     record["mesh_fscore_1_reason"] = "pip install 'a[b]'"
-    shown = Console(file=io.StringIO(), width=400)
-    shown.print(_table(record, "scores"))
-    assert "n/a (pip install 'a[b]')" in shown.file.getvalue()  # type: ignore[attr-defined]
+    print_scores(record | {"objects": {}}, "scores")
+    printed = capsys.readouterr().out
+    assert "for: normal error\n" in printed
+    assert "n/a (pip install 'a[b]')" in printed
 
 
 def test_lines_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,10 +67,11 @@ def test_lines_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_objects_of_any_name_are_rows_of_the_table() -> None:
+    columns = [metric for metric in METRICS if metric.key in OBJECT_METRICS]
     values = {key: 0.5 for key in OBJECT_METRICS}
     named = {f"[/red]{HOSTILE}": {"pixels": 3, **values}}
     shown = Console(file=io.StringIO(), width=400)
-    shown.print(_errors({"objects": named, "materials": {}}))
+    shown.print(_errors({"objects": named, "materials": {}}, columns))
     assert r"[/red]\x1b[2J" in shown.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -83,3 +82,82 @@ def test_a_console_that_cannot_say_a_letter_gets_its_escape(monkeypatch: pytest.
     say("\u2603\udcff")
     stream.flush()
     assert b"\\u2603\\udcff" in stream.buffer.getvalue()  # type: ignore[attr-defined]
+
+
+def test_the_display_shows_markup_in_names_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = JobReporter()
+    with reporter.track("all", 2) as everything, reporter.track("[red]cup[/]", 1) as one:
+        one(1, note="[bold]scoring[/]")
+        everything(1)
+        reporter.say("failed  [red]cup[/]: no [bold]space[/] left")
+    with reporter.track("again"):
+        pass
+    assert "failed  [red]cup[/]: no [bold]space[/] left" in capsys.readouterr().out
+
+
+def test_a_bar_with_a_note_stays(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = ConsoleReporter()
+    with reporter.track("reading", 2) as advance:
+        advance(2)
+    with reporter.track("training", 2) as advance:
+        advance(2, note="[red]loss[/] 0.1")
+    said = capsys.readouterr().out
+    assert "reading" not in said
+    assert "[red]loss[/] 0.1" in said
+
+
+def test_warnings_of_the_library_are_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    with warnings_printed():
+        warnings.warn("the [scene] has changed", PolarguideWarning, stacklevel=1)
+    assert capsys.readouterr().out == "warning: the [scene] has changed\n"
+
+
+def test_the_console_shows_brackets_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = ConsoleReporter()
+    reporter.say("[bold]view[/] 1")
+    reporter.warn("[x] is odd")
+    with reporter.track("[y]") as advance:
+        advance(1)
+        advance(2, total=2, note="[z]")
+    out = capsys.readouterr().out
+    assert "[bold]view[/] 1\nwarning: [x] is odd\n" in out
+
+
+def test_eighty_columns_hold_step_total_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    terminal = Console(file=screen, force_terminal=True, width=80, highlight=False, color_system=None)
+    monkeypatch.setattr(console, "console", terminal)
+    display = bars()
+    task = display.add_task("training stage all of them", total=50000, note="")
+    display.update(task, completed=100, note="all  loss 0.0312  31,415 Gaussians  step 0.123 s  and more yet")
+    terminal.print(display.get_renderable())
+    (line,) = [line for line in screen.getvalue().splitlines() if line.strip()]
+    assert len(line) <= 80
+    assert "100/50000" in line
+    assert "-:--:--" in line  # nothing is known of the speed yet
+    assert "loss 0.0312" in line
+
+
+def test_without_a_terminal_a_line_every_so_often(capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    told = Lines("training", 1000, clock=lambda: now[0])
+    for step in range(0, 1001, 10):
+        now[0] = step / 10
+        told(step, note=f"loss {step}")
+    told.close(last=True)
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "training 150/1000, 0:01:25 left  loss 150"
+    assert len(said) == 7
+    assert said[-1] == "training 1000/1000  loss 1000"
+
+
+def test_the_time_left_follows_from_the_last_minutes(capsys: pytest.CaptureFixture[str]) -> None:
+    """As of a training whose second half looks at pictures of four times the size."""
+    now = [0.0]
+    told = Lines("training", 2000, clock=lambda: now[0])
+    for step in range(0, 1501, 10):
+        now[0] = min(step, 1000) / 10 + max(0, step - 1000)
+        told(step)
+    said = capsys.readouterr().out.splitlines()
+    assert "training 900/2000, 0:01:50 left" in said
+    assert said[-1] == "training 1490/2000, 0:08:30 left"

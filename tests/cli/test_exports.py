@@ -1,10 +1,12 @@
-"""share, export and render --path on a short training: what each writes, and what it refuses."""
+"""share, export and render --path on a short training: what each writes, what it refuses, what others read of it."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import shutil
+import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,37 +17,18 @@ import pytest
 from plyfile import PlyData
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from scipy.spatial import cKDTree
 
 import polarguide
 from polarguide import errors
 from polarguide.cli.app import run
-from polarguide.export import points
+from polarguide.errors import install_package
+from polarguide.export import mesh
 from polarguide.gaussians.ply import read_ply
-from polarguide.installation import install_package
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 from polarguide.trajectory import camera_record
 
 ONE = ("--threads", "1")
-
-
-@pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
-    """Runs a command line that must be refused in one line; returns it."""
-
-    def run_and_read(*arguments: object) -> str:
-        assert run([str(argument) for argument in arguments]) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1, lines
-        assert lines[0].startswith("error: ")
-        return lines[0]
-
-    return run_and_read
-
-
-@pytest.fixture
-def copy(trained: Path, tmp_path: Path) -> Path:
-    """A copy of the training that may be damaged."""
-    return Path(shutil.copytree(trained, tmp_path / "copy"))
 
 
 def exported(trained: Path, folder: Path, kind: str, *more: str) -> Path:
@@ -87,7 +70,7 @@ def test_points_have_unit_normals_and_colors(
     assert "found none" in refused(
         "export", trained, "--format", "points", "--out", tmp_path
     )  # all are faint yet
-    monkeypatch.setattr(points, "OPAQUE", 0.02)
+    monkeypatch.setattr(mesh, "OPAQUE", 0.02)
     exported(trained, tmp_path, "points")
     cloud = trimesh.load_scene(tmp_path / "points.ply").dump()[0]
     vertices = PlyData.read(tmp_path / "points.ply")["vertex"]
@@ -261,3 +244,55 @@ def test_options_without_what_they_belong_to(trained: Path, refused, tmp_path: P
     assert "--frames: expected a --path" in refused(*render, "--frames", "5")
     assert "--rotate-environment" in refused(*render, "--rotate-environment", "1e308")
     assert not (tmp_path / "new").exists()
+
+
+PLACES = (
+    str(Path(__file__).resolve().parents[2] / "build/node/node_modules/.bin"),
+    os.environ.get("PATH", ""),
+)
+PROGRAM = shutil.which(os.environ.get("SPLAT_TRANSFORM", "splat-transform"), path=os.pathsep.join(PLACES))
+pytestmark = [
+    pytest.mark.skipif(PROGRAM is None, reason="no splat-transform -> apt-get install nodejs npm; make test"),
+    pytest.mark.slow,
+]
+# Largest error of the median Gaussian. Harmonics have 4 bits in SPZ (steps of 1/8), and come from a palette in SOG.
+EXACT = 1e-5
+TOLERANCES = {
+    "ply": dict.fromkeys(("means", "opacity", "log_scales", "turn", "sh_dc", "sh_rest"), EXACT),
+    "spz": {"means": 3e-4, "opacity": 3e-3, "log_scales": 0.04, "turn": 0.02, "sh_dc": 0.02, "sh_rest": 0.07},
+    "sog": {"means": 3e-3, "opacity": 3e-3, "log_scales": 0.02, "turn": 0.01, "sh_dc": 0.01, "sh_rest": 0.02},
+}
+
+
+def described(path: Path) -> dict[str, np.ndarray]:
+    """What both programs agree to call a Gaussian: [N, ...] by name, quaternions of unit length with w positive."""
+    rows = {name: values.double().numpy() for name, values in read_ply(path).items() if name != "extra"}
+    turn = rows["quaternions"] / np.linalg.norm(rows["quaternions"], axis=1, keepdims=True)
+    return {
+        "means": rows["means"],
+        "opacity": (1 / (1 + np.exp(-rows["opacity_logits"])))[:, None],
+        "log_scales": rows["log_scales"],
+        "turn": turn * np.where(turn[:, :1] < 0, -1, 1),
+        "sh_dc": rows["sh_dc"].reshape(len(turn), -1),
+        "sh_rest": rows["sh_rest"].reshape(len(turn), -1),
+    }
+
+
+@pytest.mark.parametrize("kind", TOLERANCES)
+def test_another_program_reads_our_splats(kind: str, trained: Path, tmp_path: Path) -> None:
+    if kind == "spz":
+        pytest.importorskip("gaussforge")
+    assert run(["export", str(trained), "--format", kind, "--out", str(tmp_path), "--threads", "1"]) == 0
+    back = tmp_path / "back.ply"
+    assert PROGRAM is not None
+    subprocess.run([PROGRAM, "-q", str(tmp_path / f"splats.{kind}"), str(back)], check=True, timeout=300)
+    ours, theirs = described(trained / "point_cloud.ply"), described(back)
+    assert len(ours["means"]) == len(theirs["means"])
+    distance, nearest = cKDTree(theirs["means"]).query(ours["means"])
+    extent = np.ptp(ours["means"], axis=0).max()
+    assert np.quantile(distance, 0.99) < 1e-3 * extent
+    for name, tolerance in TOLERANCES[kind].items():
+        error = np.abs(theirs[name][nearest] - ours[name]).max(axis=1)
+        if name == "turn":  # q and -q are one rotation, and w may be near 0
+            error = np.minimum(error, np.abs(theirs[name][nearest] + ours[name]).max(axis=1))
+        assert np.median(error) < tolerance, name

@@ -24,12 +24,6 @@ ONE = ("--threads", "1")
 
 
 @pytest.fixture
-def copy(trained: Path, tmp_path: Path) -> Path:
-    """A copy of the training that may be presented otherwise."""
-    return Path(shutil.copytree(trained, tmp_path / "copy"))
-
-
-@pytest.fixture
 def scene(demo_scene: Path, tmp_path: Path) -> Path:
     """A copy of the demo scene."""
     return Path(shutil.copytree(demo_scene, tmp_path / "scene"))

@@ -1,18 +1,27 @@
-"""What a shell does to a command: streams that are closed or full, folders that go away, names that are empty."""
+"""The command under a shell: closed or full streams, folders that go away, kills, limits of memory, empty names."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import json
+import os
+import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from safetensors.torch import load_file
 
 from polarguide.cli import app
 from polarguide.cli.app import run
+from polarguide.runs import families
+from polarguide.runs import forecast as forecasts
+from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
+from polarguide.runs.memory import MemoryPlan
 from polarguide.system import interrupt
 
 PROGRAM = f"{sys.executable} -m polarguide"
@@ -167,3 +176,84 @@ def test_a_version_that_cannot_be_written_is_one_line(
         monkeypatch.undo()
         with contextlib.suppress(OSError):
             full.close()
+
+
+pytestmark = pytest.mark.slow
+PATIENCE = 120.0
+
+
+def launch(scene: Path, out: Path, recipe: str, steps: int, *flags: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "polarguide", "train", str(scene), "--out", str(out)]
+    command += ["--recipe", recipe, "--downscale", "4", "--steps", str(steps)]
+    command += ["--checkpoint-every", str(steps // 10), "--threads", "1", *flags]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.parametrize(("recipe", "steps"), [("polarguide-stokes", 200), ("gnerp", 30)])
+def test_killed_and_resumed_is_uninterrupted(
+    demo_scene: Path, tmp_path: Path, recipe: str, steps: int
+) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    process = launch(demo_scene, killed, recipe, steps)
+    give_up = time.monotonic() + PATIENCE
+    while not (killed / CHECKPOINT).exists() and time.monotonic() < give_up:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL, "it ended before it could be killed"
+    step = int(load_file(killed / CHECKPOINT)["scalars"][0])
+    assert 0 < step < steps
+    for out, flags in ((killed, ("--resume",)), (whole, ())):
+        process = launch(demo_scene, out, recipe, steps, *flags)
+        _, errors = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0, errors
+    first, second = load_file(killed / CHECKPOINT), load_file(whole / CHECKPOINT)
+    assert set(first) == set(second)
+    assert [n for n in first if first[n].numpy().tobytes() != second[n].numpy().tobytes()] == []
+
+
+SHORT = ("--downscale", "4", "--steps", "30", "--threads", "1")
+
+
+def test_too_little_is_refused_before_a_picture_is_decoded(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def decode(*_: object) -> None:
+        raise AssertionError("a picture was decoded")
+
+    monkeypatch.setattr("polarguide.capture.view_reader.decode_picture", decode)
+    assert run(["train", str(demo_scene), "--out", str(tmp_path / "run"), *SHORT, "--memory", "30MB"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--memory: expected at least" in said
+    assert "Give --memory" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_training_in_little_memory_gives_the_same_bits_and_says_what_it_takes(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecasts, "LEAST_STEPS", 30)
+    assert run(["train", str(demo_scene), "--out", str(tmp_path / "a"), *SHORT]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert re.search(
+        r"estimate: \d+ s with the [\d,]+ Gaussians of the beginning, \d+ s with [\d,]+; up to", said
+    )
+    assert re.search(
+        r"took \d+ s and [\d.]+ GB of memory \(estimate: \d+ s( to \d+ s)?, up to [\d.]+ GB\)", said
+    )
+    # Nothing is kept in memory.
+    monkeypatch.setattr(families, "plan_memory", lambda *_, **__: MemoryPlan(False, 0, 10**9))
+    assert run(["train", str(demo_scene), "--out", str(tmp_path / "b"), *SHORT, "--memory", "3GB"]) == 0
+    first, second = (load_file(tmp_path / name / CHECKPOINT) for name in "ab")
+    assert first.keys() == second.keys()
+    assert all(first[name].numpy().tobytes() == second[name].numpy().tobytes() for name in first)
+    assert {path.name for path in (tmp_path / "b").iterdir()} == {
+        path.name for path in (tmp_path / "a").iterdir()
+    }
+    settings = json.loads((tmp_path / "b" / CONFIGURATION).read_text())["settings"]
+    assert settings["steps"] == 30
+    assert settings["gaussians"] > 1000

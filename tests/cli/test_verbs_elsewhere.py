@@ -1,4 +1,4 @@
-"""Verbs on a device that is not the CPU, with values: scores, pictures, other light, and the inspection's training."""
+"""Verbs on a device that is not the CPU, with values; and verbs on a field in place of Gaussians."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ from other_device import BACKEND, OtherDevice
 
 from polarguide.api import Run, open_run
 from polarguide.capture import load_scene
+from polarguide.cli.app import run
+from polarguide.cli.compare import chosen_steps
 from polarguide.cli.render import render
-from polarguide.evaluation.facts import SceneFacts
-from polarguide.evaluation.flip import load_package
-from polarguide.evaluation.maps import ErrorsByObject
-from polarguide.evaluation.measures import HAZE_DEPTH
-from polarguide.evaluation.scores import score_view
-from polarguide.evaluation.target import ViewTarget
+from polarguide.errors import PolarguideError
+from polarguide.evaluation.metrics import HAZE_DEPTH
+from polarguide.evaluation.perceptual import load_package
+from polarguide.evaluation.scores import ErrorsByObject, score_view
+from polarguide.evaluation.target import SceneFacts, ViewTarget
+from polarguide.experiments.record import read_results
 from polarguide.inspection.short_run import short_run, surface_of
 from polarguide.options import ComputeOptions
 from polarguide.presentation import Crop
 from polarguide.scene_frame import scene_frame
-from polarguide.viewer import shown_run
-from polarguide.viewer.appearance import Appearance, Painter
+from polarguide.viewer import run_scenery
+from polarguide.viewer.scenery import Appearance, Painter
 
 
 @pytest.fixture
-def run(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def elsewhere(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run folder, which is opened on the other device unless the CPU is asked for."""
     from polarguide.runs import opened as opening
 
@@ -41,9 +43,9 @@ def run(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
-def test_scores_are_made_there_and_read_once_a_view(run: Path) -> None:
+def test_scores_are_made_there_and_read_once_a_view(elsewhere: Path) -> None:
     with OtherDevice() as device:
-        opened = open_run(run)
+        opened = open_run(elsewhere)
         record = opened.evaluate()
         view, facts = opened.scene.test_views[0], SceneFacts.of(opened.scene)
         result = opened.model.render(view.camera, depth=True, surface=True)
@@ -61,19 +63,19 @@ def test_scores_are_made_there_and_read_once_a_view(run: Path) -> None:
         with pytest.raises(RuntimeError, match="mixes devices"):
             score_view(ViewTarget.of_view(view, facts, cpu), result)
     assert there == here == record["views"][view.name]
-    by_cpu = open_run(run, device="cpu").evaluate()
+    by_cpu = open_run(elsewhere, device="cpu").evaluate()
     assert record["psnr"] == pytest.approx(by_cpu["psnr"], abs=0.01)
     assert record["specular_psnr"] == pytest.approx(by_cpu["specular_psnr"], abs=0.01)
 
 
-def test_pictures_by_other_light_and_along_a_path(run: Path, tmp_path: Path) -> None:
+def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Path) -> None:
     light = tmp_path / "light.hdr"
     cv2.imwrite(str(light), np.full((16, 32, 3), 0.4, np.float32))
     layers = "final,reflection,specular,normal,depth,strength"
 
     def shown(device: str, out: Path) -> np.ndarray:
         render(
-            run,
+            elsewhere,
             layers=layers,
             environment=light,
             rotate_environment=30,
@@ -84,7 +86,7 @@ def test_pictures_by_other_light_and_along_a_path(run: Path, tmp_path: Path) -> 
 
     with OtherDevice():
         there = shown("auto", tmp_path / "there")
-        render(run, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path)
+        render(elsewhere, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path)
     assert len(list(tmp_path.glob("path_*.png"))) == 2
     # Depth's colors jump where nothing is seen, so a few pixels may differ by much.
     assert float((np.abs(there - shown("cpu", tmp_path / "here")) > 2).mean()) < 0.01
@@ -110,7 +112,7 @@ def test_the_inspection_trains_there_and_compares_here(
     assert {t.device.type for t in (surface.normal, surface.depth, surface.known)} == {"cpu"}
 
 
-def test_the_viewer_draws_what_lies_there(run: Path) -> None:
+def test_the_viewer_draws_what_lies_there(elsewhere: Path) -> None:
     crop = Crop((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     chosen = [
         Appearance(layer, exposure=0.5, strength=0.5, turn=30.0, crop=crop)
@@ -120,12 +122,75 @@ def test_the_viewer_draws_what_lies_there(run: Path) -> None:
     def drawn(opened: Run) -> list[np.ndarray]:
         view = opened.scene.test_views[0]
         painter = Painter(scene_frame(list(opened.cameras.values())))
-        pictures = [painter.paint(shown_run(opened), view.camera, look, view) for look in chosen]
+        pictures = [painter.paint(run_scenery(opened), view.camera, look, view) for look in chosen]
         return [picture.astype(float) for picture in pictures if picture is not None]
 
     with OtherDevice():
-        there = drawn(open_run(run))
-    here = drawn(open_run(run, device="cpu"))
+        there = drawn(open_run(elsewhere))
+    here = drawn(open_run(elsewhere, device="cpu"))
     assert len(there) == len(here) == len(chosen)
     for a, b in zip(there, here, strict=True):
         assert np.abs(a - b).mean() < 1
+
+
+SMALL = ["--downscale", "8", "--threads", "1"]
+
+
+def test_steps_of_recipes() -> None:
+    assert chosen_steps(("5000",)) == (5000, {})
+    assert chosen_steps(("5000", "gnerp=10000")) == (5000, {"gnerp": 10000})
+    assert chosen_steps(("gnerp:circular=7",)) == (None, {"gnerp:circular": 7})
+
+
+@pytest.mark.parametrize("words", [("5000", "3000"), ("gnerp=",), ("gnerp=1", "gnerp=2"), ("many",), ("-5",)])
+def test_steps_that_cannot_be_read(words: tuple[str, ...]) -> None:
+    with pytest.raises(PolarguideError, match="--steps"):
+        chosen_steps(words)
+
+
+def test_steps_of_a_recipe_that_is_not_compared(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    command = ["compare", str(demo_scene), "--recipes", "3dgs", "--steps", "5", "gnerp=9", "--out", str(out)]
+    assert run(command) == 2
+    assert "gnerp" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_a_field_is_compared_with_gaussians(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    command = ["compare", str(demo_scene), "--recipes", "3dgs", "gnerp", "--steps", "20", "gnerp=4"]
+    command += ["--downscale", "8", "--jobs", "1", "--out", str(out), "--report-views", "1"]
+    assert run(command) == 0
+    record = json.loads((out / "results.json").read_text())
+    read_results(out / "results.json")
+    assert [r["about"].endswith("; 4 steps.") for r in record["recipes"]] == [False, True]
+    assert [r.get("steps") for r in record["recipes"]] == [None, 4]
+    rows = [
+        line.split("|")[1].strip() for line in (out / "results.md").read_text().splitlines() if "|" in line
+    ]
+    assert rows[2:4] == ["`3dgs`", "`gnerp` (4 steps)"]
+    steps = {
+        r["recipe"]: json.loads((out / r["folder"] / "metrics.json").read_text())["steps"]
+        for r in record["runs"]
+    }
+    assert steps == {"3dgs": 20, "gnerp": 4}
+    capsys.readouterr()
+    assert run(command) == 0
+    assert "finished before: 2" in capsys.readouterr().out
+    folder = next(str(out / r["folder"]) for r in record["runs"] if r["recipe"] == "gnerp")
+    assert (
+        run(["render", folder, "--layers", "final,normal,depth,specular", "--out", str(tmp_path / "r")]) == 0
+    )
+    assert "no layer specular" in capsys.readouterr().out
+    assert run(["export", folder, "--format", "mesh", "--resolution", "24"]) == 0
+    for refused in (["export", folder, "--format", "ply"], ["share", folder]):
+        capsys.readouterr()
+        assert run(refused) == 2
+        error = capsys.readouterr().err
+        assert "signed-distance field" in error
+        assert len(error.splitlines()) == 1

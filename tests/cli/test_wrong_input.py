@@ -10,24 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from polarguide.cli.app import run
-from polarguide.installation import install_package
+from polarguide.errors import install_package
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
-
-
-@pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
-    """Runs a command line that must be refused; returns the one line it says."""
-
-    def run_and_read(*arguments: object) -> str:
-        assert run([str(argument) for argument in arguments]) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1, lines
-        assert lines[0].startswith("error: ")
-        assert lines[0].endswith(".")
-        return lines[0]
-
-    return run_and_read
 
 
 def test_missing_scene(refused, tmp_path: Path) -> None:

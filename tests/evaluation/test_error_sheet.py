@@ -12,8 +12,7 @@ from known_scene import HEIGHT, WIDTH, known_scene, rendered
 
 from polarguide.evaluation import error_sheet
 from polarguide.evaluation.error_sheet import COLUMNS, ErrorSheet
-from polarguide.evaluation.facts import SceneFacts
-from polarguide.evaluation.target import ViewTarget
+from polarguide.evaluation.target import SceneFacts, ViewTarget
 from polarguide.visualization import figures
 
 CPU = torch.device("cpu")

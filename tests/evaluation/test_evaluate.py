@@ -1,19 +1,27 @@
-"""A whole run scored: what is said first, and what is written."""
+"""Scoring a run: its record, its speed, and views behind one polarizer."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import math
 import shutil
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from heard import Heard
 
 from polarguide.api import Run, open_run
+from polarguide.capture import View
+from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.errors import PolarguideError
 from polarguide.evaluation import evaluate
+from polarguide.evaluation.evaluate import cross_fitted, frames_per_second
+from tests.helpers.tiny import make_scene
 
 
 @pytest.fixture
@@ -115,3 +123,94 @@ def test_a_run_without_test_views_is_not_scored(changed: tuple[Path, Path]) -> N
     ):
         run.evaluate()
     assert not (folder / "metrics.json").exists()
+
+
+VIEWS: Any = ["a", "b", "c", "d"]
+
+
+class Clock:
+    """Time that passes only while a view is drawn, half a second for each but the slower first one."""
+
+    def __init__(self) -> None:
+        self.now, self.drawn = 0.0, list[Any]()
+
+    def draw(self, view: Any) -> None:
+        self.drawn.append(view)
+        self.now += 0.75 if view == "a" else 0.5
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    found = Clock()
+    monkeypatch.setattr(evaluate, "time", found)
+    monkeypatch.setattr(evaluate.Stopwatch, "read", lambda self: (found.now, True))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "drawn", "speed"),
+    [
+        (0.0, 40.0, VIEWS * 4, 2.0),  # a warm-up, and three times each
+        (10.0, 40.0, VIEWS * 6, 2.0),  # until it has taken long enough
+        (0.0, 2.9, ["a", *VIEWS[:3]], 2.0),  # those that fit, once
+        (0.0, 0.1, ["a", "a"], 1 / 0.75),
+    ],
+)
+def test_slow_pictures_are_drawn_less_often(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch, least: float, most: float, drawn: list[str], speed: float
+) -> None:
+    monkeypatch.setattr(evaluate, "MINIMUM_SECONDS", least)
+    monkeypatch.setattr(evaluate, "MOST_SECONDS", most)
+    assert frames_per_second(clock.draw, VIEWS) == pytest.approx(speed)
+    assert clock.drawn == drawn
+
+
+def test_beside_other_work_there_is_no_speed(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluate.Stopwatch, "read", lambda self: (clock.now, False))
+    assert frames_per_second(clock.draw, VIEWS) is None
+
+
+WHOLE = make_scene().views[0]
+STOKES = WHOLE.stokes()
+FINAL = STOKES[0] / 2
+
+
+def single(place: int, gain: float = 1.0) -> View:
+    codes = (WHOLE.codes[place : place + 1].to(torch.float32) * gain).round().to(torch.int32).to(torch.uint16)
+    return dataclasses.replace(WHOLE, pictures=codes, exposures=(Exposure(),))
+
+
+@pytest.mark.parametrize("place", range(4))
+@pytest.mark.parametrize("gain", [1.0, 0.8])
+def test_a_model_that_is_right_predicts_any_picture(place: int, gain: float) -> None:
+    view = single(place, gain)
+    assert torch.allclose(cross_fitted(view, FINAL, STOKES), view.photograph(), atol=2e-3)
+
+
+def test_no_pixel_takes_part_in_its_own_fit() -> None:
+    """Whatever the left half shows, its prediction stays the same."""
+    view = single(1)
+    changed = view.codes.clone()
+    middle = changed.shape[2] // 2
+    changed[:, :, :middle] = (changed[:, :, :middle].to(torch.int32) // 2).to(torch.uint16)
+    ours = cross_fitted(view, FINAL, STOKES)
+    theirs = cross_fitted(dataclasses.replace(view, pictures=changed), FINAL, STOKES)
+    assert torch.equal(ours[:, :middle], theirs[:, :middle])
+    assert not torch.allclose(ours[:, middle:], theirs[:, middle:], atol=1e-2)
+
+
+def test_without_a_prediction_the_gain_alone_is_fitted() -> None:
+    found = cross_fitted(single(0), FINAL, None)
+    ratio = found / FINAL
+    middle = found.shape[1] // 2
+    for half in (ratio[:, :middle], ratio[:, middle:]):
+        assert math.isclose(float(half.min()), float(half.max()), rel_tol=1e-4)
+
+
+def test_s0_needs_no_such_thing() -> None:
+    assert WHOLE.exposures == FOUR
+    assert WHOLE.measures_radiance
+    assert not single(0).measures_radiance

@@ -12,9 +12,8 @@ import torch
 from known_scene import HEIGHT, WIDTH, known_scene, rendered
 
 from polarguide.capture.exposures import Exposure
-from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.scores import score_view, summarize
-from polarguide.evaluation.target import ViewTarget, without_jumps
+from polarguide.evaluation.target import SceneFacts, ViewTarget, without_jumps
 from polarguide.experiments.plan import black_share
 
 CPU = torch.device("cpu")

@@ -13,10 +13,9 @@ from random_runs import ring
 
 from polarguide.camera import Camera
 from polarguide.capture import GroundTruth, View
+from polarguide.errors import install_package
 from polarguide.evaluation import mesh as measured
-from polarguide.installation import install_package
-from polarguide.rendering.fusion import Surface
-from polarguide.rendering.mesh import fused_surface
+from polarguide.rendering.mesh import Surface, fused_surface
 from polarguide.shading.result import RenderResult
 
 trimesh = pytest.importorskip("trimesh")

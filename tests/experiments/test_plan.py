@@ -14,7 +14,7 @@ from heard import Heard
 
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.evaluate import evaluate
-from polarguide.evaluation.sources import scoring_digest
+from polarguide.evaluation.sources import code_digest
 from polarguide.experiments import plan as plans
 from polarguide.experiments.compare import ablated, collect, compare
 from polarguide.experiments.options import CompareOptions
@@ -143,7 +143,7 @@ def test_another_scene_recipe_value_or_program_has_another_key(monkeypatch: pyte
     assert len(set(keys)) == len(keys)
     assert key() == key()
     before = folders()
-    monkeypatch.setattr(plans, "training_digest", lambda: "other")
+    monkeypatch.setattr(plans, "code_digest", lambda: "other")
     assert not set(before) & set(folders())
 
 
@@ -204,7 +204,7 @@ def test_how_far_a_run_is(planned: PlannedRun, tmp_path: Path) -> None:
     assert planned.state() == "done"
     record = json.loads(metrics.read_text())
     assert (record["fps"], record["fps_layers"]) == (None, None)
-    assert record["provenance"]["sources"] == scoring_digest()
+    assert record["provenance"]["sources"] == code_digest()
     for change in (
         {"steps": 39},
         {"psnr": "high"},

@@ -14,8 +14,7 @@ import pytest
 import torch
 from random_runs import KINDS, random_state, ring
 
-from polarguide.export.records import harmonics_steps, records
-from polarguide.export.share import BAKED, baked_page, share_page
+from polarguide.export.share import BAKED, baked_page, harmonics_steps, records, share_page
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.presentation import Presentation
 from polarguide.runs.point_cloud import gaussian_colors

@@ -9,20 +9,20 @@ from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.scene_frame import SceneFrame, scene_frame
-from polarguide.viewer import Shown
-from polarguide.viewer.frusta import Photograph
+from polarguide.viewer import GaussianScenery
+from polarguide.viewer.cameras import Photograph
 
 
-def shown(recipe: str = "polarguide-stokes") -> Shown:
+def shown(recipe: str = "polarguide-stokes") -> GaussianScenery:
     state, shading = random_state(recipe)
-    return Shown(state.gaussians, state.light, shading, rasterize_cpu, 3, f"{recipe}, a test")
+    return GaussianScenery(state.gaussians, state.light, shading, rasterize_cpu, 3, f"{recipe}, a test")
 
 
 def frame_of_scene() -> SceneFrame:
     return scene_frame(list(ring().values()))
 
 
-def photograph(name: str, camera: Camera, seen: Shown) -> Photograph:
+def photograph(name: str, camera: Camera, seen: GaussianScenery) -> Photograph:
     """A photograph of the scene as it is rendered, polarized along the rows of the picture."""
     picture = seen.render(camera, depth=False).final.clamp(0, 0.6)
     factors = torch.tensor([1.3, 1.0, 0.7, 1.0])[:, None, None, None]
@@ -32,5 +32,5 @@ def photograph(name: str, camera: Camera, seen: Shown) -> Photograph:
     return Photograph(View(name, camera, codes, nowhere, nowhere), small, held_out=name == "v0")
 
 
-def photographs(seen: Shown) -> dict[str, Photograph]:
+def photographs(seen: GaussianScenery) -> dict[str, Photograph]:
     return {name: photograph(name, camera, seen) for name, camera in ring().items()}

@@ -1,12 +1,17 @@
-"""Means over windows, against another package."""
+"""Safe arithmetic, and NumPy arrays in and out."""
 
 from __future__ import annotations
 
+import inspect
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 from scipy.ndimage import uniform_filter
 from torch.testing import assert_close
 
+from polarguide import optics
 from polarguide.optics._numerics import window_mean
 
 
@@ -15,3 +20,123 @@ def test_window_means_repeat_the_border(window: int) -> None:
     planes = torch.randn(2, 9, 13, generator=torch.Generator().manual_seed(window), dtype=torch.float64)
     expected = uniform_filter(planes.numpy(), size=(1, window, window), mode="nearest")
     assert_close(window_mean(planes, window), torch.from_numpy(expected), rtol=0, atol=1e-13)
+
+
+RNG = np.random.default_rng(3)
+FOUR = RNG.uniform(0.1, 0.9, (4, 6, 7, 3)).astype(np.float32)
+STOKES = optics.stokes(FOUR)
+GRAY = optics.luminance(STOKES)
+RAYS = np.array([0.1, -0.2, 1.0], np.float32) / np.float32(np.sqrt(1.05))
+NORMALS = np.broadcast_to(np.array([0.3, 0.2, -0.93], np.float32), (6, 7, 3))
+ANGLE = RNG.uniform(0.1, 1.4, (6, 7)).astype(np.float32)
+SHARE = RNG.uniform(0.05, 0.35, (6, 7)).astype(np.float32)
+CIRCLE = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)
+CALLS: dict[str, tuple[Any, ...]] = {
+    "analyzer": (ANGLE[0, 0], RAYS, "filter"),
+    "aolp": (GRAY,),
+    "azimuth": (NORMALS, RAYS),
+    "brewster": (SHARE + 1,),
+    "chromatic_normals": (STOKES,),
+    "conductor": (SHARE, SHARE + np.float32(0.5)),
+    "conductor_dolp_slope": (SHARE, SHARE + 1, SHARE + 2),
+    "conductor_index": (SHARE + np.float32(0.5),),
+    "conductor_reflectances": (SHARE, SHARE + 1, SHARE + 2),
+    "diffuse_dolp": (ANGLE,),
+    "diffuse_dolp_limit": (SHARE + 1,),
+    "diffuse_zenith": (SHARE,),
+    "disambiguate": (optics.physical_candidates(GRAY, RAYS), NORMALS),
+    "dolp": (GRAY,),
+    "dolp_noise": (GRAY, SHARE),
+    "dolp_slopes": (SHARE,),
+    "exact_separation": (STOKES, NORMALS, RAYS),
+    "filter_analyzer": (ANGLE[0, 0], RAYS),
+    "fitted_stokes": (FOUR, CIRCLE),
+    "intensity": (GRAY, ANGLE),
+    "intensity_noise": (FOUR[..., 0], 3),
+    "lens_frame": (RAYS,),
+    "luminance": (STOKES,),
+    "normal_from_angles": (ANGLE, ANGLE, RAYS),
+    "paper_candidates": (GRAY, RAYS),
+    "paper_intensities": (STOKES, ANGLE, ANGLE, 0.5),
+    "paper_separation": (STOKES, ANGLE),
+    "photograph": (STOKES,),
+    "physical_candidates": (GRAY, RAYS),
+    "polarization_mask": (GRAY,),
+    "polarization_uncertainty": (GRAY, FOUR[..., 0] * np.float32(1e-4)),
+    "predicted_stokes": (STOKES[0], STOKES[0], NORMALS, RAYS),
+    "reflectances": (ANGLE,),
+    "reflectances_from_cosine": (SHARE,),
+    "specular_dolp": (ANGLE,),
+    "specular_zeniths": (SHARE,),
+    "stokes": (FOUR,),
+    "transmittances": (ANGLE,),
+    "zenith": (NORMALS, RAYS),
+}
+
+
+def flat(value: Any) -> list[Any]:
+    return [part for item in value for part in flat(item)] if isinstance(value, tuple) else [value]
+
+
+def as_tensors(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return (
+            type(value)(*map(as_tensors, value))
+            if hasattr(value, "_fields")
+            else tuple(map(as_tensors, value))
+        )
+    return torch.tensor(np.array(value)) if isinstance(value, np.ndarray) else value
+
+
+def test_every_function_is_called_here() -> None:
+    public = {name for name in optics.__all__ if inspect.isfunction(getattr(optics, name))}
+    assert public == set(CALLS)
+
+
+@pytest.mark.parametrize("name", sorted(CALLS))
+def test_arrays_in_arrays_out(name: str) -> None:
+    function = getattr(optics, name)
+    found = function(*CALLS[name])
+    true = function(*(as_tensors(argument) for argument in CALLS[name]))
+    assert type(found) is type(true) or isinstance(found, np.ndarray)
+    for ours, theirs in zip(flat(found), flat(true), strict=True):
+        assert isinstance(ours, np.ndarray)
+        assert isinstance(theirs, torch.Tensor)
+        np.testing.assert_array_equal(ours, theirs.numpy())
+
+
+@pytest.mark.parametrize(
+    ("kind", "result"),
+    [
+        (np.uint8, np.float32), (np.uint16, np.float32), (np.int32, np.float64), (np.float16, np.float32),
+        (np.float32, np.float32), (np.float64, np.float64), (">f4", np.float32),
+    ],
+)  # fmt: skip
+def test_numbers_of_every_kind(kind: Any, result: Any) -> None:
+    """Differences of unsigned numbers would wrap around."""
+    found = optics.stokes(np.array([[10], [20], [30], [5]]).astype(kind))
+    assert found.dtype == result
+    assert found[:, 0].tolist() == [32.5, -20.0, 15.0]
+
+
+def test_views_and_read_only_arrays() -> None:
+    four = np.broadcast_to(np.arange(4.0)[:, None], (4, 5))[:, ::-1]
+    assert not four.flags.writeable
+    assert optics.stokes(four).shape == (3, 5)
+    assert (optics.stokes(four)[1] == -2).all()
+
+
+def test_a_tensor_among_arrays_gives_tensors() -> None:
+    assert isinstance(optics.intensity(torch.from_numpy(GRAY), ANGLE), torch.Tensor)
+
+
+def test_tensors_keep_their_gradient() -> None:
+    stokes = torch.tensor([1.0, 0.2, 0.1], requires_grad=True)
+    optics.dolp(stokes).backward()
+    assert stokes.grad is not None
+    assert stokes.grad.abs().sum() > 0
+
+
+def test_something_else_than_numbers() -> None:
+    with pytest.raises(TypeError, match="expected an array of numbers"):
+        optics.stokes(np.array(["a", "b", "c", "d"]))

@@ -11,8 +11,7 @@ from torch import Tensor
 from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.export.mesh import write_mesh
-from polarguide.rendering.fusion import Surface, box_around, fuse, largest_pieces, seen_points
-from polarguide.rendering.mesh import scene_mesh
+from polarguide.rendering.mesh import Surface, box_around, fuse, largest_pieces, scene_mesh, seen_points
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import RenderResult
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from polarguide.errors import PolarguideError
-from polarguide.rendering.video import write_video
+from polarguide.rendering.film import write_video
 
 encoder = pytest.importorskip("imageio_ffmpeg")
 PICTURES = [np.full((16, 16, 3), 40 * k, np.uint8) for k in range(5)]

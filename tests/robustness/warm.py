@@ -39,9 +39,7 @@ def warm_up(few_gaussians: bool = True) -> None:
     for verb in app.VERBS:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
             app.run([verb, "--help"])
-    sources = importlib.import_module("polarguide.evaluation.sources")
-    sources.training_digest()
-    sources.scoring_digest()
+    importlib.import_module("polarguide.evaluation.sources").code_digest()
     if few_gaussians:
         _shrink(importlib.import_module("polarguide.recipes.registry"))
     tasks = Path("/proc/self/task")

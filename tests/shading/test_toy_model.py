@@ -18,7 +18,7 @@ from polarguide.capture import Scene
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.scores import score_view
 from polarguide.evaluation.target import ViewTarget
-from polarguide.export.points import surface_points
+from polarguide.export.mesh import surface_points
 from polarguide.export.share import BAKED, share_page
 from polarguide.gaussians.ply import read_ply
 from polarguide.presentation import Crop
@@ -36,8 +36,8 @@ from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer
-from polarguide.viewer import shown_training
-from polarguide.viewer.appearance import Appearance, Painter
+from polarguide.viewer import training_scenery
+from polarguide.viewer.scenery import Appearance, Painter
 
 SETTINGS = TrainSettings(steps=150, seed=2, refractive_index=1.4)
 STOP = 70  # after rounds of the density control, and before others
@@ -138,7 +138,7 @@ def test_it_is_shared_with_baked_colors_and_a_note(trained: Trainer) -> None:
 def test_it_is_viewed(trained: Trainer) -> None:
     cameras = [view.camera for view in trained.scene.views]
     running = AngleTrainer(trained.scene, trained.recipe, trained.settings, trained.backend, trained.state)
-    painter, shown, camera = Painter(scene_frame(cameras)), shown_training(running), cameras[0]
+    painter, shown, camera = Painter(scene_frame(cameras)), training_scenery(running), cameras[0]
     pictures = {layer: painter.paint(shown, camera, Appearance(layer=layer)) for layer in LAYERS}
     assert {layer for layer, found in pictures.items() if found is not None} == set(trained.shading.layers)
     stronger = Appearance(strength=2.0, turn=30.0, crop=Crop((-9, -9, -9), (9, 9, 9)))

@@ -24,11 +24,11 @@ from polarguide.presentation import (
 )
 from polarguide.rendering.picking import gains_of, gray_world, surface_at
 from polarguide.shading.result import LAYERS
+from polarguide.viewer.cameras import letterbox
 from polarguide.viewer.messages import Refused, checked
 from polarguide.viewer.panel import PanelOptions
+from polarguide.viewer.server import save_to_run
 from polarguide.viewer.session import Session
-from polarguide.viewer.viewport import letterbox
-from polarguide.viewer.watch import save_to_run
 from polarguide.visualization import figures
 
 AROUND = frame_of_scene()

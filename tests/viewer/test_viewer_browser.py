@@ -103,7 +103,9 @@ def psnr(picture: np.ndarray, expected: np.ndarray) -> float:
 @pytest.fixture(scope="module")
 def opened() -> Iterator[Opened]:
     with chromium() as browser, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("polarguide.viewer.pose.ARRIVAL", PATIENCE)  # a busy machine's browser takes its time
+        patch.setattr(
+            "polarguide.viewer.cameras.ARRIVAL", PATIENCE
+        )  # a busy machine's browser takes its time
         viewing = Opened(browser)
         yield viewing
         viewing.close()

@@ -17,11 +17,11 @@ from polarguide import optics
 from polarguide.capture.calibration import Calibration
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
-from polarguide.numerals import number_or_nan
 from polarguide.optics import Mount
 from polarguide.polarizer import ANGLES
 from polarguide.records import shortened
 from polarguide.spreadsheet import csv_lines
+from polarguide.text import number_or_nan
 
 Angle = float | Literal["unknown", "none"]
 """Degrees counter-clockwise from the picture's horizontal, modulo 180; or a word."""

@@ -16,8 +16,8 @@ from polarguide.capture.datasets.dataset import checked_pose, pinhole_camera, re
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.errors import PolarguideError
 from polarguide.files import read_file
-from polarguide.numerals import number_or_nan
 from polarguide.records import read_record
+from polarguide.text import number_or_nan
 
 SUFFIXES = (".json", ".xml", ".npz")
 _SQUARE = ((3, 4), (4, 4))

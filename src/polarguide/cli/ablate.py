@@ -7,9 +7,7 @@ from pathlib import Path
 
 import polarguide
 from polarguide.cli.compare import Options, Scenes, Settings, print_results
-from polarguide.cli.console import use_threads
-from polarguide.cli.job_progress import JobReporter
-from polarguide.system import signals_as_interrupts
+from polarguide.cli.console import JobReporter, use_threads
 
 
 def ablate(
@@ -37,15 +35,14 @@ def ablate(
         reference: Recipes to add as first rows, such as 3dgs-dr.
     """
     use_threads(options.threads)
-    with signals_as_interrupts():
-        results = polarguide.ablate(
-            scenes,
-            base,
-            out,
-            only=only,
-            reference=reference,
-            settings=replace(settings, steps=steps),
-            options=options,
-            reporter=JobReporter(),
-        )
+    results = polarguide.ablate(
+        scenes,
+        base,
+        out,
+        only=only,
+        reference=reference,
+        settings=replace(settings, steps=steps),
+        options=options,
+        reporter=JobReporter(),
+    )
     print_results(results, out)

@@ -8,7 +8,6 @@ import difflib
 import importlib
 import io
 import os
-import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -16,14 +15,12 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import tyro
-from rich.console import Console
 
 from polarguide import __version__
-from polarguide.cli.console import say, warnings_printed
+from polarguide.cli.console import print_error, warnings_printed
 from polarguide.errors import PolarguideError
 from polarguide.options import gibibytes
-from polarguide.system import interrupts
-from polarguide.variables import check_variables
+from polarguide.system import check_variables, interrupts
 
 VERBS = {
     "demo": "demo",
@@ -90,29 +87,25 @@ def run(arguments: Sequence[str]) -> int:
         sys.stderr.close()
         return 1
     except OSError as error:  # missing rights, a full disk, a file where a folder should be
-        said = (
+        message = (
             f"{error.filename or 'files'}: expected to read or write there, found {error.strerror or error}."
         )
-        return _failed(f"{said} Check the name, the rights, and the room on the disk.")
+        return _failed(f"{message} Check the name, the rights, and the room on the disk.")
     except Exception as error:
         if _from_a_signal(error) or interrupts() > before:
             return _stopped()
-        said = _of_the_machine(error)
-        if not said:
+        message = _system_error_message(error)
+        if not message:
             raise
         traceback.clear_frames(error.__traceback__)  # they hold the memory, and printing takes some
-        return _failed(said)
+        return _failed(message)
     return status
 
 
-def _errors() -> Console:
-    return Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
-
-
 def _stopped() -> int:
-    """Say that a signal ended the command, if anybody can be told; returns the exit status."""
+    """Print that a signal ended the command, if stderr can be written; returns the exit status."""
     with contextlib.suppress(OSError):
-        _errors().print("stopped.")
+        print("stopped.", file=sys.stderr)
     return 130
 
 
@@ -126,18 +119,17 @@ def _from_a_signal(error: BaseException | None) -> bool:
 
 
 def _failed(text: str) -> int:
-    """Print an error, if anybody can be told; returns the exit status."""
+    """Print an error, if stderr can be written; returns the exit status."""
     with contextlib.suppress(OSError):
-        _errors().print("[bold red]error:[/] ", end="")
-        say(_LONG_WORD.sub(lambda word: word[0][:200] + "...", text), to=_errors())
+        print_error(text)
     return 2
 
 
-def _of_the_machine(error: Exception) -> str:
-    """What to say where memory or threads have run out; empty: it is something else."""
+def _system_error_message(error: Exception) -> str:
+    """The message where memory or threads have run out, or a package cannot be loaded; empty for other errors."""
     if isinstance(error, MemoryError) or any(words in str(error) for words in _RUN_OUT):
-        said = (str(error).splitlines() or ["none is left"])[0]
-        return f"memory: expected enough of it, and of threads, found {said[:200]}. {_MORE_ROOM}"
+        reason = (str(error).splitlines() or ["none is left"])[0]
+        return f"memory: expected enough of it, and of threads, found {reason[:200]}. {_MORE_ROOM}"
     if isinstance(error, ModuleNotFoundError):
         return ""
     if isinstance(error, ImportError):
@@ -154,8 +146,6 @@ def _while_loading(error: Exception) -> bool:
     return any(name.startswith("<frozen importlib") for name in frames[ours[-1] + 1 :]) if ours else False
 
 
-# Of a file or the command line: megabytes of it hide what is wrong.
-_LONG_WORD = re.compile(r"\S{1000,}?(?=:?(?:\s|$))")
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
 _HOME = str(Path(__file__).parents[1]) + os.sep
 _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
@@ -189,7 +179,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
 
 
 def _require_place() -> None:
-    """Refuse a current folder that is no more: some packages end the process there, without a word."""
+    """Refuse a current folder that does not exist any more: some packages end the process there, without a word."""
     try:
         os.getcwd()
     except FileNotFoundError:

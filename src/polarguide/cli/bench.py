@@ -9,10 +9,8 @@ from typing import Annotated
 import tyro
 
 from polarguide.cli.compare import print_results
-from polarguide.cli.console import say, use_threads
-from polarguide.cli.job_progress import JobReporter
+from polarguide.cli.console import JobReporter, say, use_threads
 from polarguide.experiments.options import BenchOptions
-from polarguide.system import signals_as_interrupts
 
 
 def bench(
@@ -30,8 +28,7 @@ def bench(
     """
     use_threads(options.threads)
     run_bench = importlib.import_module("polarguide.experiments.bench").run_bench
-    with signals_as_interrupts():
-        results = run_bench(out, options, reporter=JobReporter())
+    results = run_bench(out, options, reporter=JobReporter())
     if results is None:
         say(f"scenes: {out / 'scenes'}")
     else:

@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import say, use_threads
-from polarguide.cli.job_progress import JobReporter
+from polarguide.cli.console import JobReporter, say, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
-from polarguide.system import signals_as_interrupts
 from polarguide.training.settings import Background, Materials, TrainSettings
 
 if TYPE_CHECKING:
@@ -59,16 +57,15 @@ def compare(
     """
     use_threads(options.threads)
     common, steps_of = chosen_steps(steps)
-    with signals_as_interrupts():
-        results = polarguide.compare(
-            scenes,
-            recipes,
-            out,
-            settings=replace(settings, steps=common),
-            options=options,
-            steps_of=steps_of,
-            reporter=JobReporter(),
-        )
+    results = polarguide.compare(
+        scenes,
+        recipes,
+        out,
+        settings=replace(settings, steps=common),
+        options=options,
+        steps_of=steps_of,
+        reporter=JobReporter(),
+    )
     print_results(results, out)
 
 

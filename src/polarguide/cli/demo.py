@@ -54,12 +54,11 @@ def _first_picture(out: Path) -> Path:
     """A test view larger than its photograph, with its layers: what somebody is shown first."""
     layers = importlib.import_module("polarguide.visualization.layers")
     figures = importlib.import_module("polarguide.visualization.figures")
-    sheet = importlib.import_module("polarguide.visualization.sheet")
     run = polarguide.open_run(out)
     camera = run.scene.view(FIRST_VIEW).camera
     camera = camera.scaled(FINER, FINER * camera.width, FINER * camera.height)
     result = run.result(camera).to("cpu")
     tiles = [layers.layer_picture(result, name, camera) for name in FIRST_LAYERS]
     path = out / "first_picture.png"
-    figures.write_png(path, sheet.contact_sheet([tiles], [FIRST_VIEW], FIRST_LAYERS))
+    figures.write_png(path, figures.contact_sheet([tiles], [FIRST_VIEW], FIRST_LAYERS))
     return path

@@ -8,10 +8,9 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from polarguide.cli.console import console, say, warn
-from polarguide.cli.runs import RunFolder, opened
+from polarguide.cli.console import RunFolder, console, opened, say, warn
 from polarguide.options import ComputeOptions
-from polarguide.printable import printable
+from polarguide.text import printable
 
 _MOST_OBJECTS = 100
 """Lines of the table: a terminal takes minutes to lay out the most that a scene may have."""
@@ -35,15 +34,7 @@ def evaluate(
     title = (
         f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
     )
-    console.print(_table(record, title))
-    for line in _without_value(record):
-        say(line)
-    if record["objects"]:
-        console.print(_errors(record))
-        if len(record["objects"]) > _MOST_OBJECTS:
-            say(
-                f"the {_MOST_OBJECTS} largest of {len(record['objects']):,} objects; metrics.json has all of them"
-            )
+    print_scores(record, title)
     found = trained.health
     for warning in () if found is None else found.warnings:
         warn(warning)
@@ -54,30 +45,42 @@ def evaluate(
     say(f"where the errors are: {run / sheet}")
 
 
-def _without_value(record: dict[str, Any]) -> list[str]:
-    """What has no value for want of something to compare, a line of it if there is any."""
-    absent = importlib.import_module("polarguide.evaluation.table").absent_metrics(record)
-    return [f"no ground truth, or no such layer, for: {', '.join(absent)}"] if absent else []
+def print_scores(record: dict[str, Any], title: str) -> None:
+    """Print a run's record as tables: its metrics, and its errors by object and material."""
+    metrics = importlib.import_module("polarguide.evaluation.table")
+    table = Table(title=Text(printable(title)))
+    table.add_column("metric")
+    table.add_column("value", justify="right")
+    for label, text in metrics.shown_metrics(record):
+        table.add_row(label, Text(printable(text)))
+    console.print(table)
+    if absent := metrics.absent_metrics(record):
+        say(f"no ground truth, or no such layer, for: {', '.join(absent)}")
+    if record["objects"]:
+        columns = [metric for metric in metrics.METRICS if metric.key in metrics.OBJECT_METRICS]
+        console.print(_errors(record, columns))
+        if len(record["objects"]) > _MOST_OBJECTS:
+            say(
+                f"the {_MOST_OBJECTS} largest of {len(record['objects']):,} objects; metrics.json has all of them"
+            )
 
 
-def _errors(record: dict[str, Any]) -> Table:
-    """Errors by object and by material, over the pixels of all test views."""
-    known = importlib.import_module("polarguide.evaluation.table")
-    columns = [metric for metric in known.METRICS if metric.key in known.OBJECT_METRICS]
+def _errors(record: dict[str, Any], columns: list[Any]) -> Table:
+    """Errors by object and by material, over the pixels of all test views; ``columns``: metrics."""
     table = Table(title="by object and material, over the pixels of all test views")
     table.add_column("object", no_wrap=True)
     table.add_column("pixels", justify="right", no_wrap=True)
     for metric in columns:
         table.add_column(metric.heading, justify="right", min_width=8)
-    told = any(errors.get("metal_share") is not None for errors in record["objects"].values())
-    if told:
+    has_metals = any(errors.get("metal_share") is not None for errors in record["objects"].values())
+    if has_metals:
         table.add_column("metal", justify="right", no_wrap=True)
 
     def add(name: str, errors: dict[str, Any]) -> None:
         values = [errors[metric.key] for metric in columns]
         texts = ["n/a" if v is None else f"{v:.{m.digits}f}" for m, v in zip(columns, values, strict=True)]
         share = errors.get("metal_share")
-        texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if told else []
+        texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if has_metals else []
         table.add_row(Text(printable(name)), f"{errors['pixels']:,}", *texts)
 
     largest = sorted(record["objects"], key=lambda name: -record["objects"][name]["pixels"])[:_MOST_OBJECTS]
@@ -86,13 +89,4 @@ def _errors(record: dict[str, Any]) -> Table:
     table.add_section()
     for kind, errors in record["materials"].items():
         add(f"all {kind}", errors)
-    return table
-
-
-def _table(record: dict[str, Any], title: str) -> Table:
-    table = Table(title=Text(printable(title)))
-    table.add_column("metric")
-    table.add_column("value", justify="right")
-    for label, text in importlib.import_module("polarguide.evaluation.table").shown_metrics(record):
-        table.add_row(label, Text(printable(text)))
     return table

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from polarguide.cli.console import say, size_text
-from polarguide.cli.runs import RunFolder, opened
+from polarguide.cli.console import RunFolder, opened, say, size_text
 from polarguide.errors import require_package
 from polarguide.options import EXPORT_PACKAGES, ExportFormat, ThreadOptions
 

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from polarguide.cli.console import console, say, use_threads
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.console import ConsoleReporter, console, say, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.inspection.settings import InspectSettings
 from polarguide.options import ComputeOptions
@@ -68,7 +67,7 @@ def _fix(found: Any, out: Path, reporter: ConsoleReporter) -> None:
         raise PolarguideError(
             "--fix",
             expected="a scene with four pictures of each view",
-            found="one with other pictures, whose angles are said in a table",
+            found="one with other pictures, whose angles are given in a table",
             remedy="Correct SCENE/angles.csv as the report says, or repeat prepare.",
         )
     change = fixing.correction(found.capture, found.angles)
@@ -80,12 +79,12 @@ def _fix(found: Any, out: Path, reporter: ConsoleReporter) -> None:
 
 
 def _print_checks(checks: Any) -> None:
-    said = ""
+    previous = ""
     for check in checks:
         console.print(f"[{COLORS[check.verdict]}]{check.verdict:>12}[/]  ", end="")
         say(f"{check.title}: {check.finding}")
-        if check.remedy not in ("", said) and check.verdict != "ok":
-            said = check.remedy
+        if check.remedy not in ("", previous) and check.verdict != "ok":
+            previous = check.remedy
             say(f"{'':14}{check.remedy}")
 
 

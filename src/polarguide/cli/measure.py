@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 
-from polarguide.cli.console import console, say, use_threads
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.console import ConsoleReporter, console, print_error, say, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.measurement.options import MeasureOptions, WatchOptions
 from polarguide.options import ThreadOptions
 from polarguide.preparation.settings import CalibrationOptions
 from polarguide.shots.options import ShotOptions
-from polarguide.system import StopSignals, signals_as_interrupts
+from polarguide.system import StopSignals
 
 
 def measure(
@@ -58,59 +57,40 @@ def measure(
                 remedy="Leave it out, or watch a folder.",
             )
     reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
-    said = _Lines()
+    heard = partial(_print_entry, every=watching.watch is not None)
     if watching.watch is None:
         line = importlib.import_module("polarguide.measurement.line")
-        with signals_as_interrupts():
-            outcome = line.measure_shots(paths, out, options, reading, heard=said, reporter=ConsoleReporter())
+        outcome = line.measure_shots(paths, out, options, reading, heard=heard, reporter=ConsoleReporter())
     else:
-        said.all = True
         watch = importlib.import_module("polarguide.measurement.watch")
         with StopSignals() as should_stop:
             outcome = watch.watch_folder(
                 watching.watch, out, options, reading, watching,
-                should_stop=should_stop, heard=said, reporter=ConsoleReporter(),
+                should_stop=should_stop, heard=heard, reporter=ConsoleReporter(),
             )  # fmt: skip
     _print_outcome(outcome)
-    _print_what_never_came(outcome, watching.watch)
-    status: int = outcome.exit_status
-    return status
-
-
-def _print_what_never_came(outcome: Any, folder: Path | None) -> None:
-    """Why nothing was found in a watched folder, and which shots were not complete when the watch ended."""
-    said = _Lines()
-    if outcome.trouble:
-        said.error(outcome.trouble)
+    if outcome.trouble:  # why nothing was found in a watched folder
+        print_error(outcome.trouble)
     if outcome.waiting:
         names = ", ".join(outcome.waiting[:4]) + (", ..." if len(outcome.waiting) > 4 else "")
         found = f"{len(outcome.waiting)} that are not, and were not measured ({names})"
         remedy = "Complete, rename or remove their files; the same command goes on."
-        said.error(str(PolarguideError(folder, expected="complete shots", found=found, remedy=remedy)))
+        error = PolarguideError(watching.watch, expected="complete shots", found=found, remedy=remedy)
+        print_error(str(error))
+    status: int = outcome.exit_status
+    return status
 
 
-class _Lines:
-    """Shots as lines, those that could not be read on stderr; ``all``: also those with nothing against them."""
-
-    all = False
-
-    def __init__(self) -> None:
-        self._errors = Console(stderr=True, highlight=False, soft_wrap=True)
-
-    def __call__(self, entry: Any) -> None:
-        if entry.status == "unread":
-            self.error(entry.why)
-        elif entry.status == "beyond":
-            console.print("[bold red]beyond:[/] ", end="")
-            faults = (f"{row['region']} {row['why']}" for row in entry.regions if row["why"])
-            say(f"{entry.shot}: {'; '.join(faults)}")
-        elif self.all:
-            say(f"{entry.status}: {entry.shot}")
-
-    def error(self, text: str) -> None:
-        """Print an error."""
-        self._errors.print("[bold red]error:[/] ", end="")
-        say(text, to=self._errors)
+def _print_entry(entry: Any, *, every: bool) -> None:
+    """Print a shot that is beyond a limit or could not be read; ``every``: also one without a fault."""
+    if entry.status == "unread":
+        print_error(entry.why)
+    elif entry.status == "beyond":
+        console.print("[bold red]beyond:[/] ", end="")
+        faults = (f"{row['region']} {row['why']}" for row in entry.regions if row["why"])
+        say(f"{entry.shot}: {'; '.join(faults)}")
+    elif every:
+        say(f"{entry.status}: {entry.shot}")
 
 
 def _print_outcome(outcome: Any) -> None:

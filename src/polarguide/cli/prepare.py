@@ -9,8 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import say, use_threads
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.console import ConsoleReporter, say, use_threads
 from polarguide.options import ThreadOptions
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 

@@ -10,8 +10,7 @@ from typing import Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import say, use_threads
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.console import ConsoleReporter, say, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.options import SceneOptions, ThreadOptions
 from polarguide.preparation.settings import CalibrationOptions

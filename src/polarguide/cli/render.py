@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from polarguide.cli.console import say
-from polarguide.cli.runs import RunFolder, opened
+from polarguide.cli.console import RunFolder, opened, say
 from polarguide.errors import PolarguideError, require_package
-from polarguide.options import ComputeOptions, PictureFormat, check_finite, check_range
+from polarguide.options import ComputeOptions, PictureFormat, check_finite
 
 FRAMES = 120
 
@@ -54,7 +53,6 @@ def render(
             found=f"{video} and {path or 'no path'}",
             remedy="Write for example --path orbit --video film.mp4.",
         )
-    check_range("frames", frames, 1, 100_000)
     if not path and frames != FRAMES:
         raise PolarguideError(
             "frames",

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from polarguide.cli.console import say, size_text
-from polarguide.cli.runs import RunFolder, opened
+from polarguide.cli.console import RunFolder, opened, say, size_text
 from polarguide.options import ThreadOptions
 
 

@@ -9,8 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import console, say, use_threads
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.console import ConsoleReporter, console, say, use_threads
 from polarguide.errors import PolarguideError
 from polarguide.options import ThreadOptions
 from polarguide.synth.settings import LONG_SECONDS, Overrides, SynthSettings, find_scene, rough_time

@@ -8,8 +8,7 @@ from typing import Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import say
-from polarguide.cli.progress import ConsoleReporter
+from polarguide.cli.console import ConsoleReporter, say
 from polarguide.options import SceneOptions, SessionOptions
 from polarguide.system import StopSignals
 from polarguide.training.settings import TrainSettings

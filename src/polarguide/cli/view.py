@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from polarguide.cli.runs import RunFolder, opened
+from polarguide.cli.console import RunFolder, opened
 from polarguide.errors import PolarguideError, require_package
 from polarguide.options import LOOPBACK, ComputeOptions, VisitorOptions
 

@@ -15,7 +15,7 @@ from polarguide.evaluation.metrics import Selection, normal_angles_deg
 from polarguide.evaluation.target import ViewTarget
 from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
-from polarguide.visualization.sheet import Picture, contact_sheet
+from polarguide.visualization.figures import Picture, contact_sheet
 
 ERRORS_FILE = "errors.png"
 MOST_VIEWS = 8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import statistics
 import time
@@ -10,30 +11,69 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 import polarguide
-from polarguide import _native
+from polarguide import _native, optics
+from polarguide.angles.fit import fit_angle
 from polarguide.capture import View
 from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
 from polarguide.evaluation.error_sheet import ERRORS_FILE, ErrorSheet
-from polarguide.evaluation.facts import SceneFacts
-from polarguide.evaluation.held_out import cross_fitted
-from polarguide.evaluation.maps import ErrorsByObject
-from polarguide.evaluation.measures import HAZE_DEPTH
 from polarguide.evaluation.mesh import mesh_scores
+from polarguide.evaluation.metrics import HAZE_DEPTH
 from polarguide.evaluation.record import METRICS_FILE, write_metrics
-from polarguide.evaluation.scores import ViewScores, score_view
-from polarguide.evaluation.sources import commit, scoring_digest
-from polarguide.evaluation.target import ViewTarget
+from polarguide.evaluation.scores import ErrorsByObject, ViewScores, score_view
+from polarguide.evaluation.sources import code_digest, commit
+from polarguide.evaluation.target import SceneFacts, ViewTarget
 from polarguide.neural.model import FieldModel
+from polarguide.optics import Mount
 from polarguide.progress import SILENT, Reporter
-from polarguide.rendering.fusion import Surface
-from polarguide.rendering.mesh import RESOLUTION, fused_surface, implicit_surface
+from polarguide.rendering.mesh import RESOLUTION, Surface, fused_surface, implicit_surface
 from polarguide.runs.folder import RunLog
 from polarguide.runs.opened import OpenedRun
 from polarguide.system import peak_memory_mib
 from polarguide.training.stopwatch import Stopwatch
+
+
+@torch.no_grad()
+def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
+    """The picture that a model predicts of ``view.photograph()``, behind an analyzer that is fitted on the other half.
+
+    Gain, angle and strength of the analyzer are fitted on the left half of the picture for the right one, and on the
+    right one for the left (``angles.fit``), so that no pixel takes part in the fit that it is scored by.
+
+    Args:
+        view: whose pictures do not measure S0.
+        final: [H, W, 3] rendered, S0/2.
+        stokes: [3, H, W, 3] as predicted; None: no prediction, the gain alone is fitted.
+
+    Returns:
+        [H, W, 3] linear, on the device of ``final``.
+    """
+    local = view.to(final.device)
+    measured, rays = local.photograph().to(final), local.camera.rays(device=final.device)
+    good = (~(local.invalid | local.saturated)).to(final)
+    polarized = torch.zeros_like(final).expand(2, *final.shape) if stokes is None else stokes[1:]
+    predicted = torch.cat((2 * final[None], polarized)).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    left = torch.arange(final.shape[1], device=final.device) < final.shape[1] // 2
+    by_right, by_left = (
+        _behind(measured, predicted, good * half, rays, view.mount) for half in (~left, left)
+    )
+    return torch.where(left[None, :, None], by_right, by_left)
+
+
+def _behind(measured: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount) -> Tensor:
+    """The whole picture behind the analyzer that fits where the weight is."""
+    found = fit_angle(measured, stokes, weight, rays, mount)
+    if found is None:
+        counted = weight[..., None]
+        gain = (counted * measured).sum() / (counted * stokes[0] / 2).sum().clamp(min=1e-12)
+        return gain * stokes[0] / 2
+    cosine, sine = optics.analyzer(math.radians(found.angle), rays, mount)[..., None].to(stokes)
+    polarized = found.modulation * (stokes[1] * cosine + stokes[2] * sine)
+    return found.gain * (stokes[0] + polarized) / 2
+
 
 MINIMUM_SECONDS = 1.5
 MOST_SECONDS = 40.0
@@ -161,7 +201,7 @@ def _provenance(run: OpenedRun) -> dict[str, Any]:
         "recipe": configuration.recipe,
         "seed": configuration.settings.seed,
         "commit": commit(),
-        "sources": scoring_digest(),
+        "sources": code_digest(),
         "versions": {
             "polarguide": polarguide.__version__,
             "torch": torch.__version__,

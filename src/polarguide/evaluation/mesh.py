@@ -18,7 +18,7 @@ from polarguide.errors import PolarguideError, optional_import, require_package
 from polarguide.evaluation.table import MESH_LABEL
 from polarguide.evaluation.target import jumps
 from polarguide.options import EXPORT_PACKAGES
-from polarguide.rendering.fusion import NoSurfaceError, Surface, seen_points
+from polarguide.rendering.mesh import NoSurfaceError, Surface, seen_points
 
 THRESHOLDS = {"05": 0.005, "1": 0.01}
 """Distances that count as right, as shares of the object's diagonal, by the end of their keys."""
@@ -41,7 +41,7 @@ def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> Mappin
 
     Returns:
         Shares in [0, 1]; nothing where no depth is known. Where there is no surface to fuse, all are 0. Where a library
-        is missing, ``mesh_fscore_1_reason`` alone, which says so.
+        is missing, ``mesh_fscore_1_reason`` alone, which names it.
     """
     known = [view for view in views if view.ground_truth is not None and view.ground_truth.depth is not None]
     if not any(bool(_known(view)[1].any()) for view in known):
@@ -117,7 +117,7 @@ def true_points(view: View, finer: int = 1) -> tuple[Points, Points]:
 
 
 def _inner(depth: Tensor, front: Tensor) -> Tensor:
-    """Pixels [H, W] whose neighbors belong to the foreground, too, at depths near to each other."""
+    """Pixels [H, W] all of whose neighbors belong to the foreground, at similar depths."""
     inner = minimum_filter(front.numpy(), size=3, mode="nearest")
     return torch.from_numpy(inner & ~jumps(depth))
 

@@ -32,25 +32,17 @@ class Provenance(TypedDict):
     scene_hash: str
 
 
-def _fields(metrics: tuple[Metric, ...]) -> list[tuple[str, Any]]:
-    return [
-        (m.key, Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None if m.unit == "dB" else float | None)
-        for m in metrics
-        if m.key not in _LATER
-    ]
-
-
-_LATER = ("flip",)
-"""Metrics that records of earlier versions lack: these are read as if they had no value."""
-_REASONS: list[tuple[str, Any, Any]] = [
-    *((key, float | None, None) for key in _LATER),
-    *((f"{key}_reason", str | None, None) for key in ("lpips", "flip", "stokes_error")),
-]
-_RUN_REASONS = [
-    (f"{key}_reason", str | None, None)
-    for key in ("fps", "train_seconds", "peak_memory_mib", "mesh_fscore_1")
-]
 _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
+
+
+def _fields(metrics: tuple[Metric, ...], *reasons: str) -> list[Any]:
+    """Fields of a record: the metrics, and reasons of those that may be null for another one than missing truth."""
+    values = [(metric.key, _Decibels if metric.unit == "dB" else float | None) for metric in metrics]
+    return [*values, *((f"{key}_reason", str | None, None) for key in reasons)]
+
+
+_VIEW_REASONS = ("lpips", "flip", "stokes_error")
+_RUN_REASONS = (*_VIEW_REASONS, "fps", "train_seconds", "peak_memory_mib", "mesh_fscore_1")
 
 
 class ObjectErrors(msgspec.Struct, kw_only=True):
@@ -67,21 +59,17 @@ class ObjectErrors(msgspec.Struct, kw_only=True):
     metal_share: float | None = None
 
 
-_VIEW = msgspec.defstruct("View", [*_fields(VIEW_METRICS), *_REASONS])
-_VIEWS = Annotated[dict[str, Any], msgspec.Meta(min_length=1)]
+_VIEW = msgspec.defstruct("View", _fields(VIEW_METRICS, *_VIEW_REASONS))
 _RUN = msgspec.defstruct(
     "Run",
     [
-        *_fields(METRICS),
-        ("views", _VIEWS),
+        *_fields(METRICS, *_RUN_REASONS),
+        ("views", Annotated[dict[str, Any], msgspec.Meta(min_length=1)]),
         ("provenance", Provenance),
-        *_REASONS,
-        *_RUN_REASONS,
-        *(
-            (name, dict[str, ObjectErrors], msgspec.field(default_factory=dict))
-            for name in ("objects", "materials")
-        ),
+        ("objects", dict[str, ObjectErrors], msgspec.field(default_factory=dict)),
+        ("materials", dict[str, ObjectErrors], msgspec.field(default_factory=dict)),
     ],
+    kw_only=True,
 )
 
 

@@ -12,15 +12,19 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from polarguide.evaluation.measures import (
+from polarguide.evaluation.metrics import (
     beyond_share,
     coverage_error,
     depth_error_percent,
     haze_share,
+    layer_error,
     mean_alpha,
+    normal_mae_deg,
+    normal_within_11,
+    squared_error,
+    ssim,
     stokes_error,
 )
-from polarguide.evaluation.metrics import layer_error, normal_mae_deg, normal_within_11, squared_error, ssim
 from polarguide.evaluation.target import ViewTarget
 
 HIGHEST_PSNR = 100.0
@@ -78,43 +82,23 @@ class Metric:
         return f"{number} {self.unit if self.factor == 1.0 else ''}".rstrip()
 
 
-def _compared(compare: Callable[..., Tensor], layer: str, true: str, region: str, *more: str) -> Measure:
-    """A comparison of a rendered layer with what the target knows, over one of its regions.
+def _compared(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:
+    """A measure of a rendered layer by what the target knows, such as its true values and one of its regions.
 
     Args:
-        compare: takes the layer, what is true of it, the region, and further attributes of the target by name.
+        compare: takes the layer, and the attributes of the target that ``known`` names.
     """
 
     def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
-        given = [layers[layer], *(getattr(target, name) for name in (true, region, *more))]
+        given = [layers[layer], *(getattr(target, name) for name in known)]
         return None if any(values is None for values in given) else compare(*given)
 
     return measure
 
 
-def _picture(region: str) -> Measure:
-    """The squared error of the final picture over a region of the target."""
-    return _compared(squared_error, "final", "photograph", region)
-
-
-def _normal(compare: Callable[..., Tensor]) -> Measure:
-    """A comparison of rendered and true normals on the foreground."""
-    return _compared(compare, "normal", "normal", "surface")
-
-
 def _layer(name: str, *, aligned: bool = False, region: str = "foreground") -> Measure:
     """The squared error of a layer against its true lobe on the foreground, or another region."""
     return _compared(partial(layer_error, aligned=aligned), name, name, region)
-
-
-def _of_layer(measure: Callable[..., Tensor], layer: str, region: str) -> Measure:
-    """A measure of a layer by itself over a region of the target."""
-
-    def measured(target: ViewTarget, layers: Layers) -> Tensor | None:
-        values, keep = layers[layer], getattr(target, region)
-        return None if values is None or keep is None else measure(values, keep)
-
-    return measured
 
 
 def _mesh(key: str, label: str, *, shown: Literal["tables", "files"] = "files") -> Metric:
@@ -123,22 +107,45 @@ def _mesh(key: str, label: str, *, shown: Literal["tables", "files"] = "files") 
 
 
 METRICS: tuple[Metric, ...] = (
-    Metric("psnr", "PSNR", "dB", 2, "higher", measure=_picture("valid")),
-    Metric("psnr_foreground", "PSNR foreground", "dB", 2, "higher", measure=_picture("foreground")),
-    Metric("psnr_reflective", "PSNR reflective", "dB", 2, "higher", measure=_picture("reflective")),
+    Metric(
+        "psnr", "PSNR", "dB", 2, "higher", measure=_compared(squared_error, "final", "photograph", "valid")
+    ),
+    Metric(
+        "psnr_foreground",
+        "PSNR foreground",
+        "dB",
+        2,
+        "higher",
+        measure=_compared(squared_error, "final", "photograph", "foreground"),
+    ),
+    Metric(
+        "psnr_reflective",
+        "PSNR reflective",
+        "dB",
+        2,
+        "higher",
+        measure=_compared(squared_error, "final", "photograph", "reflective"),
+    ),
     Metric(
         "ssim", "SSIM", "", 3, "higher", measure=_compared(ssim, "final", "photograph", "valid", "windows")
     ),
     Metric("lpips", "LPIPS", "", 3, "lower"),
     Metric("flip", "FLIP", "", 3, "lower"),
-    Metric("normal_mae_deg", "normal error", "deg", 1, "lower", measure=_normal(normal_mae_deg)),
+    Metric(
+        "normal_mae_deg",
+        "normal error",
+        "deg",
+        1,
+        "lower",
+        measure=_compared(normal_mae_deg, "normal", "normal", "surface"),
+    ),
     Metric(
         "normal_within_11",
         "normals within 11.25 deg",
         "%",
         1,
         "higher",
-        measure=_normal(normal_within_11),
+        measure=_compared(normal_within_11, "normal", "normal", "surface"),
         factor=100.0,
     ),
     Metric("specular_psnr", "specular PSNR", "dB", 2, "higher", measure=_layer("specular")),
@@ -201,7 +208,7 @@ METRICS: tuple[Metric, ...] = (
         "%",
         2,
         "lower",
-        measure=_of_layer(haze_share, "in_front", "smooth"),
+        measure=_compared(haze_share, "in_front", "smooth"),
         shown="files",
         factor=100.0,
     ),
@@ -231,7 +238,7 @@ METRICS: tuple[Metric, ...] = (
         "%",
         2,
         "lower",
-        measure=_of_layer(mean_alpha, "alpha", "beyond"),
+        measure=_compared(mean_alpha, "alpha", "beyond"),
         shown="files",
         factor=100.0,
     ),
@@ -249,7 +256,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
 )
 OBJECT_METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr", "stokes_error")
-"""Keys of those that are told apart by object and by material."""
+"""Keys of the metrics that are recorded by object and by material."""
 VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")
 """Those of one view, which are averaged over views."""
 RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")

@@ -14,7 +14,7 @@ from polarguide import __version__
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.variants import count_of
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.sources import commit, scoring_digest
+from polarguide.evaluation.sources import code_digest, commit
 from polarguide.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.experiments.charts import exposure_svg, read_study, study_svg
 from polarguide.experiments.jobs import STDERR, Job, run_jobs
@@ -286,7 +286,7 @@ def collect(
         "provenance": {
             "version": __version__,
             "commit": commit(),
-            "sources": scoring_digest(),
+            "sources": code_digest(),
             "command": comparison.command,
             "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         },

@@ -18,9 +18,9 @@ from polarguide import __version__
 from polarguide.capture import View
 from polarguide.capture.variants import black_pixels, mask_background
 from polarguide.errors import PolarguideError
-from polarguide.evaluation.facts import SceneFacts
 from polarguide.evaluation.record import read_metrics
-from polarguide.evaluation.sources import field_digest, model_digest, scoring_digest, training_digest
+from polarguide.evaluation.sources import code_digest, model_digest
+from polarguide.evaluation.target import SceneFacts
 from polarguide.experiments.options import CompareOptions
 from polarguide.options import Exposures, SceneOptions, index_of
 from polarguide.progress import SILENT, Reporter
@@ -206,7 +206,7 @@ class PlannedRun:
         except (OSError, PolarguideError):
             return None
         whole = record["steps"] == self.steps
-        return record if whole and record["provenance"].get("sources") == scoring_digest() else None
+        return record if whole and record["provenance"].get("sources") == code_digest() else None
 
 
 def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[SceneEntry]:
@@ -269,8 +269,8 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
         refractive_index=comparison.index_of(scene),
     )
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
-    own = model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else field_digest()
-    code = f"{__version__} {training_digest()}{own}"
+    plugin = model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else ""
+    code = f"{__version__} {code_digest()}{plugin}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     name = row.name.replace(":", "__").replace(" ", "-")
     folder = comparison.out / RUNS / scene.name / name / f"{seed}-{key}"

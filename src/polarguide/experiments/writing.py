@@ -11,8 +11,8 @@ import pandas as pd
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import MINUS, Section, sections
 from polarguide.files import write_text
-from polarguide.printable import printable
 from polarguide.spreadsheet import plain
+from polarguide.text import printable
 from polarguide.visualization.pages import templates
 
 _LATEX = {

@@ -16,16 +16,20 @@ from polarguide.capture.layout import refuse_scene
 from polarguide.errors import PolarguideError, PolarguideWarning
 from polarguide.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.evaluation.table import shown_metrics
-from polarguide.export.cameras import write_colmap, write_transforms
-from polarguide.export.mesh import write_mesh
-from polarguide.export.placement import Origin, Placement, comments, rewrite_splats
-from polarguide.export.points import surface_points, write_points
+from polarguide.export.mesh import surface_points, write_mesh, write_points
+from polarguide.export.placement import (
+    Origin,
+    Placement,
+    comments,
+    rewrite_splats,
+    write_colmap,
+    write_transforms,
+)
 from polarguide.export.share import share_page
-from polarguide.export.sog import write_sog
-from polarguide.export.spz import write_spz
+from polarguide.export.splats import write_sog, write_spz
 from polarguide.files import holds_files, make_folder, require_inside, temporary_folder, write_text
 from polarguide.neural.model import FieldModel
-from polarguide.options import ExportFormat, PathLike, check_choice, check_range
+from polarguide.options import ExportFormat, PathLike, check_choice, check_finite
 from polarguide.presentation import balanced
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.mesh import RESOLUTION, ColoredMesh, implicit_mesh, scene_mesh
@@ -78,20 +82,20 @@ def export(
         require_inside(run.folder, folder)
     refuse_scene(folder)
     writers: dict[str, Callable[[], list[Path]]] = {
-        "ply": lambda: [_ply(run, shown, folder / "splats.ply")],
-        "spz": lambda: [_spz(run, shown, folder / "splats.spz", spz_version)],
-        "sog": lambda: [_sog(run, shown, folder / "splats.sog")],
-        "mesh": lambda: _mesh(run, shown, folder, resolution, reporter),
-        "points": lambda: _points(run, shown, folder),
-        "environment": lambda: _environment(run, shown, folder),
-        "cameras": lambda: _cameras(run, shown, folder),
+        "ply": lambda: [_ply(run, presented, folder / "splats.ply")],
+        "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
+        "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
+        "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
+        "points": lambda: _points(run, presented, folder),
+        "environment": lambda: _environment(run, presented, folder),
+        "cameras": lambda: _cameras(run, presented, folder),
     }
     check_choice("format", format, writers)
-    check_range("resolution", resolution, 16, 1024)
-    check_range("spz_version", spz_version, 3, 4)
+    check_finite("resolution", resolution, 16, 1024)
+    check_finite("spz_version", spz_version, 3, 4)
     if format in SPLATS:
         run.gaussian_model(f"format {format}")
-    shown = _Shown(run)
+    presented = _Presented(run)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return writers[format]()
@@ -120,34 +124,34 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
             "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
         )
     model = run.gaussian_model("share")
-    shown = _Shown(run)
-    assert shown.gaussians is not None
+    presented = _Presented(run)
+    assert presented.gaussians is not None
     views = run.scene.test_views + run.scene.train_views
     scored = (run.folder / METRICS_FILE).exists()
     scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
     health = run.health
     page = share_page(
-        shown.gaussians,
+        presented.gaussians,
         model.light,
         model.shading,
         {view.name: view.camera for view in views},
         first=views[0].name,
-        title=title or shown.presentation.title or run.scene.name,
+        title=title or presented.presentation.title or run.scene.name,
         caption=f"{caption or f'{run.recipe.name}, {run.steps:,} steps'} · polarization: {run.polarization}",
         metrics=[
             *((f"{label}, test views", text) for label, text in scores),
-            ("Gaussians", f"{len(shown.gaussians['means']):,}"),
+            ("Gaussians", f"{len(presented.gaussians['means']):,}"),
         ],
         notes=[f"Warning: {warning}" for warning in health.warnings] if health is not None else [],
-        presentation=shown.presentation,
+        presentation=presented.presentation,
     )
     make_folder(path.parent)
     write_text(path, page)
     return path
 
 
-class _Shown:
-    """How a run is presented, and what of it is.
+class _Presented:
+    """A run as its presentation shows it: the Gaussians within the crop box, their placement, and the origin of files.
 
     Raises:
         PolarguideError: the presentation cannot be read, or nothing lies within its crop box.
@@ -183,13 +187,13 @@ class _Shown:
         return comments(self.origin, self.placement)
 
 
-def _ply(run: OpenedRun, shown: _Shown, path: Path, placement: Placement | None = None) -> Path:
+def _ply(run: OpenedRun, presented: _Presented, path: Path, placement: Placement | None = None) -> Path:
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.gaussian_model("format ply")
         write_run_ply(whole, model.state, model.shading, _camera_centers(run))
-        kept = None if shown.kept is None else shown.kept.cpu()
-        rewrite_splats(path, whole, placement or shown.placement, kept, shown.comments)
+        kept = None if presented.kept is None else presented.kept.cpu()
+        rewrite_splats(path, whole, placement or presented.placement, kept, presented.comments)
     return path
 
 
@@ -208,43 +212,47 @@ def _camera_centers(run: OpenedRun) -> Tensor | None:
         return None
 
 
-def _spz(run: OpenedRun, shown: _Shown, path: Path, version: int) -> Path:
+def _spz(run: OpenedRun, presented: _Presented, path: Path, version: int) -> Path:
     """From a PLY that is gone afterwards. In units of the scene: its positions are multiples of 1/4096 of a unit."""
     with temporary_folder(path.with_suffix(".ply")) as place:
-        ply = _ply(run, shown, place / "splats.ply", replace(shown.placement, scale=1.0, metric=False))
+        ply = _ply(
+            run, presented, place / "splats.ply", replace(presented.placement, scale=1.0, metric=False)
+        )
         write_spz(path, ply, version)
     return path
 
 
-def _sog(run: OpenedRun, shown: _Shown, path: Path) -> Path:
+def _sog(run: OpenedRun, presented: _Presented, path: Path) -> Path:
     """From a PLY that is gone afterwards."""
-    credit = shown.presentation.credit
-    about = {"extras": {**shown.origin.record(), **shown.placement.record()}}
+    credit = presented.presentation.credit
+    about = {"extras": {**presented.origin.record(), **presented.placement.record()}}
     with temporary_folder(path.with_suffix(".ply")) as place:
-        ply = _ply(run, shown, place / "splats.ply")
+        ply = _ply(run, presented, place / "splats.ply")
         write_sog(path, ply, {**({"copyright": credit} if credit else {}), **about})
     return path
 
 
-def _mesh(run: OpenedRun, shown: _Shown, folder: Path, resolution: int, reporter: Reporter) -> list[Path]:
+def _mesh(
+    run: OpenedRun, presented: _Presented, folder: Path, resolution: int, reporter: Reporter
+) -> list[Path]:
     if isinstance(run.model, FieldModel):
         mesh = implicit_mesh(run.cameras, run.model, resolution=resolution)
     else:
-        mesh = _fused(run, shown, resolution)
-    if (crop := shown.presentation.crop) is not None:
+        mesh = _fused(run, presented, resolution)
+    if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
-        write_mesh(path, mesh, run.frame, shown.placement, shown.origin)
+        write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
     reporter.say(f"{len(mesh.surface.vertices):,} vertices, {len(mesh.surface.faces):,} triangles")
     return paths
 
 
-def _fused(run: OpenedRun, shown: _Shown, resolution: int) -> ColoredMesh:
+def _fused(run: OpenedRun, presented: _Presented, resolution: int) -> ColoredMesh:
     """The mesh of Gaussians."""
     model = run.gaussian_model("format mesh")
-    gaussians = shown.gaussians
+    gaussians = presented.gaussians
     assert gaussians is not None
 
     def seen(camera: Camera) -> RenderResult:
@@ -261,27 +269,27 @@ def _fused(run: OpenedRun, shown: _Shown, resolution: int) -> ColoredMesh:
         return scene_mesh(run.cameras, seen, resolution=resolution)
 
 
-def _points(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
-    path, model, placement = folder / "points.ply", run.gaussian_model("format points"), shown.placement
-    assert shown.gaussians is not None
+def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+    path, model, placement = folder / "points.ply", run.gaussian_model("format points"), presented.placement
+    assert presented.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
-    places, normals, colors = surface_points(shown.gaussians, model.shading, views, rasterize)
-    write_points(path, placement.points(places), placement.directions(normals), colors, shown.comments)
+    places, normals, colors = surface_points(presented.gaussians, model.shading, views, rasterize)
+    write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)
     return [path]
 
 
-def _environment(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
+def _environment(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
     cubemap = needs_radiance(run.model.shading, what="format")
     picture = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
     paths = [folder / "environment.exr", folder / "environment.png"]
-    credit = shown.presentation.credit
+    credit = presented.presentation.credit
     write_exr(paths[0], picture, {"owner": credit} if credit else {})
-    figures.write_png(paths[1], figures.radiance_to_rgb(balanced(picture, shown.presentation.gains)))
+    figures.write_png(paths[1], figures.radiance_to_rgb(balanced(picture, presented.presentation.gains)))
     return paths
 
 
-def _cameras(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
-    scene, placement = run.scene, shown.placement
+def _cameras(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+    scene, placement = run.scene, presented.placement
     model = folder / "sparse" / "0"
     require_inside(folder, model)
     if model.is_dir() and holds_files(model) and not (folder / TRANSFORMS).exists():
@@ -293,7 +301,7 @@ def _cameras(run: OpenedRun, shown: _Shown, folder: Path) -> list[Path]:
         )
     cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     points = placement.points(scene.points)
-    write_colmap(model, cameras, points, scene.point_colors, comments=shown.comments)
-    about = {**shown.origin.record(), **placement.record()}
+    write_colmap(model, cameras, points, scene.point_colors, comments=presented.comments)
+    about = {**presented.origin.record(), **placement.record()}
     write_transforms(folder / TRANSFORMS, cameras, about)
     return [model, folder / TRANSFORMS]

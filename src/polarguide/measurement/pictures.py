@@ -11,7 +11,7 @@ import numpy as np
 from polarguide.color import srgb_encode_array
 from polarguide.measurement.regions import Differences, Region
 from polarguide.shots.maps import Map, ShotMaps
-from polarguide.visualization.sheet import FONT, INK, LINE_HEIGHT, Picture, contact_sheet
+from polarguide.visualization.figures import FONT, INK, LINE_HEIGHT, Picture, contact_sheet
 
 S0_RANGE, DOLP_RANGE, AOLP_RANGE = 0.2, 0.1, 20.0
 """Differences with the full color: full scales of S0, DoLP, degrees of AoLP."""

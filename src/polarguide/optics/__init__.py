@@ -4,17 +4,13 @@ They are differentiable, and value and gradient stay finite at every degenerate 
 polarization, normal and grazing incidence).
 """
 
-from polarguide.optics.analyzers import Mount, analyzer, filter_analyzer, fitted_stokes
-from polarguide.optics.chromatic import ChromaticNormals, chromatic_normals
-from polarguide.optics.conductor import (
+from polarguide.optics.frames import azimuth, lens_frame, normal_from_angles, zenith
+from polarguide.optics.fresnel import (
+    brewster,
     conductor,
     conductor_dolp_slope,
     conductor_index,
     conductor_reflectances,
-)
-from polarguide.optics.frames import azimuth, lens_frame, normal_from_angles, zenith
-from polarguide.optics.fresnel import (
-    brewster,
     diffuse_dolp,
     diffuse_dolp_limit,
     diffuse_zenith,
@@ -27,8 +23,10 @@ from polarguide.optics.fresnel import (
 )
 from polarguide.optics.normals import (
     Candidates,
+    ChromaticNormals,
     Disambiguated,
     PhysicalCandidates,
+    chromatic_normals,
     disambiguate,
     dolp_noise,
     intensity_noise,
@@ -43,8 +41,21 @@ from polarguide.optics.separation import (
     paper_separation,
     predicted_stokes,
 )
-from polarguide.optics.stokes import aolp, dolp, intensity, luminance, photograph, stokes
-from polarguide.optics.uncertainty import UNIFORM_SPREAD, Uncertainty, polarization_uncertainty
+from polarguide.optics.stokes import (
+    UNIFORM_SPREAD,
+    Mount,
+    Uncertainty,
+    analyzer,
+    aolp,
+    dolp,
+    filter_analyzer,
+    fitted_stokes,
+    intensity,
+    luminance,
+    photograph,
+    polarization_uncertainty,
+    stokes,
+)
 from polarguide.polarizer import ANGLES
 
 __all__ = [

@@ -11,8 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from polarguide.optics._arrays import for_arrays
-from polarguide.optics._numerics import safe_atan2
+from polarguide.optics._numerics import for_arrays, safe_atan2
 from polarguide.vectors import dot
 
 

@@ -1,20 +1,25 @@
-"""Linear Stokes vectors, and the quantities derived from them.
+"""Linear Stokes vectors: how polarizers measure them, quantities derived from them, and their uncertainty.
 
 A Stokes tensor has the three linear components (S0, S1, S2) on its **first** axis and any shape after it. All
 values are linear radiance. Angles are radians, zero along the image's horizontal, counter-clockwise as
 displayed.
+
+An analyzer is the pair (cos 2t, sin 2t) of the angle t, in the lens frame of its pixel, of the field that it passes:
+its intensity is ``(S0 + S1 cos 2t + S2 sin 2t) / 2`` (Malus's law).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from polarguide.optics._arrays import for_arrays
-from polarguide.optics._numerics import check_leading, safe_atan2, safe_sqrt
+from polarguide.optics._numerics import check_leading, for_arrays, safe_atan2, safe_sqrt
+from polarguide.optics.frames import lens_frame
 from polarguide.polarizer import malus, stokes_of_four
+from polarguide.vectors import dot
 
 
 @for_arrays
@@ -122,3 +127,140 @@ def luminance(stokes: Tensor) -> Tensor:
     """
     check_leading(stokes, 3, "stokes")
     return stokes.mean(dim=-1)
+
+
+Mount = Literal["sensor", "filter"]
+"""Where the polarizer is: behind the lens, or a sheet before it."""
+
+
+@for_arrays
+def filter_analyzer(angle: float | Tensor, rays: Tensor) -> Tensor:
+    """Analyzer of a sheet polarizer before the lens.
+
+    A sheet absorbs the field along its absorption axis a, which lies in the plane of the picture, and passes what is
+    perpendicular to a and to the ray d: the field ``d x a``. In the lens frame of a pixel at normalized image position
+    (x, y) that is up to about ``x y / 2`` radians away from the angle at which the sheet is mounted.
+
+    Args:
+        angle: of the transmission axis, radians counter-clockwise as displayed; a number or a tensor of one.
+        rays: [..., 3] unit, camera axes.
+
+    Returns:
+        [2, ...]: cosine and sine of twice the angle of the field that it passes, in the lens frame.
+    """
+    theta = torch.as_tensor(angle, dtype=rays.dtype, device=rays.device)
+    sine, cosine = torch.sin(theta), torch.cos(theta)
+    x, y, z = rays.unbind(-1)
+    # d x a with a = (-sin, -cos, 0): up in the picture is -y of the camera.
+    passed = z * cosine, -z * sine, y * sine - x * cosine
+    right, up = lens_frame(rays)
+    field = torch.stack(passed, dim=-1)
+    along, across = dot(field, right), dot(field, up)
+    squared = (along * along + across * across).clamp(min=torch.finfo(rays.dtype).tiny)
+    return torch.stack(((along * along - across * across) / squared, 2 * along * across / squared))
+
+
+@for_arrays
+def analyzer(angle: float | Tensor, rays: Tensor, mount: Mount = "sensor") -> Tensor:
+    """Analyzer of a polarizer at an angle: [2], or [2, ...] of a filter before the lens.
+
+    Args:
+        angle: radians, a number or a tensor of one. rays: [..., 3] unit, camera axes.
+        mount: where the polarizer is.
+    """
+    if mount == "filter":
+        return filter_analyzer(angle, rays)
+    twice = 2 * torch.as_tensor(angle, dtype=torch.float64)
+    return torch.stack((torch.cos(twice), torch.sin(twice))).to(rays)
+
+
+@for_arrays
+def fitted_stokes(intensities: Tensor, analyzers: Tensor) -> Tensor:
+    """Least-squares Stokes vectors of intensities behind any analyzers.
+
+    Args:
+        intensities: [K, ..., C] linear, on one exposure, with the colors last.
+        analyzers: [K, 2], or [K, 2, ...] of each pixel; (0, 0) for a picture without a polarizer.
+
+    Returns:
+        [3, ..., C], in the units of the intensities.
+
+    Raises:
+        ValueError: there are not as many analyzers as intensities.
+    """
+    check_leading(intensities, len(analyzers), "intensities")
+    ones = torch.ones_like(analyzers[:, :1])
+    rows = torch.cat((ones, analyzers), dim=1).to(torch.float64) / 2
+    if rows.ndim == 2:
+        inverse = torch.linalg.pinv(rows).to(intensities)
+        return torch.einsum("sk,k...->s...", inverse, intensities)
+    rows = rows.movedim((0, 1), (-2, -1))
+    moments = torch.linalg.inv(rows.mT @ rows) @ rows.mT
+    return torch.einsum("...sk,k...c->s...c", moments.to(intensities), intensities)
+
+
+UNIFORM_SPREAD = math.pi / math.sqrt(12.0)
+"""Standard deviation of an angle about which nothing is known, in radians (52 degrees)."""
+
+
+class Uncertainty(NamedTuple):
+    """How well DoLP and AoLP are known.
+
+    Attributes:
+        dolp: [...] standard deviation of the DoLP; infinite where S0 <= 0.
+        aolp: [...] standard deviation of the AoLP, radians, at most ``UNIFORM_SPREAD``.
+        debiased: [...] DoLP in [0, 1] without what noise adds to it on average.
+    """
+
+    dolp: Tensor
+    aolp: Tensor
+    debiased: Tensor
+
+
+@for_arrays
+def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
+    """Standard deviations of DoLP and AoLP, and the DoLP debiased.
+
+    Noise makes a DoLP larger: unpolarized light measures as noise does. The debiased DoLP is the modified asymptotic
+    estimator ``d - b^2 (1 - exp(-d^2 / b^2)) / (2 d)`` with b the noise across the direction of polarization
+    (Plaszczynski, Montier, Levrier and Tristram 2014, "A novel estimator of the polarization amplitude from normally
+    distributed Stokes parameters", MNRAS 439, 4048), which is unbiased from about d = 2 b on. Of
+    unpolarized light it leaves four fifths of what noise makes: over a region, average Stokes vectors instead.
+
+    Args:
+        stokes: [3, ...].
+        variances: [4, ...] of the four intensities in the order of ``ANGLES``, independent, squared units of
+            ``stokes``; or a shape that broadcasts to it.
+
+    Returns:
+        Uncertainty. To first order: good where the DoLP is over about three times its standard deviation. Without
+        any polarization the AoLP has ``UNIFORM_SPREAD``, and the spread of the DoLP is 0.66 of what is stated.
+
+    Raises:
+        ValueError: the first axis of ``stokes`` is not 3 or that of ``variances`` not 4.
+    """
+    check_leading(stokes, 3, "stokes")
+    check_leading(variances, 4, "variances")
+    s0, s1, s2 = stokes.unbind(0)
+    v0, v45, v90, v135 = variances.unbind(0)
+    tiny = torch.finfo(s0.dtype).tiny
+    lit = s0 > tiny
+    square = s1 * s1 + s2 * s2
+    polarized = square > tiny
+    inverse = torch.where(polarized, square, 1.0).rsqrt()
+    # Without polarization any direction will do: the first.
+    c, s = torch.where(polarized, s1 * inverse, 1.0), s2 * inverse
+    scale = 1 / torch.where(lit, s0, 1.0)
+    d = (torch.where(polarized, square * inverse, 0.0) * scale).clamp(max=1)
+    half = d / 2
+    along = (c - half) ** 2 * v0 + (s - half) ** 2 * v45 + (c + half) ** 2 * v90 + (s + half) ** 2 * v135
+    across = s * s * (v0 + v90) + c * c * (v45 + v135)
+    b2 = across * scale * scale
+    ratio = (d * d / b2.clamp(min=tiny)).clamp(max=88.0)
+    removed = b2 * -torch.expm1(-ratio) / (2 * d.clamp(min=1e-12))
+    spread = torch.where(polarized, across.sqrt() * (inverse / 2), math.inf).clamp(max=UNIFORM_SPREAD)
+    return Uncertainty(
+        torch.where(lit, along.sqrt() * scale, math.inf),
+        torch.where(lit, spread, UNIFORM_SPREAD),
+        torch.where(lit, (d - removed).clamp(min=0), 0.0),
+    )

@@ -16,9 +16,9 @@ from msgspec import Meta
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
 from polarguide.errors import PolarguideError
-from polarguide.numerals import decimal
 from polarguide.polarizer import ANGLES
 from polarguide.records import check_options, option_name
+from polarguide.text import decimal
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")

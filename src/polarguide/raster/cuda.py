@@ -26,8 +26,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
-from polarguide.installation import install_extra
+from polarguide.errors import PolarguideError, install_extra
 from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterized, ScreenStatistic, Splats, check_shapes
 
 TILE = 16

@@ -1,9 +1,11 @@
-"""A run seen along a path of cameras, as a video or as pictures."""
+"""A run along a path of cameras, as a video (MP4, H.264) or as pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,17 +13,82 @@ import torch
 from polarguide.camera import Camera
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.memory import require_memory
-from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, require_inside
-from polarguide.options import PathLike, check_range
+from polarguide.errors import PolarguideError, optional_import
+from polarguide.files import atomic, make_folder, require_inside
+from polarguide.options import PathLike, check_finite
 from polarguide.progress import SILENT, Reporter
-from polarguide.rendering.video import write_video
 from polarguide.runs.opened import OpenedRun, checked_layers
-from polarguide.trajectory import interpolated, orbit, read_path, spiral
+from polarguide.trajectory import interpolated, orbit, read_path
 from polarguide.visualization import figures
-from polarguide.visualization.layers import Picture, layer_picture
+from polarguide.visualization.figures import Picture
+from polarguide.visualization.layers import layer_picture
 
-PATHS = {"orbit": orbit, "spiral": spiral}
+
+def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:
+    """Write uint8 RGB pictures [H, W, 3] of one size; odd sides lose their last row or column, as H.264 wants.
+
+    Returns:
+        How many were written.
+
+    Raises:
+        PolarguideError: imageio-ffmpeg is not installed, or the encoder fails.
+    """
+    encoder = optional_import("imageio_ffmpeg", "--video")
+    count = 0
+    # The encoder chooses the format by the name's suffix.
+    with atomic(path) as temporary:
+        named = temporary.with_name(temporary.name + ".mp4")
+        writer = None
+        try:
+            for picture in pictures:
+                height, width = (side - side % 2 for side in picture.shape[:2])
+                if writer is None:
+                    writer = encoder.write_frames(
+                        str(named),
+                        (width, height),
+                        fps=frames_per_second,
+                        codec="libx264",
+                        macro_block_size=2,
+                        output_params=["-crf", "18", "-movflags", "+faststart"],
+                    )
+                    writer.send(None)
+                writer.send(np.ascontiguousarray(picture[:height, :width]))
+                count += 1
+            if writer is not None:
+                writer.close()
+                _require_whole(encoder, named, count)
+            named.replace(temporary)
+        except (OSError, RuntimeError) as error:
+            raise PolarguideError(
+                path,
+                expected="that the video can be encoded",
+                found=str(error).strip().splitlines()[-1][:200] if str(error).strip() else "a failure",
+                remedy="Make room, choose another place or fewer layers.",
+            ) from None
+        finally:
+            if writer is not None:
+                with contextlib.suppress(OSError, RuntimeError):
+                    writer.close()  # the encoder would go on to write what is unlinked here
+            named.unlink(missing_ok=True)
+    return count
+
+
+def _require_whole(encoder: Any, path: Path, count: int) -> None:
+    """Count the pictures of a video: the encoder is another program, whose end on a full disk nobody reports.
+
+    Raises:
+        OSError: there are fewer than were written.
+    """
+    try:
+        found, _ = encoder.count_frames_and_secs(path)
+    except RuntimeError:  # it cannot be read at all
+        found = 0
+    if found != count:
+        raise OSError(f"a file of {found} of {count} pictures, as on a full disk")
+
+
+SWINGS = {"orbit": 0.0, "spiral": 0.25}
+"""Paths around the scene: by what share of the cameras' distance they go up and down."""
 FRAMES_PER_SECOND = 30.0
 RENDERED = 160
 """Bytes that a pixel takes at least while it is rendered: layers, and what they are made of."""
@@ -38,12 +105,12 @@ def path_cameras(run: OpenedRun, path: str, frames: int) -> tuple[list[Camera], 
     Raises:
         PolarguideError: too many frames, or a file that cannot be read.
     """
-    check_range("frames", frames, 1, 100_000)
+    check_finite("frames", frames, 1, 100_000)
     cameras = list(run.cameras.values())
     if path == "interpolate":
         return interpolated(cameras, frames), FRAMES_PER_SECOND
-    if path in PATHS:
-        return PATHS[path](cameras, frames, around=run.frame), FRAMES_PER_SECOND
+    if path in SWINGS:
+        return orbit(cameras, frames, swing=SWINGS[path], around=run.frame), FRAMES_PER_SECOND
     return read_path(Path(path))
 
 
@@ -99,28 +166,16 @@ def write_film(
 def _pictures(
     run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter
 ) -> Iterator[Picture]:
+    """Layers side by side, a picture for each camera."""
     depths = _depths(run, cameras) if "depth" in layers else None
-    gains = run.presentation.gains
+    gains, surface = run.presentation.gains, bool({"normal", "depth"} & {*layers})
     with reporter.track("rendering", len(cameras)) as advance:
         for number, camera in enumerate(cameras):
-            picture = _picture(run, layers, camera, depths, gains)
+            result = run.model.render(camera, depth="depth" in layers, surface=surface)
+            run.chosen_layers(result, layers)
+            pictures = [layer_picture(result, name, camera, depths, gains=gains) for name in layers]
             advance(number + 1)
-            yield picture
-
-
-def _picture(
-    run: OpenedRun,
-    layers: list[str],
-    camera: Camera,
-    depths: tuple[float, float] | None,
-    gains: torch.Tensor | None,
-) -> Picture:
-    """Layers side by side."""
-    surface = bool({"normal", "depth"} & {*layers})
-    result = run.model.render(camera, depth="depth" in layers, surface=surface)
-    run.chosen_layers(result, layers)
-    pictures = [layer_picture(result, name, camera, depths, gains=gains) for name in layers]
-    return np.concatenate([picture for picture in pictures if picture is not None], axis=1)
+            yield np.concatenate([picture for picture in pictures if picture is not None], axis=1)
 
 
 def _depths(run: OpenedRun, cameras: list[Camera]) -> tuple[float, float]:

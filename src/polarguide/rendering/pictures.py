@@ -22,8 +22,8 @@ from polarguide.rendering.relight import write_exr
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
+from polarguide.visualization.figures import contact_sheet
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture, true_depth_range
-from polarguide.visualization.sheet import contact_sheet
 
 SHEET_VIEWS = 8
 CONTACT_SHEET = "contact_sheet.png"
@@ -120,7 +120,8 @@ def write_pictures(
                     exposed = name == "reflection"
                     whole = layer_picture(rendered, name, view.camera, depths, exposed=exposed, gains=gains)
                     assert whole is not None
-                    figures.write_png(folder / f"{view.name}_{name}.png", whole, _opacity(result), about)
+                    alpha = (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+                    figures.write_png(folder / f"{view.name}_{name}.png", whole, alpha, about)
                 elif format == "png":
                     figures.write_png(folder / f"{view.name}_{name}.png", picture, about=about)
                 else:
@@ -156,11 +157,6 @@ def _unblended(result: RenderResult) -> RenderResult:
     alpha = result.alpha.clamp(min=1e-3)[..., None]
     layers = {name: getattr(result, name) for name in ("final", "base", "specular", "diffuse")}
     return replace(result, **{name: t / alpha for name, t in layers.items() if t is not None})
-
-
-def _opacity(result: RenderResult) -> Picture:
-    """Alpha [H, W] as uint8."""
-    return (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 def _write_numbers(path: Path, values: Tensor) -> None:

@@ -11,11 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from polarguide.capture import Scene, View, load_scene, read_model
+from polarguide.capture import Scene, load_scene, read_model
 from polarguide.capture.layout import find_layout
 from polarguide.errors import PolarguideError
 from polarguide.files import require_folder
-from polarguide.numerals import decimal
 from polarguide.options import DeviceName, PathLike
 from polarguide.presentation import (
     CREDITS,
@@ -32,6 +31,7 @@ from polarguide.records import decode
 from polarguide.rendering.picking import gains_of, gray_world, photograph_color, surface_at
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.opened import OpenedRun
+from polarguide.text import decimal
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -71,23 +71,23 @@ def present(
         reporter: told what takes long.
 
     Returns:
-        What is now said of the folder: for a run, its own over its scene's.
+        The presentation of the folder: for a run, its own over its scene's.
 
     Raises:
-        PolarguideError: no such folder, or a value that is none; nothing is written then.
+        PolarguideError: no such folder, or a value that cannot be read; nothing is written then.
     """
     place = _Place(Path(folder), device, reporter)
     own = read_presentation(place.folder)
     changes: dict[str, Any] = {}
     if white_balance is not None:
-        changes["white_balance"] = _white_balance(white_balance, place)
+        changes["white_balance"] = None if white_balance == "none" else _white_balance(white_balance, place)
     if up_axis is not None:
-        changes["up_axis"] = _up_axis(up_axis, place)
+        changes["up_axis"] = None if up_axis == "none" else _up_axis(up_axis, place)
     if points or distance is not None or meters_per_unit is not None:
         changes["meters_per_unit"] = _scale(points, distance, meters_per_unit, place)
     if crop is not None:
         up = changes["up_axis"] if "up_axis" in changes else place.shown(own).up_axis
-        changes["crop"] = _crop(crop, up)
+        changes["crop"] = None if crop == "none" else _crop(crop, up)
     texts = {"title": title, "author": author, "license": license, "provenance": provenance}
     changes |= {
         name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
@@ -121,7 +121,8 @@ class _Place:
         return self._run.scene_folder if self._is_run else self.folder
 
     @cached_property
-    def _scene(self) -> Scene:
+    def scene(self) -> Scene:
+        """The scene, or that of the run."""
         return self._run.scene if self._is_run else load_scene(self.folder, reporter=self._reporter)
 
     def shown(self, own: Presentation) -> Presentation:
@@ -147,10 +148,6 @@ class _Place:
                     remedy=f"Remove it there (polarguide present {self._scene_folder}), or give the run another.",
                 )
 
-    def training_views(self) -> Sequence[View]:
-        """Photographs that were trained on."""
-        return self._scene.train_views
-
     def pixel(self, text: str) -> tuple[str, float, float] | None:
         """A view and a place in it, if the text is VIEW,X,Y."""
         name, *numbers = text.rsplit(",", 2)
@@ -159,15 +156,11 @@ class _Place:
             return None
         return name, places[0], places[1]
 
-    def view(self, name: str) -> View:
-        """A view by its name."""
-        return self._scene.view(name)
-
     def surface(self, name: str, x: float, y: float, where: str) -> tuple[Tensor, Tensor | None]:
         """Point and normal of the surface at a pixel of a view.
 
         Raises:
-            PolarguideError: there is none, or no run that would know of one.
+            PolarguideError: no surface is there, or the folder is not a run's.
         """
         if not self._is_run:
             raise PolarguideError(
@@ -176,7 +169,7 @@ class _Place:
                 found=f"the scene {self.folder}",
                 remedy="Give the folder of a run of it, or numbers X,Y,Z.",
             )
-        camera = self.view(name).camera
+        camera = self.scene.view(name).camera
         found = surface_at(self._run.result(camera, depth=True).to("cpu"), camera, x, y)
         if found is None:
             raise PolarguideError(
@@ -191,7 +184,7 @@ class _Place:
         """A PLACE as a point [3] in the world.
 
         Raises:
-            PolarguideError: it is none.
+            PolarguideError: the text is not a PLACE.
         """
         pixel = self.pixel(text)
         if pixel is not None:
@@ -203,37 +196,29 @@ class _Place:
 
 
 def _white_balance(text: str, place: _Place) -> Vector | None:
-    if text == "none":
-        return None
     if text == "gray":
-        return gray_world(place.training_views())
-    numbers = _numbers(text)
-    pixel = place.pixel(text)
-    if pixel is not None:
+        return gray_world(place.scene.train_views)
+    if (pixel := place.pixel(text)) is not None:
         name, x, y = pixel
-        return gains_of(photograph_color(place.view(name), x, y, "white_balance"))
-    if len(numbers) != 3:
-        raise _none_of("white_balance", "none, gray, three gains such as 1.9,1,1.6, or VIEW,X,Y", text)
-    return numbers[0], numbers[1], numbers[2]
+        return gains_of(photograph_color(place.scene.view(name), x, y, "white_balance"))
+    expected = "none, gray, three gains such as 1.9,1,1.6, or VIEW,X,Y"
+    red, green, blue = _require_numbers(text, 3, "white_balance", expected)
+    return red, green, blue
 
 
 def _up_axis(text: str, place: _Place) -> Vector | None:
-    if text == "none":
-        return None
     if (axis := AXES.get(text.removeprefix("-").removeprefix("+").lower())) is not None:
         sign = -1.0 if text.startswith("-") else 1.0
         return sign * axis[0], sign * axis[1], sign * axis[2]
-    pixel = place.pixel(text)
-    if pixel is not None:
+    if (pixel := place.pixel(text)) is not None:
         _, normal = place.surface(*pixel, "up_axis")
         if normal is None:
-            raise _none_of("up_axis", "a place whose normal is known", text)
+            raise _wrong("up_axis", "a place whose normal is known", text)
         x, y, z = normal.tolist()
-        return x, y, z
-    numbers = _numbers(text)
-    if len(numbers) != 3:
-        raise _none_of("up_axis", "none, an axis such as z or -y, three numbers, or VIEW,X,Y", text)
-    return numbers[0], numbers[1], numbers[2]
+    else:
+        expected = "none, an axis such as z or -y, three numbers, or VIEW,X,Y"
+        x, y, z = _require_numbers(text, 3, "up_axis", expected)
+    return x, y, z
 
 
 def _scale(
@@ -241,47 +226,52 @@ def _scale(
 ) -> float | None:
     if meters_per_unit is not None:
         if points or distance is not None:
-            raise _none_of("meters_per_unit", "either this, or --points and --distance", "both")
+            raise _wrong("meters_per_unit", "either this, or --points and --distance", "both")
         if meters_per_unit == "none":
             return None
-        numbers = _numbers(meters_per_unit)
-        if len(numbers) != 1:
-            raise _none_of("meters_per_unit", "a number above 0, or none", meters_per_unit)
-        return numbers[0]
+        return _require_numbers(meters_per_unit, 1, "meters_per_unit", "a number above 0, or none")[0]
     if len(points) != 2 or distance is None:
         found = f"{len(points)} points and {'a' if distance else 'no'} distance"
-        raise _none_of("points", "two points, and their --distance", found)
+        raise _wrong("points", "two points, and their --distance", found)
     meters = parse_length(distance)
     apart = float((place.point(points[0]) - place.point(points[1])).norm())
     if apart < 1e-9:
-        raise _none_of("points", "two points that lie apart", "one and the same")
+        raise _wrong("points", "two points that lie apart", "one and the same")
     return meters / apart
 
 
-def _crop(text: str, up: Vector | None) -> dict[str, Any] | None:
-    if text == "none":
-        return None
-    numbers = _numbers(text)
-    if len(numbers) != 6:
-        raise _none_of("crop", "none, or left,right,down,up,front,back in percent", text)
-    left, right, down, above, front, back = (number / 100 for number in numbers)
+def _crop(text: str, up: Vector | None) -> dict[str, Any]:
+    sides = _require_numbers(text, 6, "crop", "none, or left,right,down,up,front,back in percent")
+    left, right, down, above, front, back = (side / 100 for side in sides)
     return {"low": (left, down, front), "high": (right, above, back), "up": up}
 
 
 def _numbers(text: str) -> list[float]:
-    """Numbers separated by commas; none where something else is among them."""
+    """Numbers separated by commas; an empty list where the text is something else."""
     try:
         return [decimal(part) for part in text.split(",")]
     except ValueError:
         return []
 
 
-def _none_of(where: str, expected: str, found: str) -> PolarguideError:
+def _require_numbers(text: str, count: int, where: str, expected: str) -> list[float]:
+    """So many numbers separated by commas.
+
+    Raises:
+        PolarguideError: the text is something else.
+    """
+    numbers = _numbers(text)
+    if len(numbers) != count:
+        raise _wrong(where, expected, text)
+    return numbers
+
+
+def _wrong(where: str, expected: str, found: str) -> PolarguideError:
     return PolarguideError(where, expected=expected, found=found, remedy="Correct the value.")
 
 
 def described(presentation: Presentation) -> list[str]:
-    """What is set, a line each; one that says so where nothing is."""
+    """The fields that are set, a line each; "nothing is set" for an empty presentation."""
     lines = {
         "white balance": _listed(presentation.white_balance),
         "up axis": _listed(presentation.up_axis),

@@ -11,25 +11,24 @@ from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.errors import PolarguideError
 from polarguide.files import make_folder
-from polarguide.options import PathLike, SceneOptions, check_finite, index_of
+from polarguide.options import PathLike, check_finite, index_of
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
-from polarguide.runs.opened import OpenedRun, read_scene
+from polarguide.runs.opened import OpenedRun
 from polarguide.training.priors import facing_chromatic, guide_normals
 from polarguide.training.recipe import Priors
 from polarguide.visualization import figures
-from polarguide.visualization.sheet import Picture, contact_sheet
+from polarguide.visualization.figures import Picture, contact_sheet
 
 
 def write_priors(
-    scene: Scene | PathLike,
+    scene: Scene,
     out: PathLike,
     *,
     run: OpenedRun | None = None,
     views: str = "test",
     refractive_index: float | None = None,
     threshold: float = 0.05,
-    reading: SceneOptions = SceneOptions(),
     reporter: Reporter = SILENT,
 ) -> Path:
     """Pictures of what polarization says about a scene, one PNG each, and a contact sheet of them.
@@ -39,7 +38,7 @@ def write_priors(
     with their ambiguity resolved only by the surface facing the camera.
 
     Args:
-        scene: a scene, or the folder of one, which is read as ``reading`` says.
+        scene: a scene with poses.
         out: folder to write.
         run: a run trained on this scene at this size, whose normals resolve the ambiguity.
         views: ``test``, ``train``, ``all``, or names separated by commas.
@@ -54,8 +53,6 @@ def write_priors(
             at another size.
     """
     check_finite("threshold", threshold, 0.0, 1.0)
-    if not isinstance(scene, Scene):
-        scene = read_scene(scene, reading, reporter)
     index = index_of(refractive_index, scene.refractive_index)
     check_finite("refractive_index", index, 1.0001, 4.0)
     if run is not None and run.configuration.downscale != scene.downscale:

@@ -14,8 +14,7 @@ from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.sensor.pattern import Pattern
 from polarguide.polarizer import ANGLES, stokes_of_four
 from polarguide.sensor_calibration.solve import ShotFit
-from polarguide.visualization.figures import scalar_to_rgb, scale_bar
-from polarguide.visualization.sheet import FONT, INK, Picture, contact_sheet
+from polarguide.visualization.figures import FONT, INK, Picture, contact_sheet, scalar_to_rgb, scale_bar
 
 COUNTLESS = 1000.0
 """Extinction ratios above this are not told apart: noise and the polarizer decide them."""

@@ -14,8 +14,8 @@ from msgspec import Meta
 from polarguide.capture.calibration import Sense
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.errors import PolarguideError
-from polarguide.numerals import decimal
 from polarguide.records import check_options
+from polarguide.text import decimal
 
 NAMES = "names"
 _NUMBER = re.compile(r"(?:^|.*[_ ])(\d+(?:\.\d+)?)(?:deg)?")

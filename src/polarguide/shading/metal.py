@@ -21,7 +21,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.camera import Camera
-from polarguide.optics.conductor import LARGEST_REFLECTANCE
+from polarguide.optics.fresnel import LARGEST_REFLECTANCE
 from polarguide.shading.layout import Layout
 from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.vectors import dot, unit

@@ -16,7 +16,7 @@ from torch import Tensor
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.read import SurfaceMaps, tiles
 from polarguide.visualization import figures
-from polarguide.visualization.sheet import FONT, INK, Picture
+from polarguide.visualization.figures import FONT, INK, Picture
 
 Look = Literal["radiance", "scalar", "angle", "normal", "reason"]
 _OF_S0 = "linear radiance in units of S0 (2 is full scale of all four intensities)"

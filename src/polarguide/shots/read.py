@@ -17,12 +17,12 @@ from polarguide.camera import Camera
 from polarguide.capture.colmap.model import fit_camera, read_model
 from polarguide.capture.view import View
 from polarguide.errors import PolarguideError
-from polarguide.numerals import decimal
 from polarguide.options import check_finite, index_of
 from polarguide.shots.develop import Developed, develop, develop_view
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import Map, Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
+from polarguide.text import decimal
 from polarguide.vectors import dot, unit
 
 UNREADABLE = (PolarguideError, OSError, MemoryError)

@@ -19,8 +19,7 @@ from polarguide.synth.folder import write_file
 from polarguide.synth.mesh import Array
 from polarguide.synth.settings import dr, mi
 from polarguide.visualization import figures
-from polarguide.visualization.figures import Picture
-from polarguide.visualization.sheet import contact_sheet
+from polarguide.visualization.figures import Picture, contact_sheet
 
 
 @dataclass(frozen=True, eq=False)

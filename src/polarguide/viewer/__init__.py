@@ -1,8 +1,16 @@
 """A local web viewer for trained runs and for trainings in progress."""
 
 from polarguide.options import LOOPBACK
-from polarguide.viewer.frusta import photographs
+from polarguide.viewer.cameras import photographs
+from polarguide.viewer.scenery import GaussianScenery, run_scenery, training_scenery
 from polarguide.viewer.server import Viewer, viewing_address
-from polarguide.viewer.shown import Shown, shown_run, shown_training
 
-__all__ = ["LOOPBACK", "Shown", "Viewer", "photographs", "shown_run", "shown_training", "viewing_address"]
+__all__ = [
+    "LOOPBACK",
+    "GaussianScenery",
+    "Viewer",
+    "photographs",
+    "run_scenery",
+    "training_scenery",
+    "viewing_address",
+]

@@ -8,9 +8,9 @@ from typing import Any
 
 from polarguide.presentation import Crop, Presentation, Vector
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.appearance import MEASURED, Appearance
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.presenting import PresentingControls
+from polarguide.viewer.scenery import MEASURED, Appearance
 
 FREE_VIEW = "(free)"
 STEPS = ("previous", "next")
@@ -55,7 +55,7 @@ class Panel:
 
     def __init__(self, gui: Any, options: PanelOptions, changed: Callable[[], None]) -> None:
         self._crop: list[Any] = []
-        # The box as it was saved, until a slider is moved; it is told more exactly than sliders can.
+        # The box as it was saved, until a slider is moved; its sides are more exact than the sliders' steps.
         self._saved_crop = options.presentation.crop
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._status, self._lines, self._note = gui.add_markdown(""), tuple[str, ...](), ""

@@ -81,7 +81,7 @@ class Presenting:
         client: viser's handle. controls: of its panel. presentation: as it was saved.
         gray_world: gives the gains of the photographs' mean. save: writes what was chosen, and says what it did.
         distance: of the cameras.
-        changed: called after every change that affects the picture, and when a click waits. said: when there is
+        changed: called after every change that affects the picture, and when a click waits. noted: when there is
             another note.
         caught: makes callbacks whose faults cost only this browser.
     """
@@ -96,12 +96,12 @@ class Presenting:
         save: Callable[[], str],
         distance: float,
         changed: Callable[[], None],
-        said: Callable[[], None],
+        noted: Callable[[], None],
         caught: Callable[[Callable[[], None]], Callable[[Any], None]],
     ) -> None:
         self._client, self._controls, self._gray_world = client, controls, gray_world
         self._changed, self._caught, self._distance = changed, caught, distance
-        self.chosen, self.note, self._said = presentation, "", said
+        self.chosen, self.note, self._noted = presentation, "", noted
         self._picked_white = presentation.white_balance
         self._picking = ""
         self._listener: Callable[[Any], None] | None = None
@@ -144,7 +144,7 @@ class Presenting:
 
     def _say(self, text: str) -> None:
         self.note = text
-        self._said()
+        self._noted()
 
     def _ask(self, what: str) -> None:
         if what == "length":

@@ -1,31 +1,45 @@
-"""The web server of the viewer; one thread renders for all sessions."""
+"""The web server of the viewer over a run, or over a training; one thread renders for all sessions."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import io
 import socket
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any
 
+import msgspec
+
+from polarguide.capture import Scene
 from polarguide.errors import PolarguideError, optional_import
 from polarguide.options import LOOPBACK, VisitorOptions
-from polarguide.presentation import Presentation, Vector
+from polarguide.presentation import (
+    PRESENTATION_FILE,
+    Presentation,
+    Vector,
+    read_presentation,
+    write_presentation,
+)
+from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.picking import gray_world
+from polarguide.runs.families import AnyTrainer
+from polarguide.runs.opened import OpenedRun
+from polarguide.runs.train import Ends, Look
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.model import ShadingModel
-from polarguide.viewer.frusta import Photograph
-from polarguide.viewer.gate import Gate
-from polarguide.viewer.guard import guarded
+from polarguide.viewer.cameras import Photograph, photographs
+from polarguide.viewer.guard import Gate, guarded
 from polarguide.viewer.messages import Accepts, checked
 from polarguide.viewer.panel import NOTHING, PanelOptions
+from polarguide.viewer.scenery import Scenery, run_scenery, training_scenery
 from polarguide.viewer.session import Session
-from polarguide.viewer.shown import Scenery
 
 REFRESH = 1.0  # least seconds between two pictures of a training,
 SHARE = 10.0  # which are also at least this multiple of the time that the last one took
@@ -50,10 +64,10 @@ class Viewer:
         shading: model of the recipe. trains: whether the panel can pause a training.
         host, port: address to listen at; another port is used if this one is taken.
         visitors: who may look besides pages of this machine.
-        presentation: as it was saved. save: writes what a visitor chose to the run, and says so, in plain text; None:
-            visitors can download it. They can only do that, too, where others than this machine may look.
+        presentation: as it was saved. save: writes a choice to the run, and returns a message in plain text; None:
+            visitors can download it. That is all they can do where other machines may look.
         title: plain text.
-        warn: told why a browser was let go.
+        warn: called with the reason why a browser was disconnected.
 
     Raises:
         PolarguideError: viser is not installed or not as it was tested, or the server cannot listen at the address.
@@ -252,3 +266,118 @@ def _listening(viser: Any, host: str, port: int, title: str) -> Any:
         ) from None
     with contextlib.redirect_stdout(io.StringIO()):
         return viser.ViserServer(host=host, port=port, label=title, verbose=False)
+
+
+PATIENCE = 0.2  # seconds between two looks at whether a paused training should end
+
+
+def view_run(
+    run: OpenedRun,
+    *,
+    host: str = LOOPBACK[0],
+    port: int = 8080,
+    visitors: VisitorOptions = VisitorOptions(),
+    reporter: Reporter = SILENT,
+) -> None:
+    """Serve a run to browsers: its layers from any side, beside the photographs. KeyboardInterrupt ends it.
+
+    Args:
+        run: the run; its scene is read.
+        host: address to listen at. port: the next free one is taken if it is in use.
+        visitors: who may look besides pages of this machine.
+        reporter: told the address.
+
+    Raises:
+        PolarguideError: the address cannot be listened at.
+    """
+    scenery = run_scenery(run)
+    with _opened(
+        lambda: scenery,
+        run.scene,
+        reporter,
+        host,
+        name=run.folder.resolve().name,
+        shading=run.model.shading,
+        port=port,
+        visitors=visitors,
+        presentation=run.presentation,
+        save=functools.partial(save_to_run, run),
+    ) as viewer:
+        while True:
+            viewer.serve(1.0)
+
+
+def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
+    """Write white, up, scale and crop to the run's ``presentation.json``, and say so in plain text.
+
+    What its scene says just so is left to the scene. The run's own credit stays.
+    """
+    own, above = read_presentation(run.folder), read_presentation(run.scene_folder)
+    fields, kept = {}, []
+    for name in ("white_balance", "up_axis", "meters_per_unit", "crop"):
+        value, given = getattr(chosen, name), getattr(above, name)
+        fields[name] = None if value == given else value
+        if value is None and given is not None:
+            kept.append(name)
+    write_presentation(run.folder, msgspec.structs.replace(own, **fields))
+    if kept:
+        return f"Saved; the scene's own {', '.join(kept)} still counts"
+    return f"Saved to {PRESENTATION_FILE}"
+
+
+@contextmanager
+def watched(
+    trainer: AnyTrainer,
+    host: str,
+    port: int,
+    visitors: VisitorOptions = VisitorOptions(),
+    reporter: Reporter = SILENT,
+) -> Iterator[Look]:
+    """A viewer over a training; yields what is to be called between steps.
+
+    Raises:
+        PolarguideError: several processes train, or the address cannot be listened at.
+    """
+    if trainer.ranks.world > 1:
+        raise PolarguideError(
+            "viewer",
+            expected="one process",
+            found=f"{trainer.ranks.world}",
+            remedy="Leave it out, and look at the checkpoints: polarguide view RUN.",
+        )
+    scene = trainer.scene
+
+    def look(ends: Ends) -> None:
+        viewer.refresh()
+        viewer.serve()
+        while viewer.paused and not ends():
+            viewer.serve(PATIENCE)
+
+    with _opened(
+        functools.partial(training_scenery, trainer),
+        scene,
+        reporter,
+        host,
+        name=scene.name,
+        shading=trainer.shading,
+        port=port,
+        visitors=visitors,
+        presentation=read_presentation(scene.root),
+        trains=True,
+    ) as viewer:
+        yield look
+
+
+@contextmanager
+def _opened(
+    current: Callable[[], Scenery], scene: Scene, reporter: Reporter, host: str, *, name: str, **options: Any
+) -> Iterator[Viewer]:
+    """A viewer with options of ``Viewer``; the reporter is told where to look, and warned of other machines."""
+    viewer = Viewer(
+        current, photographs(scene), host=host, title=f"polarguide {name}", warn=reporter.warn, **options
+    )
+    with closing(viewer):
+        if host not in LOOPBACK:
+            reporter.warn(f"whoever reaches {host} over the network can look: there is no password")
+        reporter.say(f"viewer: {viewer.address}")
+        yield viewer

@@ -14,16 +14,79 @@ from polarguide.camera import Camera
 from polarguide.presentation import PRESENTATION_FILE, Presentation, Vector
 from polarguide.records import to_json
 from polarguide.scene_frame import SceneFrame
-from polarguide.viewer.appearance import Painter
-from polarguide.viewer.frame_pacing import FramePacing
-from polarguide.viewer.frusta import Frusta, Photograph
-from polarguide.viewer.keyframes import FRAMES_PER_SECOND, Keyframes
+from polarguide.viewer.cameras import (
+    FRAMES_PER_SECOND,
+    Frusta,
+    Keyframes,
+    Photograph,
+    ViewPose,
+    free_camera,
+    move_to_view,
+)
 from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
-from polarguide.viewer.pose import ViewPose, move_to_view
 from polarguide.viewer.presenting import Presenting
-from polarguide.viewer.shown import Scenery
-from polarguide.viewer.viewport import free_camera
+from polarguide.viewer.scenery import Painter, Scenery
 from polarguide.visualization.figures import Picture, png_bytes
+
+REST = 0.25  # seconds without a change after which a sharp picture is rendered
+BUDGET = 0.1  # seconds per picture while the camera moves
+FIRST_HEIGHT = 360
+LEAST_HEIGHT = 90
+GREATEST_HEIGHT = 1080
+GREATEST_WIDTH = 3840
+
+
+class FramePacing:
+    """Coarse pictures while the camera or a control changes, one sharp picture afterwards.
+
+    The height of coarse pictures adapts to the time that they take. Times are seconds of one monotonic clock.
+
+    Attributes:
+        version: number of changes so far; a picture that is rendered now shows this version.
+    """
+
+    def __init__(self) -> None:
+        self._changed = 0.0
+        self.version = 1
+        self._drawn = self._sharp = 0
+        self.last_frame = 0.0
+        self._height = float(FIRST_HEIGHT)
+
+    def mark_changed(self, now: float) -> None:
+        """Record that the camera or a control has changed at the time ``now``."""
+        self._changed = now
+        self.version += 1
+
+    def mark_outdated(self) -> None:
+        """Record that the scene has changed: a sharp picture is due, without coarse ones before it."""
+        self.version += 1
+
+    def due(self, now: float) -> str | None:
+        """The kind of picture that is due: "coarse", "sharp", or None if the last picture is up to date."""
+        if now - self._changed >= REST:
+            return None if self._sharp == self.version else "sharp"
+        return None if self._drawn == self.version else "coarse"
+
+    def frame_size(self, window: tuple[int, int], kind: str) -> tuple[int, int]:
+        """Width and height in pixels of the next picture of this kind, given those of the window."""
+        limit = GREATEST_HEIGHT if kind == "sharp" else round(self._height)
+        height = max(1, min(window[1], limit))
+        width = max(1, round(window[0] * height / max(1, window[1])))
+        if width > GREATEST_WIDTH:
+            height = max(1, round(height * GREATEST_WIDTH / width))
+        return min(width, GREATEST_WIDTH), height
+
+    def end_frame(self, version: int, kind: str, seconds: float, now: float) -> None:
+        """Record that a picture was rendered in so many seconds."""
+        self._drawn, self.last_frame = version, now
+        if kind == "sharp":
+            self._sharp = version
+            return
+        # Time is at most proportional to the number of pixels. Shrink at once, grow step by step.
+        factor = (BUDGET / max(seconds, 1e-4)) ** 0.5
+        self._height *= max(0.25, factor) if factor < 1 else min(1.1, factor)
+        self._height = min(float(GREATEST_HEIGHT), max(float(LEAST_HEIGHT), self._height))
+
 
 PATH_FILE, PICTURE_FILE = "camera_path.json", "polarguide.png"
 JPEG_QUALITY = 75
@@ -44,7 +107,7 @@ class Session:
         client: viser's handle. photographs: by name. scene_frame: of the scene.
         options: of the panel. wake: called when a picture may be due.
         gray_world: gives the gains of the photographs' mean.
-        save: writes a presentation to the run, and says so; None: the browser downloads it.
+        save: writes a presentation to the run, and returns a message; None: the browser downloads it.
         drop: called with what a callback has raised, to let the browser go.
     """
 
@@ -81,7 +144,7 @@ class Session:
             save=self._save_presentation,
             distance=scene_frame.distance,
             changed=self._changed,
-            said=lambda: self.panel.show_note(self._presenting.note),
+            noted=lambda: self.panel.show_note(self._presenting.note),
             caught=self._caught,
         )
         self._frusta = Frusta(
@@ -130,7 +193,7 @@ class Session:
         return called
 
     def _soon_again(self, what: str) -> bool:
-        """Whether this was asked for only just now, too: what takes time or memory is passed over then."""
+        """Whether the same was requested less than ``BETWEEN_FILES`` ago; such a request is ignored."""
         now = time.monotonic()
         with self._lock:
             soon = now - self._asked.get(what, -BETWEEN_FILES) < BETWEEN_FILES
@@ -252,11 +315,11 @@ class Session:
                 "sharp" if self._screenshot or self._presenting.waits else self.pacing.due(time.monotonic())
             )
 
-    def draw(self, shown: Scenery, kind: str) -> None:
+    def draw(self, scenery: Scenery, kind: str) -> None:
         """Render a picture and send it to the browser."""
         began = time.monotonic()
         with self._lock:
-            version, view_pose = self.pacing.begin_frame(), self._view_pose
+            version, view_pose = self.pacing.version, self._view_pose
             screenshot, self._screenshot = self._screenshot, False
             camera = self._client.camera
             frame_size = self.pacing.frame_size((camera.image_width, camera.image_height), kind)
@@ -265,9 +328,9 @@ class Session:
         sharp = kind == "sharp"
         if (place := self._presenting.take_click()) is not None:
             appearance = self.panel.appearance(self._presenting.chosen)
-            self._presenting.found(self._painter.point(shown, viewpoint, appearance, view, place))
+            self._presenting.found(self._painter.point(scenery, viewpoint, appearance, view, place))
         appearance = self.panel.appearance(self._presenting.chosen)
-        picture = self._painter.paint(shown, viewpoint, appearance, view, settled=sharp)
+        picture = self._painter.paint(scenery, viewpoint, appearance, view, settled=sharp)
         self._send(picture, frame_size, sharp=sharp)
         self._frusta.hide_near(None if view else viewpoint.center.numpy())
         if screenshot and picture is not None:
@@ -276,7 +339,7 @@ class Session:
         with self._lock:
             self.pacing.end_frame(version, kind, now - began, now)
         note = f"{frame_size[0]} x {frame_size[1]} in {1000 * (now - began):.0f} ms"
-        self.panel.show_status(shown.status, NO_LAYER if picture is None else note)
+        self.panel.show_status(scenery.status, NO_LAYER if picture is None else note)
 
     def _send(self, picture: Picture | None, frame_size: tuple[int, int], *, sharp: bool) -> None:
         if picture is None:

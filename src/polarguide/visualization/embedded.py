@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 
-from polarguide.visualization.sheet import Picture, check_picture
+from polarguide.visualization.figures import Picture, check_picture
 
 LAYERS: dict[str, str] = {
     "final": "final",

@@ -11,7 +11,7 @@ from polarguide.capture import View
 from polarguide.presentation import balanced
 from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
-from polarguide.visualization.sheet import Picture
+from polarguide.visualization.figures import Picture
 
 RADIANCE = frozenset(("final", "base", "reflection", "specular", "diffuse"))
 """Layers that are linear radiance."""

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from polarguide.numerals import decimal
+from polarguide.text import decimal
 
 
 @pytest.mark.parametrize(

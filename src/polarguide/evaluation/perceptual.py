@@ -1,8 +1,4 @@
-"""LPIPS (Zhang et al. 2018) with the VGG-16 network, where its weights are at hand.
-
-The network needs the extra ``lpips`` (torchmetrics, torchvision) and ImageNet weights (528 MB). Nothing is ever
-downloaded here: without them the metric is None, with a reason that says how to get them.
-"""
+"""Learned and perceptual distances of two pictures, where their packages and weights are installed: LPIPS and FLIP."""
 
 from __future__ import annotations
 
@@ -16,6 +12,7 @@ import torch
 from torch import Tensor
 
 from polarguide.color import shown
+from polarguide.errors import PolarguideError, optional_import
 
 FETCH_COMMAND = "python -c \"import torchvision; torchvision.models.vgg16(weights='DEFAULT')\""
 # Five halvings: below this the last layer of the network has no pixel.
@@ -72,3 +69,51 @@ def load_metric() -> tuple[Any, str | None]:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     return LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True), None
+
+
+PIXELS_PER_DEGREE = 67.0206
+"""Of the visual angle: a display of 3840 pixels, 0.7 m wide, seen from 0.7 m, as the authors report it."""
+PACKAGE = "flip-evaluator"
+
+
+def flip(
+    pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None
+) -> tuple[float | None, str | None]:
+    """Mean LDR-FLIP of two shown pictures (Andersson et al. 2020) at ``PIXELS_PER_DEGREE``.
+
+    The eye's filters reach beyond a pixel, so pixels outside ``keep`` are black in both, and the mean is taken over the
+    others.
+
+    Args:
+        pred_linear, true_linear: [H, W, 3] linear radiance.
+        keep: [H, W] bool, the pixels that count; None counts all.
+
+    Returns:
+        (value, None), the value from 0 for equal pictures to 1; or (None, reason) where the package is not installed or
+        no pixel counts.
+    """
+    package, reason = load_package()
+    if package is None:
+        return None, reason
+    true = true_linear.detach().cpu()
+    pred = pred_linear.detach().cpu().to(true.dtype)
+    counts = torch.ones(true.shape[:2], dtype=torch.bool) if keep is None else keep.cpu()
+    if not counts.any():
+        return None, "no pixel counts"
+    encoded = [
+        torch.where(counts[..., None], shown(picture), 0.0).float().contiguous().numpy()
+        for picture in (true, pred)
+    ]
+    errors, _, _ = package.evaluate(
+        *encoded, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": PIXELS_PER_DEGREE}
+    )
+    return float(torch.from_numpy(errors[..., 0].copy())[counts].double().mean()), None
+
+
+@lru_cache(maxsize=1)
+def load_package() -> tuple[Any, str | None]:
+    """The package ``flip_evaluator``, loaded once per process: (package, None), or (None, reason)."""
+    try:
+        return optional_import("flip_evaluator", "FLIP"), None
+    except PolarguideError:
+        return None, f"the package {PACKAGE} is not installed"

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from polarguide import installation
-from polarguide.installation import install_extra, install_package
+from polarguide import errors
+from polarguide.errors import install_extra, install_package
 
 REQUIRES = ["viser==1.1.*", "scikit-image>=0.22", "flip-evaluator>=1.6; python_version < '3.14'",
             'mitsuba==3.9.*; extra == "synth"', "torchmetrics>=1.4; extra == 'lpips'",
@@ -23,7 +23,7 @@ REQUIRES = ["viser==1.1.*", "scikit-image>=0.22", "flip-evaluator>=1.6; python_v
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Pretends that the package lies in an environment, with a ``direct_url.json`` as given (None: no such file)."""
-    monkeypatch.setattr(installation, "__file__", str(tmp_path / "lib" / "python" / "polarguide" / "x.py"))
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "lib" / "python" / "polarguide" / "x.py"))
     monkeypatch.setattr(shutil, "which", lambda name: str(Path(sys.executable).with_name(name)))
 
     def pretend(url: str | None) -> None:
@@ -89,5 +89,5 @@ def test_the_pip_of_another_python_is_not_used(installed, monkeypatch: pytest.Mo
 
 def test_a_checkout_that_was_never_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = sources(tmp_path / "checkout")
-    monkeypatch.setattr(installation, "__file__", str(folder / "src" / "polarguide" / "installation.py"))
+    monkeypatch.setattr(errors, "__file__", str(folder / "src" / "polarguide" / "installation.py"))
     assert shlex.split(install_extra("synth"))[-1] == f"{folder}[synth]"

@@ -1,0 +1,267 @@
+"""Cameras of a browser window: free ones, those at a photograph's pose, a path of keyframes, and clickable frusta."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from polarguide.camera import Camera, quaternion
+from polarguide.capture import Scene, View
+from polarguide.presentation import Crop
+from polarguide.scene_frame import SceneFrame
+from polarguide.trajectory import camera_record, interpolated
+from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture
+
+
+def free_camera(
+    wxyz: Sequence[float], position: Sequence[float], fov: float, frame_size: tuple[int, int]
+) -> Camera:
+    """A camera with square pixels and a centered principal point.
+
+    Args:
+        wxyz: quaternion of the camera-to-world rotation, OpenCV's axes. position: in the world.
+        fov: vertical field of view in radians. frame_size: width and height in pixels.
+    """
+    width, height = frame_size
+    w, x, y, z = (float(v) for v in wxyz)
+    rotation = torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix().T.copy())
+    center = torch.tensor([float(v) for v in position], dtype=torch.float64)
+    focal = 0.5 * height / math.tan(0.5 * fov)
+    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, -rotation @ center)
+
+
+@dataclass(frozen=True)
+class Letterbox:
+    """The placement of a photograph in a window of another aspect ratio: as large as possible, centered.
+
+    Attributes:
+        scale: window pixels per pixel of the photograph. left, top: its corner in window pixels.
+        frame_size: width and height of the window.
+    """
+
+    scale: float
+    left: float
+    top: float
+    frame_size: tuple[int, int]
+
+    def camera(self, photograph: Camera) -> Camera:
+        """The photograph's camera, extended to the window."""
+        scaled = photograph.scaled(self.scale, *self.frame_size)
+        return replace(scaled, cx=scaled.cx + self.left, cy=scaled.cy + self.top)
+
+    def apply(self, picture: Picture) -> Picture:
+        """A picture of the photograph's size, resampled into the window with gray borders."""
+        matrix = np.array([[self.scale, 0, self.left], [0, self.scale, self.top]])
+        # The origin of warpAffine is the center of the corner pixel, that of our cameras its corner.
+        matrix[:, 2] += 0.5 * self.scale - 0.5
+        blend = cv2.INTER_LINEAR if self.scale >= 1 else cv2.INTER_AREA
+        placed = cv2.warpAffine(picture, matrix, self.frame_size, flags=blend, borderValue=(64, 64, 64))
+        return np.ascontiguousarray(placed, dtype=np.uint8)
+
+
+def letterbox(photograph: Camera, frame_size: tuple[int, int]) -> Letterbox:
+    """The placement of a photograph in a window of ``frame_size``, width and height."""
+    scale = min(frame_size[0] / photograph.width, frame_size[1] / photograph.height)
+    left = 0.5 * (frame_size[0] - scale * photograph.width)
+    top = 0.5 * (frame_size[1] - scale * photograph.height)
+    return Letterbox(scale, left, top, frame_size)
+
+
+def window_fov(photograph: Camera, aspect: float) -> float:
+    """Vertical field of view in radians with which a window of ``aspect`` (width / height) contains a photograph."""
+    high, wide = 0.5 * photograph.height / photograph.fy, 0.5 * photograph.width / photograph.fx
+    return 2 * math.atan(max(high, wide / aspect))
+
+
+ARRIVAL = 5.0  # seconds within which a browser has to report a pose
+# Tolerances of rounding: 1 - |cos| of half the angle, and a share of the cameras' distance.
+TURNED, MOVED = 1e-6, 1e-4
+
+
+@dataclass(eq=False)
+class ViewPose:
+    """The view at whose pose a session's camera is.
+
+    Attributes:
+        view: the view. wxyz, position: the pose that was sent to the browser. since: the time when it was sent.
+        reached: whether the browser has reported this pose; until then it may report earlier poses.
+    """
+
+    view: View
+    wxyz: np.ndarray
+    position: np.ndarray
+    since: float
+    reached: bool = False
+
+    def is_kept(self, camera: Any, now: float, distance: float) -> bool:
+        """Whether a browser's camera has this pose, or may still be moving to it.
+
+        Args:
+            camera: viser's. now: time in seconds. distance: of the cameras from the scene's center.
+        """
+        turned = 1 - abs(float(np.dot(self.wxyz, camera.wxyz)))
+        moved = float(np.linalg.norm(self.position - camera.position)) / distance
+        here = turned < TURNED and moved < MOVED
+        self.reached |= here
+        return here or (not self.reached and now - self.since < ARRIVAL)
+
+
+def move_to_view(client: Any, view: View, scene_frame: SceneFrame, now: float) -> ViewPose:
+    """Move a browser's camera to the pose of a view, with a field of view that contains the photograph."""
+    camera, target, center = client.camera, view.camera, view.camera.center
+    # The orbit center lies on the optical axis, at the distance of the scene's center.
+    ahead = target.rotation[2]
+    distance = max(float((scene_frame.center - center) @ ahead), 0.1 * scene_frame.distance)
+    with client.atomic():
+        camera.fov = window_fov(target, camera.aspect)
+        camera.up_direction = (-target.rotation[1]).numpy()
+        camera.position = center.numpy()
+        camera.look_at = (center + distance * ahead).numpy()
+    # Not what viser has stored by now: a message of the browser may have replaced it.
+    return ViewPose(view, np.array(quaternion(target.rotation.T)), center.numpy(), now)
+
+
+FRAMES_PER_SECOND = 30
+MOST_KEYFRAMES = 50
+
+
+class Keyframes:
+    """Keyframes in the order in which they were added, and the smooth path through them.
+
+    Args:
+        frame_size: width and height of the pictures of the path.
+    """
+
+    def __init__(self, frame_size: tuple[int, int]) -> None:
+        self._size = frame_size
+        self.cameras: list[Camera] = []
+
+    def add(self, camera: Camera) -> None:
+        """Append a keyframe, up to ``MOST_KEYFRAMES``; its vertical field of view is kept."""
+        if len(self.cameras) >= MOST_KEYFRAMES:
+            return
+        width, height = self._size
+        focal = camera.fy * height / camera.height
+        self.cameras.append(
+            replace(camera, width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
+        )
+
+    def path(self, seconds: float) -> list[Camera]:
+        """The path with ``seconds`` between keyframes; fewer than two keyframes are returned as they are."""
+        if len(self.cameras) < 2:
+            return list(self.cameras)
+        frames = 1 + round((len(self.cameras) - 1) * seconds * FRAMES_PER_SECOND)
+        return interpolated(self.cameras, frames)
+
+    def to_json(self, seconds: float) -> str:
+        """The path as JSON that ``polarguide render --path`` reads."""
+        records = [camera_record(camera) for camera in self.path(seconds)]
+        return json.dumps({"frames_per_second": FRAMES_PER_SECOND, "cameras": records})
+
+
+THUMBNAIL = 96  # pixels of the longer side
+# Shares of the cameras' distance: size of a frustum, and distance within which it is hidden.
+SIZE, NEAR = 0.05, 0.4
+COLOR, HELD_OUT_COLOR, BOX_COLOR = (60, 90, 160), (200, 120, 30), (240, 200, 40)
+# The twelve edges of a box whose eight corners are ordered with the last axis fastest.
+EDGES = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A photograph, its thumbnail (uint8 [h, w, 3] RGB), and whether it is held out from training."""
+
+    view: View
+    thumbnail: Picture
+    held_out: bool
+
+
+def photographs(scene: Scene) -> dict[str, Photograph]:
+    """All photographs of a scene, by name of the view."""
+    tests = set(scene.test_names)
+    return {view.name: Photograph(view, _thumbnail(view), view.name in tests) for view in scene.views}
+
+
+def _thumbnail(view: View) -> Picture:
+    picture = view.photograph().numpy()
+    scale = min(1.0, THUMBNAIL / max(picture.shape[:2]))
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return figures.radiance_to_rgb(torch.from_numpy(small))
+
+
+class Frusta:
+    """Clickable camera frusta with their photographs.
+
+    Args:
+        scene: viser's scene handle of one session. photographs: to be shown. scene_frame: of the scene.
+        go: called with a view's name when its frustum is clicked.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        photographs: Sequence[Photograph],
+        scene_frame: SceneFrame,
+        go: Callable[[str], None],
+    ) -> None:
+        self._scene, self._scene_frame = scene, scene_frame
+        self._visible, self._far = True, np.ones(len(photographs), dtype=bool)
+        self._centers = np.array([p.view.camera.center.numpy() for p in photographs]).reshape(-1, 3)
+        self._reach = NEAR * scene_frame.distance
+        self._handles: list[Any] = []
+        for number, photograph in enumerate(photographs):
+            camera, name = photograph.view.camera, photograph.view.name
+            handle = scene.add_camera_frustum(
+                f"/cameras/{number}",
+                fov=2 * math.atan(0.5 * camera.height / camera.fy),
+                aspect=camera.width / camera.height,
+                scale=SIZE * scene_frame.distance,
+                thickness=0.02 * SIZE * scene_frame.distance,
+                color=HELD_OUT_COLOR if photograph.held_out else COLOR,
+                image=photograph.thumbnail,
+                jpeg_quality=80,
+                wxyz=quaternion(camera.rotation.T),
+                position=camera.center.numpy(),
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            handle.on_click(lambda _, name=name: go(name))
+            self._handles.append(handle)
+        self._box: Any = None
+
+    def show(self, visible: bool) -> None:
+        """Show or hide all frusta."""
+        self._visible = visible
+        self._update()
+
+    def hide_near(self, position: np.ndarray | None) -> None:
+        """Hide the frusta near the camera position [3], which would cover the picture; all of them if it is None."""
+        near = True if position is None else np.linalg.norm(self._centers - position, axis=1) < self._reach
+        self._far = ~np.broadcast_to(near, len(self._handles))
+        self._update()
+
+    def _update(self) -> None:
+        for handle, far in zip(self._handles, self._far, strict=True):
+            visible = self._visible and bool(far)
+            if handle.visible != visible:
+                handle.visible = visible
+
+    def show_box(self, crop: Crop | None) -> None:
+        """Draw the crop box, or remove it."""
+        if self._box is not None:
+            self._box.remove()
+            self._box = None
+        if crop is not None:
+            corners = crop.corners(self._scene_frame).numpy()
+            points = np.array([[corners[a], corners[b]] for a, b in EDGES], dtype=np.float32)
+            width = 0.0015 * self._scene_frame.distance
+            self._box = self._scene.add_line_segments("/crop", points, BOX_COLOR, thickness=width)

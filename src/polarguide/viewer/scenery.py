@@ -1,0 +1,310 @@
+"""The scene that a viewer shows, and its pictures as a visitor wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from polarguide.angles.trainer import AngleTrainer
+from polarguide.camera import Camera
+from polarguide.capture import View
+from polarguide.gaussians.gaussians import Gaussians
+from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
+from polarguide.neural.model import FieldModel
+from polarguide.neural.trainer import FieldTrainer
+from polarguide.optics import aolp, dolp, luminance
+from polarguide.presentation import Crop, Presentation, Vector, balanced
+from polarguide.raster.interface import Rasterize
+from polarguide.rendering.picking import SurfacePoint, surface_at
+from polarguide.rendering.relight import RELIT_RESOLUTION, turned_cubemap
+from polarguide.runs.families import AnyTrainer
+from polarguide.runs.opened import OpenedRun
+from polarguide.scene_frame import SceneFrame
+from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
+from polarguide.shading.result import RenderResult
+from polarguide.viewer.cameras import letterbox
+from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture
+from polarguide.visualization.layers import RADIANCE, depth_range, layer_picture
+
+FIELD_SHARE = 4
+"""A field is shown with so many times fewer pixels each way: it takes seconds for a picture of full size."""
+
+
+class Scenery(Protocol):
+    """What a viewer asks for pictures."""
+
+    @property
+    def status(self) -> str:
+        """A line about it."""
+
+    def render(
+        self,
+        camera: Camera,
+        *,
+        depth: bool,
+        surface: bool = False,
+        kept: Callable[[Tensor], Tensor] | None = None,
+        turn: Tensor | None = None,
+    ) -> RenderResult:
+        """All layers, on the CPU: see ``GaussianScenery.render``."""
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianScenery:
+    """Gaussians to be rendered.
+
+    Attributes:
+        gaussians: the Gaussians. light: learned, by name.
+        shading: as it is now. rasterize: of the backend. sh_degree: of the base color.
+        status: a line about it.
+    """
+
+    gaussians: Gaussians
+    light: Light
+    shading: ShadingModel
+    rasterize: Rasterize
+    sh_degree: int
+    status: str
+
+    @torch.no_grad()
+    def render(
+        self,
+        camera: Camera,
+        *,
+        depth: bool,
+        surface: bool = False,
+        kept: Callable[[Tensor], Tensor] | None = None,
+        turn: Tensor | None = None,
+    ) -> RenderResult:
+        """All layers, on the CPU.
+
+        Args:
+            camera: with the size of the picture. depth: whether depth is one of them.
+            surface: whether normals and depth are those of the surface at the pixel's median depth.
+            kept: which places [N, 3] of the scene are shown, [N] bool; None: all.
+            turn: rotation [3, 3] of the light from afar, where it is radiance; None: as learned.
+        """
+        gaussians: Parameters = self.gaussians
+        if kept is not None:
+            inside = kept(self.gaussians["means"].detach())
+            gaussians = {name: self.gaussians[name].detach()[inside] for name in self.gaussians.names}
+        return render(
+            gaussians,
+            camera,
+            self.rasterize,
+            RenderRequest(self.sh_degree, depth=depth, at_median_depth=surface),
+            shading=self.shading,
+            light=self.light if turn is None else self._turned(turn),
+        ).to("cpu")
+
+    def _turned(self, turn: Tensor) -> Light:
+        cubemap = self.shading.radiance_cubemap
+        if cubemap is None:
+            return self.light
+        turned = turned_cubemap(self.light[cubemap.name].detach(), turn, RELIT_RESOLUTION)
+        return {**self.light, cubemap.name: turned}
+
+
+@dataclass(frozen=True, eq=False)
+class FieldScenery:
+    """A field to be rendered, at a quarter of the size. status: a line about it."""
+
+    model: FieldModel
+    status: str
+
+    def render(
+        self,
+        camera: Camera,
+        *,
+        depth: bool,
+        surface: bool = False,
+        kept: Callable[[Tensor], Tensor] | None = None,
+        turn: Tensor | None = None,
+    ) -> RenderResult:
+        """All layers, on the CPU: see ``GaussianScenery.render``. There is no light from afar to be turned."""
+        small = [max(1, size // FIELD_SHARE) for size in (camera.width, camera.height)]
+        view = replace(
+            camera,
+            width=small[0],
+            height=small[1],
+            fx=camera.fx * small[0] / camera.width,
+            fy=camera.fy * small[1] / camera.height,
+            cx=camera.cx * small[0] / camera.width,
+            cy=camera.cy * small[1] / camera.height,
+        )
+        return self.model.render(view, depth=depth, kept=kept).to("cpu").resized(camera.width, camera.height)
+
+
+def run_scenery(run: OpenedRun) -> Scenery:
+    """A trained run."""
+    model = run.model
+    status = f"{run.recipe.name}, {run.steps:,} steps; {model.size}"
+    if isinstance(model, FieldModel):
+        return FieldScenery(model, f"{status}; shown at a quarter of the size")
+    model = run.gaussian_model("view")
+    return GaussianScenery(
+        model.state.gaussians, model.light, model.shading, model.backend.rasterize, 3, status
+    )
+
+
+def training_scenery(trainer: AnyTrainer) -> Scenery:
+    """A training as it is between two steps, Gaussians shaded as in its present stage."""
+    steps = trainer.settings.steps
+    if isinstance(trainer, FieldTrainer):
+        model = FieldModel(trainer.state, trainer.recipe, trainer.state.field.distances.device, trained=False)
+        status = f"{trainer.recipe.name}, step {trainer.state.step:,} of {steps:,}"
+        return FieldScenery(model, f"{status}; shown at a quarter of the size")
+    assert isinstance(trainer, AngleTrainer)
+    state = trainer.state
+    stage = trainer.schedule.at(min(state.step, steps - 1)).stage
+    progress = f"step {state.step:,} of {steps:,} ({stage.name})"
+    status = f"{trainer.recipe.name}, {progress}; {len(state.gaussians):,} Gaussians"
+    return GaussianScenery(
+        state.gaussians,
+        state.light,
+        trainer.shading if stage.reflection else PLAIN,
+        trainer.backend.rasterize,
+        trainer.schedule.sh_degree(min(state.step, steps - 1)),
+        status,
+    )
+
+
+MEASURED = ("photograph", "DoLP", "AoLP", "error")
+"""Layers that only a photograph's pose has."""
+POLARIZED = ("DoLP", "AoLP")
+"""Those of them that need pictures which determine the polarization."""
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What a visitor has chosen.
+
+    Attributes:
+        layer: a name in ``LAYERS`` or ``MEASURED``.
+        exposure: stops by which radiance is brightened.
+        strength: factor on the specular layer.
+        turn: degrees of the far environment, counter-clockwise seen from above.
+        crop: what is shown of the scene; None: all.
+        white_balance: gains of R, G and B on radiance. up_axis: the axis of turning; None: as the cameras say.
+    """
+
+    layer: str = "final"
+    exposure: float = 0.0
+    strength: float = 1.0
+    turn: float = 0.0
+    crop: Crop | None = None
+    white_balance: Vector | None = None
+    up_axis: Vector | None = None
+
+
+class Painter:
+    """Draws a scene as a visitor wants it.
+
+    Args:
+        around: the frame of the scene's cameras.
+    """
+
+    def __init__(self, around: SceneFrame) -> None:
+        self.around = around
+        self._depths: tuple[float, float] | None = None
+
+    def paint(
+        self,
+        scenery: Scenery,
+        camera: Camera,
+        appearance: Appearance,
+        view: View | None = None,
+        *,
+        settled: bool = True,
+    ) -> Picture | None:
+        """A picture.
+
+        Args:
+            scenery: the scene. camera: with the window's size; of the pose alone, where there is a view.
+            appearance: what to draw.
+            view: the photograph at whose pose it is drawn.
+            settled: whether the camera rests; the colors of depths follow the picture only then.
+
+        Returns:
+            uint8 [H, W, 3] of the camera's size; None where there is no such layer.
+        """
+        layer = appearance.layer
+        if layer in MEASURED and (view is None or (layer in POLARIZED and not view.is_determined)):
+            return None
+        size = camera.width, camera.height
+        if view is None:
+            result = self._result(scenery, camera, appearance)
+            return self._layer(result, camera, appearance, settled=settled)
+        place = letterbox(view.camera, size)
+        if layer in MEASURED:
+            return place.apply(self._measured(scenery, view, appearance))
+        camera = place.camera(view.camera)
+        return self._layer(self._result(scenery, camera, appearance), camera, appearance, settled=settled)
+
+    def point(
+        self,
+        scenery: Scenery,
+        camera: Camera,
+        appearance: Appearance,
+        view: View | None,
+        place: tuple[float, float],
+    ) -> SurfacePoint | None:
+        """What is seen at a place of the picture that ``paint`` draws, in shares of its width and height."""
+        if view is not None:
+            camera = letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
+        plain = Appearance(layer="depth", crop=appearance.crop)
+        result = self._result(scenery, camera, plain)
+        return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
+
+    def _result(self, scenery: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
+        crop, turn = appearance.crop, None
+        kept = None if crop is None else lambda means: crop.inside(means, self.around)
+        if appearance.turn % 360:
+            presented = Presentation(up_axis=appearance.up_axis)
+            turn = presented.upright(self.around).turn(appearance.turn)
+        surface = appearance.layer in ("normal", "depth")
+        result = scenery.render(
+            camera, depth=appearance.layer == "depth", surface=surface, kept=kept, turn=turn
+        )
+        if result.specular is None or result.diffuse is None or appearance.strength == 1.0:
+            return result
+        specular = appearance.strength * result.specular
+        return replace(result, specular=specular, final=result.diffuse + specular)
+
+    def _layer(
+        self, result: RenderResult, camera: Camera, appearance: Appearance, *, settled: bool
+    ) -> Picture | None:
+        layer = appearance.layer
+        values: Tensor | None = getattr(result, layer)
+        if values is None:
+            return None
+        if layer in RADIANCE:
+            return figures.radiance_to_rgb(_shown(values, appearance))
+        if layer == "depth" and (settled or self._depths is None):
+            self._depths = depth_range(values, result.alpha > 0.5)
+        return layer_picture(result, layer, camera, self._depths)
+
+    def _measured(self, scenery: Scenery, view: View, appearance: Appearance) -> Picture:
+        """A picture of the photograph's size."""
+        brighter = 2.0**appearance.exposure
+        if appearance.layer == "photograph":
+            return figures.radiance_to_rgb(_shown(view.photograph(), appearance))
+        if appearance.layer == "error":
+            final = self._result(scenery, view.camera, appearance).final
+            return figures.error_to_rgb(final * brighter, view.photograph() * brighter)
+        gray = luminance(view.stokes())
+        if appearance.layer == "DoLP":
+            return figures.dolp_to_rgb(dolp(gray), DOLP_HIGH)
+        return figures.aolp_to_rgb(aolp(gray), dolp(gray) / AOLP_FULL_DOLP)
+
+
+def _shown(radiance: Tensor, appearance: Appearance) -> Tensor:
+    """Radiance [H, W, 3] as bright and as white as wanted, linear."""
+    gains = Presentation(white_balance=appearance.white_balance).gains
+    return balanced(radiance, gains) * 2.0**appearance.exposure
