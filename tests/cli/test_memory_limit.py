@@ -13,7 +13,7 @@ from polarguide.cli.app import run
 from polarguide.runs import families
 from polarguide.runs import forecast as forecasts
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
-from polarguide.runs.memory import MemoryPlan
+from polarguide.runs.forecast import MemoryPlan
 
 SHORT = ("--downscale", "4", "--steps", "30", "--threads", "1")
 

@@ -18,7 +18,7 @@ from polarguide.export.records import harmonics_steps, records
 from polarguide.export.share import BAKED, baked_page, share_page
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.presentation import Presentation
-from polarguide.runs.point_cloud import gaussian_colors
+from polarguide.runs.model import gaussian_colors
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import PLAIN
 

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from polarguide.color import srgb_encode
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import read_ply
-from polarguide.runs.point_cloud import shown_colors, write_run_ply
+from polarguide.runs.model import shown_colors, write_run_ply
 
 COUNT = 7
 FIELDS = {

@@ -14,7 +14,7 @@ from polarguide.export.spz import _half_turned, write_spz
 from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.gaussians.harmonics import sh_basis
 from polarguide.gaussians.ply import read_ply
-from polarguide.runs.point_cloud import write_run_ply
+from polarguide.runs.model import write_run_ply
 
 TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 

@@ -31,9 +31,9 @@ from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.fusion import Surface
 from polarguide.rendering.mesh import RESOLUTION, fused_surface, implicit_surface
 from polarguide.runs.folder import RunLog
+from polarguide.runs.forecast import Stopwatch
 from polarguide.runs.opened import OpenedRun
 from polarguide.system import peak_memory_mib
-from polarguide.training.stopwatch import Stopwatch
 
 MINIMUM_SECONDS = 1.5
 MOST_SECONDS = 40.0

@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
-TRAINED_BY = ("angles/trainer.py", "capture/reader.py", "raster/backends.py", "recipes/__init__.py")
+TRAINED_BY = ("angles/trainer.py", "capture/reader.py", "raster/__init__.py", "recipes/__init__.py")
 """What trains, and what makes its scene, backend and shading: with all that they import, they decide the result."""
 FIELDS_TRAINED_BY = ("neural/trainer.py",)
 """What trains a field beside that."""

@@ -18,7 +18,7 @@ from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.raster import Rasterize
 from polarguide.shading.model import Parameters, ShadingModel
-from polarguide.shading.visibility import outward_directions
+from polarguide.training.actions import outward_directions
 
 OPAQUE = 0.5
 FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [

@@ -21,7 +21,7 @@ from polarguide.camera import Camera
 from polarguide.export.records import TEXEL, planes, records
 from polarguide.gaussians.ply import refit_sh_to_display
 from polarguide.presentation import Presentation
-from polarguide.runs.point_cloud import gaussian_colors
+from polarguide.runs.model import gaussian_colors
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
