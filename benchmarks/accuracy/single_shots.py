@@ -32,7 +32,7 @@ from polarguide.capture import Scene, View
 from polarguide.capture.exposures import analyzers
 from polarguide.evaluation.metrics import psnr
 from polarguide.runs.opened import OpenedRun
-from polarguide.training.partial import behind_analyzer
+from polarguide.training.photometric import behind_analyzer
 
 SAME_PLACE = 0.02
 """Two depths of one place differ by less than this share."""

@@ -18,10 +18,10 @@ from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, recipe_named
-from polarguide.runs.angles import report_polarizers
 from polarguide.runs.defaults import resolve
-from polarguide.training.angle_rules import AngleRules
+from polarguide.runs.families import report_polarizers
 from polarguide.training.checked import refuse_foreign
+from polarguide.training.rules import AngleRules
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 from tests.helpers.heard import Heard

@@ -21,7 +21,7 @@ from polarguide.cli.app import run
 from polarguide.runs import families
 from polarguide.runs import forecast as forecasts
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
-from polarguide.runs.memory import MemoryPlan
+from polarguide.runs.forecast import MemoryPlan
 from polarguide.system import interrupt
 
 PROGRAM = f"{sys.executable} -m polarguide"

@@ -16,7 +16,7 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.presentation import Presentation
 from polarguide.raster import Splats
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.runs.point_cloud import write_run_ply
+from polarguide.runs.model import write_run_ply
 from polarguide.scene_frame import scene_frame
 
 CAMERAS = ring()

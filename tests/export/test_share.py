@@ -17,7 +17,7 @@ from random_runs import KINDS, random_state, ring
 from polarguide.export.share import BAKED, baked_page, harmonics_steps, records, share_page
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.presentation import Presentation
-from polarguide.runs.point_cloud import gaussian_colors
+from polarguide.runs.model import gaussian_colors
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import PLAIN
 

@@ -22,7 +22,7 @@ from polarguide.export.splats import _half_turned, write_sog, write_spz
 from polarguide.gaussians.geometry import quaternions_to_rotations, shortest_axis_normals
 from polarguide.gaussians.harmonics import sh_basis
 from polarguide.gaussians.ply import read_ply, write_ply
-from polarguide.runs.point_cloud import shown_colors, write_run_ply
+from polarguide.runs.model import shown_colors, write_run_ply
 
 COUNT = 7
 FIELDS = {

@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from polarguide.gaussians.densify import Densification, DensityStatistics, densify
-from polarguide.gaussians.free_space import FreeSpace
+from polarguide.gaussians.densify import Densification, DensityStatistics, FreeSpace, densify
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 from polarguide.gaussians.geometry import quaternions_to_rotations
 

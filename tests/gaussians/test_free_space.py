@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from polarguide.camera import Camera
-from polarguide.gaussians.free_space import free_space
+from polarguide.gaussians.densify import free_space
 
 
 def camera(z: float) -> Camera:

@@ -12,7 +12,7 @@ from polarguide import optics
 from polarguide.camera import Camera, look_at
 from polarguide.capture import GroundTruth, Scene, View
 from polarguide.color import srgb_decode
-from polarguide.neural.region import MARGIN
+from polarguide.neural.field import MARGIN
 from polarguide.polarizer import ANGLES
 from polarguide.vectors import unit
 

@@ -9,8 +9,8 @@ from torch.testing import assert_close
 
 from polarguide import _native
 from polarguide.shading.gbuffer import split, split_reference
-from polarguide.shading.layout import Layout
 from polarguide.shading.native import split_native
+from polarguide.shading.result import Layout
 
 HEIGHT, WIDTH, CHANNELS = 40, 61, 11
 SIZE = (HEIGHT, WIDTH)

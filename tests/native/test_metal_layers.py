@@ -12,10 +12,10 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.layout import Layout
 from polarguide.shading.metal import BLUR, MINIMUM_SHARE, where_metal
 from polarguide.shading.model import GBuffer
 from polarguide.shading.native import MetalArguments, reflect_native
+from polarguide.shading.result import Layout
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 32
 MODELS = [

@@ -8,9 +8,9 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.shading.deferred import DeferredShading, reflect_reference
-from polarguide.shading.layout import Layout
 from polarguide.shading.model import GBuffer, ShadingModel
 from polarguide.shading.native import reflect_native, world_rays_native
+from polarguide.shading.result import Layout
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 8
 MODELS = [

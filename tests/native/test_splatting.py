@@ -17,8 +17,8 @@ from polarguide.gaussians.harmonics import SH_C0, evaluate_sh
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Splats
 from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.gbuffer import splatting, splatting_reference
 from polarguide.shading.model import PLAIN, Parameters, ShadingModel, base_colors
-from polarguide.shading.splatting import splatting, splatting_reference
 from polarguide.training.losses import flatness_loss, flatness_loss_reference
 
 TURN = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64))[0]

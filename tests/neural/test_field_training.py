@@ -15,9 +15,9 @@ import polarguide
 from polarguide.capture import Scene
 from polarguide.capture.variants import select_exposures
 from polarguide.errors import PolarguideError
+from polarguide.neural.field import NetworkField
 from polarguide.neural.march import _strata
 from polarguide.neural.model import FieldModel
-from polarguide.neural.networks import NetworkField
 from polarguide.neural.recipe import FieldShape, NeuralRecipe, Sampling
 from polarguide.neural.state import FieldState
 from polarguide.neural.trainer import FieldTrainer

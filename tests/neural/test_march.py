@@ -8,11 +8,9 @@ import pytest
 import torch
 from small_fields import SMALL_SAMPLING, SMALL_SHAPE
 
-from polarguide.neural.field import Field, GridField
+from polarguide.neural.field import Field, GridField, NetworkField, Region
 from polarguide.neural.march import march, section_opacity, trace
-from polarguide.neural.networks import NetworkField
 from polarguide.neural.recipe import FieldShape, Sampling
-from polarguide.neural.region import Region
 
 REGION = Region((0.0, 0.0, 0.0), 1.0, 2.5)
 RADIUS = 0.5 * REGION.radius

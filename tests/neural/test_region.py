@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from textured_ball import DISTANCE, cameras
 
-from polarguide.neural.region import MARGIN, Region
+from polarguide.neural.field import MARGIN, Region
 
 REGION = Region((0.5, -1.0, 2.0), 1.5, 2.6)
 

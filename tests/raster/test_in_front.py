@@ -8,7 +8,7 @@ from raster_scenes import in_view, posed
 
 from polarguide.raster import Splats, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.raster.in_front import alpha_in_front
+from polarguide.raster.surface import alpha_in_front
 
 CAMERA = posed(20, 16)
 

@@ -24,9 +24,8 @@ from polarguide.options import SceneOptions, SessionOptions
 from polarguide.progress import SILENT
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.runs.health import HEALTH, Evidence, Health, Limits, examine, warnings_of
+from polarguide.runs.health import HEALTH, Evidence, Health, Limits, Polarization, examine, warnings_of
 from polarguide.runs.model import GaussianModel
-from polarguide.runs.polarization import Polarization
 from polarguide.shading.result import RenderResult
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState

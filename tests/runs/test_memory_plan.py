@@ -20,10 +20,9 @@ from polarguide.options import Exposures, SceneOptions, gibibytes
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs import forecast as forecasts
-from polarguide.runs import memory
 from polarguide.runs import train as training
 from polarguide.runs.defaults import MOST_GAUSSIANS, resolve
-from polarguide.runs.memory import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
+from polarguide.runs.forecast import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.flat import Flat
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
 
@@ -44,7 +43,7 @@ def least(pixels: list[int], gaussians: int) -> float:
 
 
 def test_the_least_that_is_named_suffices_and_less_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(forecasts, "resident_memory", lambda: 400_000_000)
     for pixels, gaussians in ((SMALL, 100_000), (LARGE, 50_000), (LARGE, MOST_GAUSSIANS)):
         size = least(pixels, gaussians)
         plan = plan_memory(pixels, STOKES, gaussians, limit=size)
@@ -54,7 +53,7 @@ def test_the_least_that_is_named_suffices_and_less_does_not(monkeypatch: pytest.
 
 
 def test_pictures_leave_memory_before_targets_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(forecasts, "resident_memory", lambda: 400_000_000)
     plans = [plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=limit) for limit in (3.7, 5.0, 8.0, 30.0)]
     assert not plans[0].hold
     assert plans[-1] == MemoryPlan(True, None, plans[-1].peak)
@@ -65,10 +64,10 @@ def test_pictures_leave_memory_before_targets_do(monkeypatch: pytest.MonkeyPatch
 
 
 def test_without_a_limit_what_is_free_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
-    monkeypatch.setattr(memory, "free_memory", lambda: 10**9)
+    monkeypatch.setattr(forecasts, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(forecasts, "free_memory", lambda: 10**9)
     assert not plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).hold
-    monkeypatch.setattr(memory, "free_memory", lambda: None)
+    monkeypatch.setattr(forecasts, "free_memory", lambda: None)
     assert plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).kept is None
 
 
@@ -170,7 +169,7 @@ def test_options_take_a_limit() -> None:
 
 
 def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(forecasts, "resident_memory", lambda: 400_000_000)
     field = RECIPES["gnerp"]
     assert isinstance(field, NeuralRecipe)
     learned = 4 * field.numbers

@@ -18,7 +18,7 @@ from polarguide.runs import train as training
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.train import TrainingStopped
 from polarguide.system import MemoryBound
-from polarguide.training.schedule import Schedule
+from polarguide.training.recipe import Schedule
 from polarguide.training.settings import TrainSettings
 
 READING = SceneOptions(downscale=4)

@@ -16,8 +16,8 @@ from polarguide.raster import Rasterize, ScreenStatistic, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import DeferredShading, local_light, reflect_reference
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.layout import COLOR_CHANNELS
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, base_colors, mirrored
+from polarguide.shading.result import COLOR_CHANNELS
 
 COUNT, RESOLUTION = 30, 8
 LERP, FRESNEL = DeferredShading("lerp"), DeferredShading("fresnel")

@@ -13,11 +13,11 @@ from torch.testing import assert_close
 
 from polarguide.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.shading.cubemap import box_mips, mip_lookup
 from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.layout import Layout
-from polarguide.shading.mips import box_mips, mip_lookup
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, GBuffer, harmonic_colors, mirrored
+from polarguide.shading.result import Layout
 
 SHADING = DirectionalShading(width=8, environment_resolution=8, environment_spread=1.0)
 LAYOUT = Layout({"color": 3, "normal": 3, "roughness": 1, "feature": FEATURES, "surface": 1})

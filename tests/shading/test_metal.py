@@ -20,20 +20,22 @@ from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
 from polarguide.gaussians.ply import read_ply
 from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.runs.point_cloud import shown_colors, write_run_ply
-from polarguide.shading.conversion import convert, mirror_base, scale_light, spread_directions
+from polarguide.runs.model import shown_colors, write_run_ply
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.layout import Layout
 from polarguide.shading.metal import (
     FIRST_ROUGHNESS,
     any_nonzero,
+    convert,
     metal_pixels,
+    mirror_base,
     reflectance,
     reflectance_logits,
+    scale_light,
+    spread_directions,
 )
 from polarguide.shading.model import mirrored
-from polarguide.shading.result import RenderResult
+from polarguide.shading.result import Layout, RenderResult
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
 
 RESOLUTION = 8

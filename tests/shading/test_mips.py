@@ -8,8 +8,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide import _native
-from polarguide.shading.cubemap import cubemap_lookup_reference
-from polarguide.shading.mips import box_mips, mip_lookup, mip_lookup_reference
+from polarguide.shading.cubemap import box_mips, cubemap_lookup_reference, mip_lookup, mip_lookup_reference
 
 LEVELS = 5  # of resolution 8: 8, 4, 2, 1, and the mean
 

@@ -13,10 +13,9 @@ from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
 from polarguide.runs.defaults import resolve
-from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.gbuffer import RenderRequest, render, splatting
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
-from polarguide.shading.splatting import splatting
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer
 

@@ -27,7 +27,7 @@ from polarguide.recipes import ablations_of, recipe_named
 from polarguide.rendering.relight import needs_radiance
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
-from polarguide.runs.point_cloud import write_run_ply
+from polarguide.runs.model import write_run_ply
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import LAYERS, RenderResult

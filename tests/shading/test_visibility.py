@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 
 from polarguide.capture import Scene
 from polarguide.raster import choose_backend
-from polarguide.shading.visibility import outward_directions
+from polarguide.training.actions import outward_directions
 
 
 def test_a_wall_is_seen_from_the_side_of_the_cameras_and_what_is_behind_it_is_not(tiny_scene: Scene) -> None:

@@ -12,7 +12,7 @@ from polarguide.errors import PolarguideError
 from polarguide.raster import Backend, choose_backend, rasterize_reference
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
-from polarguide.shading.visibility import LEAST_PIXELS, touched_pixels
+from polarguide.training.actions import LEAST_PIXELS, touched_pixels
 from polarguide.training.losses import Weights, coverage_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
@@ -109,7 +109,7 @@ def test_a_step_is_pulled_to_emptiness_where_the_background_is_black(black_scene
 
 def summed_weights(made: Trainer, number: int) -> list[float]:
     """What one Gaussian adds to each training view, by pictures with it white among black ones."""
-    from polarguide.shading.splatting import splats
+    from polarguide.shading.gbuffer import splats
 
     given = splats(made.state.gaussians)
     features = torch.zeros(len(given.means), 1)

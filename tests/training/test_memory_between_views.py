@@ -11,12 +11,12 @@ import torch
 
 from polarguide.capture import View
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.shading.visibility import outward_directions
 from polarguide.system import MemoryBound
 from polarguide.training import flat
+from polarguide.training.actions import outward_directions
 from polarguide.training.metals.evidence import evidence
-from polarguide.training.metals.rules import MetalRules
-from polarguide.training.metals.words import contradicted, said_by
+from polarguide.training.metals.observations import contradicted, said_by
+from polarguide.training.rules import MetalRules
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
 
 RULES = MetalRules()

@@ -15,10 +15,10 @@ from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.shading.metal import any_nonzero
-from polarguide.training.metals.decision import decide
 from polarguide.training.metals.evidence import evidence
-from polarguide.training.metals.rules import MetalRules
-from polarguide.training.metals.words import contradicted, said_by
+from polarguide.training.metals.observations import contradicted, said_by
+from polarguide.training.metals.search import decide
+from polarguide.training.rules import MetalRules
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer, warn_of_unused_materials
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of

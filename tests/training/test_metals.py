@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.training.metals.decision import decide
-from polarguide.training.metals.evidence import Evidence, evidence
-from polarguide.training.metals.explanations import residuals
-from polarguide.training.metals.looks import Seen
-from polarguide.training.metals.rules import MetalRules
+from polarguide.training.metals.evidence import Evidence, evidence, residuals
+from polarguide.training.metals.observations import Seen
+from polarguide.training.metals.search import decide
+from polarguide.training.rules import MetalRules
 from tests.helpers.metal_balls import BODIES, METALS, gaussians_of_the_ball, measured, views_of
 
 RULES = MetalRules()

@@ -18,8 +18,7 @@ from polarguide.optics import Mount
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult
 from polarguide.training.losses import Weights, step_loss
-from polarguide.training.partial import partial_terms
-from polarguide.training.photometric import photometric_loss
+from polarguide.training.photometric import partial_terms, photometric_loss
 from polarguide.training.targets import PartialView, Step, StepTargets
 
 SIZE = (12, 14)

@@ -23,7 +23,7 @@ from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CHECKPOINT
 from polarguide.runs.train import TrainingStopped
 from polarguide.training.feed import Feed
-from polarguide.training.indices import index_offsets, index_picture
+from polarguide.training.metals.observations import index_offsets, index_picture
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.view_store import ViewStore

@@ -10,8 +10,7 @@ import pytest
 
 from polarguide.errors import PolarguideError
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
-from polarguide.training.recipe import Recipe, Repeat, Rounds, Stage
-from polarguide.training.schedule import Schedule
+from polarguide.training.recipe import Recipe, Repeat, Rounds, Schedule, Stage
 
 OF_GAUSSIANS = {name: recipe for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)}
 EVERY_RECIPE = pytest.mark.parametrize("recipe", OF_GAUSSIANS.values(), ids=OF_GAUSSIANS.keys())

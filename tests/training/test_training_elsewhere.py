@@ -16,7 +16,7 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
-from polarguide.runs.point_cloud import write_run_ply
+from polarguide.runs.model import write_run_ply
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer

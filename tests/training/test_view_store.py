@@ -14,20 +14,20 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.training import view_store
-from polarguide.training.packing import (
+from polarguide.training.priors import view_priors
+from polarguide.training.recipe import Recipe, Weights
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
+from polarguide.training.view_store import (
     Entry,
     Packed,
+    ViewStore,
     holds,
     pack_priors,
     packed,
     unpack_priors,
     unpacked,
 )
-from polarguide.training.priors import view_priors
-from polarguide.training.recipe import Recipe, Weights
-from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
-from polarguide.training.view_store import ViewStore
 
 STEPS, STOP = 24, 13
 

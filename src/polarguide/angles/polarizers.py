@@ -16,8 +16,8 @@ from polarguide.angles.fit import fit_angle
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
-from polarguide.training.angle_rules import AngleRules
 from polarguide.training.recipe import Recipe
+from polarguide.training.rules import AngleRules
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import ANGLE_COLUMNS
 

@@ -16,8 +16,7 @@ from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import ShadingModel
 from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.distributed import ALONE, Ranks
-from polarguide.training.recipe import Recipe
-from polarguide.training.schedule import Schedule
+from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer

@@ -31,9 +31,9 @@ from polarguide.optics import Mount
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.mesh import RESOLUTION, Surface, fused_surface, implicit_surface
 from polarguide.runs.folder import RunLog
+from polarguide.runs.forecast import Stopwatch
 from polarguide.runs.opened import OpenedRun
 from polarguide.system import peak_memory_mib
-from polarguide.training.stopwatch import Stopwatch
 
 
 @torch.no_grad()

@@ -34,9 +34,8 @@ from polarguide.presentation import balanced
 from polarguide.progress import SILENT, Reporter
 from polarguide.rendering.mesh import RESOLUTION, ColoredMesh, implicit_mesh, scene_mesh
 from polarguide.rendering.relight import needs_radiance, panorama, write_exr
-from polarguide.runs.model import GaussianModel
+from polarguide.runs.model import GaussianModel, write_run_ply
 from polarguide.runs.opened import OpenedRun
-from polarguide.runs.point_cloud import write_run_ply
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import Parameters
 from polarguide.shading.result import RenderResult

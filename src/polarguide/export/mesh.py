@@ -30,7 +30,7 @@ from polarguide.raster import Rasterize
 from polarguide.rendering.mesh import ColoredMesh
 from polarguide.scene_frame import SceneFrame
 from polarguide.shading.model import Parameters, ShadingModel
-from polarguide.shading.visibility import outward_directions
+from polarguide.training.actions import outward_directions
 
 
 def write_mesh(

@@ -20,7 +20,7 @@ from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display
 from polarguide.presentation import Presentation
 from polarguide.raster.interface import MINIMUM_ALPHA
-from polarguide.runs.point_cloud import gaussian_colors
+from polarguide.runs.model import gaussian_colors
 from polarguide.scene_frame import scene_frame
 from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel

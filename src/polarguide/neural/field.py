@@ -1,20 +1,103 @@
-"""A field: signed distance, color and what lies behind, with what rays through it need."""
+"""A field: signed distance, color and background, in the region that the cameras surround.
+
+``GridField`` has dense grids. ``NetworkField`` has the networks of the publication: distance 8 x 256, radiance 4 x 256
+(GNeRP after NeuS; initialization of Gropp et al. 2020). It is meant for a GPU: a step differentiates the distance
+twice.
+"""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from statistics import median
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, softplus
 
+from polarguide.camera import Camera
 from polarguide.neural.grids import FeatureGrids, SmoothGrids, spline_matrix
 from polarguide.neural.recipe import FieldShape
-from polarguide.neural.region import Region
+from polarguide.scene_frame import scene_frame
+
+MARGIN = 1.02
+
+
+@dataclass(frozen=True)
+class Region:
+    """The sphere around what the cameras look at in which they stand, and the unit of lengths in it.
+
+    Attributes:
+        center: [3] in the world. unit: half the side of the middle cube, in world units: half of what a picture shows
+            across at the center. Within the cube, grids have their full resolution.
+        radius: of the sphere, in this unit, at least 1.
+    """
+
+    center: tuple[float, float, float]
+    unit: float
+    radius: float
+
+    @classmethod
+    def around(cls, cameras: Sequence[Camera]) -> Region:
+        """Of the cameras of a training. The unit is the median over them."""
+        frame = scene_frame(cameras)
+        unit = median(
+            float((camera.center - frame.center).norm()) * camera.width / (2 * camera.fx)
+            for camera in cameras
+        )
+        farthest = max(float((camera.center - frame.center).norm()) for camera in cameras)
+        x, y, z = frame.center.tolist()
+        return cls((x, y, z), unit, max(1.0, MARGIN * farthest / unit))
+
+    def first_radius(self, wanted: float) -> float:
+        """Of the sphere that a surface starts as: what is wanted, but no camera stands near it or in it."""
+        return min(wanted, 0.5 * self.radius)
+
+    def inner(self, points: Tensor) -> Tensor:
+        """World points [..., 3] in the field's own coordinates."""
+        return (points - points.new_tensor(self.center)) / self.unit
+
+    def world(self, inner: Tensor) -> Tensor:
+        """The inverse of ``inner``."""
+        return inner * self.unit + inner.new_tensor(self.center)
+
+    def cube(self, inner: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the grids hold a place, in [-1, 1]^3, and its derivative along each axis, both [..., 3].
+
+        Each axis goes on as ``2 - 1/x`` beyond 1 (the contraction of Mip-NeRF 360, Barron et al. 2022, axis by axis,
+        so that slopes are turned into the field's coordinates axis by axis, too).
+        """
+        size = inner.abs()
+        outside = size.clamp(min=1)
+        end = 2 - 1 / self.radius
+        place = torch.where(size > 1, inner.sign() * (2 - 1 / outside), inner) / end
+        return place, 1 / (outside * outside * end)
+
+    def places(self, cube: Tensor) -> Tensor:
+        """The inverse of ``cube``, along each axis by itself: coordinates [...] of places in the grids."""
+        along = cube * (2 - 1 / self.radius)
+        return torch.where(along.abs() > 1, along.sign() / (2 - along.abs()), along)
+
+    def surroundings(self, inner: Tensor) -> Tensor:
+        """Where the grids of the background hold places beyond the sphere [..., 3]: in a ball of radius 1."""
+        distance = inner.norm(dim=-1, keepdim=True).clamp(min=self.radius)
+        return inner / distance * (1 - 0.5 * self.radius / distance)
+
+    def span(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Where rays enter and leave the sphere, [N] each; equal where they miss it.
+
+        Args:
+            origin: [N, 3] in the field's own coordinates. direction: [N, 3] unit.
+        """
+        middle = -(origin * direction).sum(dim=-1)
+        half = (self.radius**2 - (origin * origin).sum(dim=-1) + middle**2).clamp(min=0).sqrt()
+        begin = (middle - half).clamp(min=0)
+        return begin, (middle + half).clamp(min=begin)
+
 
 SHARPENING = 10.0
 """The sharpness is exp(10 v) of what is learned, so that it can grow as far as it has to (NeuS, Wang et al. 2021)."""
@@ -178,3 +261,85 @@ def encoded_directions(directions: Tensor) -> Tensor:
 def direction_width() -> int:
     """How many numbers ``encoded_directions`` makes of a direction."""
     return 3 * (1 + 2 * FREQUENCIES)
+
+
+DEPTH, WIDTH, SKIP = 8, 256, 4
+PLACE_FREQUENCIES = 8
+SOFTNESS = 100.0
+CHUNK = 1 << 16
+
+
+class NetworkField(Field):
+    """Distances of a network of places with a skip connection, colors of another one.
+
+    Args:
+        region: where it lies. shape: of what it is made. generator: first values are drawn from.
+    """
+
+    map_side = 65
+
+    def __init__(self, region: Region, shape: FieldShape, generator: torch.Generator) -> None:
+        super().__init__(region, shape, generator)
+        self.layers = _distance_layers(region.first_radius(shape.first_radius) / region.radius, generator)
+        radiance = (WIDTH + 3 + 3 + direction_width(), *[WIDTH] * 4, 3)
+        self.head = network(radiance, generator)
+        self.map_distances()
+
+    def geometry(self, places: Tensor) -> Geometry:
+        """See ``Field``."""
+        learns = torch.is_grad_enabled()
+        with torch.enable_grad():
+            given = places.detach().requires_grad_()
+            found = self._distance(given)
+            (slope,) = torch.autograd.grad(found[:, 0].sum(), given, create_graph=learns, retain_graph=True)
+        return Geometry(found[:, 0], slope, found[:, 1:])
+
+    def color(self, places: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
+        """See ``Field``."""
+        seen = self.direction_share * encoded_directions(directions)
+        given = torch.cat((features, places / self.region.radius, normals, seen), dim=-1)
+        color: Tensor = torch.sigmoid(self.head(given))
+        return color
+
+    @torch.no_grad()
+    def lattice(self, axes: Sequence[Tensor]) -> Tensor:
+        """See ``Field``."""
+        places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+        found = [self._distance(part)[:, 0] for part in places.view(-1, 3).split(CHUNK)]
+        return torch.cat(found).view(places.shape[:-1])
+
+    def _distance(self, places: Tensor) -> Tensor:
+        """Distance and features [N, 1 + WIDTH] at places [N, 3], in the sphere of radius 1 that the network knows."""
+        given = encoded(places / self.region.radius, PLACE_FREQUENCIES)
+        found = given
+        for k, layer in enumerate(self.layers):
+            if k == SKIP:
+                found = torch.cat((found, given), dim=-1) / math.sqrt(2)
+            found = layer(found)
+            if k < DEPTH:
+                found = softplus(found, SOFTNESS)
+        return torch.cat((self.region.radius * found[:, :1], found[:, 1:]), dim=-1)
+
+
+def _distance_layers(radius: float, generator: torch.Generator) -> nn.ModuleList:
+    """Layers that begin as the distance of a sphere (Gropp et al. 2020): positive outside."""
+    given = 3 * (1 + 2 * PLACE_FREQUENCIES)
+    layers = []
+    for k in range(DEPTH + 1):
+        inputs = given if k == 0 else WIDTH
+        outputs = WIDTH + 1 if k == DEPTH else WIDTH - given if k + 1 == SKIP else WIDTH
+        layer = nn.Linear(inputs, outputs)
+        with torch.no_grad():
+            noise = torch.randn(outputs, inputs, generator=generator)
+            if k == DEPTH:
+                layer.weight.copy_(math.sqrt(math.pi / inputs) + 1e-4 * noise)
+                layer.bias.fill_(-radius)
+            else:
+                layer.weight.copy_(noise * math.sqrt(2 / outputs))
+                layer.bias.zero_()
+                if k == 0:
+                    layer.weight[:, 3:] = 0
+                elif k == SKIP:
+                    layer.weight[:, -(given - 3) :] = 0
+        layers.append(layer)
+    return nn.ModuleList(layers)

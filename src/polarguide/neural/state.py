@@ -9,10 +9,8 @@ import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
-from polarguide.neural.field import Field, GridField
-from polarguide.neural.networks import NetworkField
+from polarguide.neural.field import Field, GridField, NetworkField, Region
 from polarguide.neural.recipe import NeuralRecipe
-from polarguide.neural.region import Region
 from polarguide.training.state import seeded
 
 KINDS: dict[str, type[Field]] = {"grids": GridField, "networks": NetworkField}

@@ -1,25 +1,64 @@
-"""The loop that trains a field: one view a step, some hundred rays of it."""
+"""The loop that trains a field: one view a step, some hundred rays of it, compared with color, DoLP and AoLP."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from polarguide.camera import Camera
 from polarguide.capture import Scene, View
+from polarguide.color import srgb_encode
 from polarguide.neural import losses
 from polarguide.neural.march import Marched, march
 from polarguide.neural.recipe import NeuralRecipe
 from polarguide.neural.state import FieldState
-from polarguide.neural.targets import Target, target_of
+from polarguide.optics import aolp, dolp, luminance
 from polarguide.shading.model import PLAIN, ShadingModel
 from polarguide.training.distributed import ALONE
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import seeded
-from polarguide.training.view_store import ViewStore
+from polarguide.training.view_store import Entry, Packed, ViewStore, packed, unpacked
 from polarguide.vectors import unit
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Of one view, row by row: P = H W pixels.
+
+    Attributes:
+        picture: shown colors [P, 3]. dolp: [P] in [0, 1], 0 where nothing is known of the polarization.
+        aolp: [P] radians in [0, pi), in the lens frame. valid: numbers of the pixels that count, [V].
+    """
+
+    picture: Tensor
+    dolp: Tensor
+    aolp: Tensor
+    valid: Tensor
+
+
+def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
+    """What a view is compared with, made once and kept as two bytes a value."""
+
+    def make() -> Entry:
+        entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
+        if bool(view.invalid.any()):
+            entry["valid"] = Packed((~view.invalid).to(device))
+        if view.is_determined:
+            gray = luminance(view.stokes())
+            known = dolp(gray) * ~(view.saturated | view.invalid)
+            entry["dolp"], entry["aolp"] = packed(known.to(device)), packed(aolp(gray).to(device))
+        return entry
+
+    kept = store.get("target", view.name, make)
+    picture = unpacked(kept["picture"]).view(-1, 3)
+    nothing = torch.zeros(len(picture), device=device)
+    degree, angle = (unpacked(kept[name]).flatten() if name in kept else nothing for name in ("dolp", "aolp"))
+    valid = kept["valid"].codes.flatten() if "valid" in kept else nothing == 0
+    return Target(picture, degree, torch.remainder(angle, torch.pi), valid.nonzero()[:, 0])
+
 
 MAP_EVERY = 16
 """Steps after which the map of distances is brought up to date."""

@@ -1,4 +1,4 @@
-"""What differs between trainings of Gaussians and of fields, for whoever trains or opens a run."""
+"""What differs between trainings of Gaussians and of fields: memory, trainer, model, files, and what is examined."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import Any, Protocol
 
 import torch
 
-from polarguide.angles.polarizers import predicts_filters
+from polarguide.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene
+from polarguide.capture.exposures import TABLE, Exposure, table_text
+from polarguide.capture.layout import find_layout
+from polarguide.capture.view import listed
 from polarguide.errors import PolarguideError
+from polarguide.files import write_text
 from polarguide.neural.model import FieldModel
 from polarguide.neural.recipe import NeuralRecipe
 from polarguide.neural.trainer import FieldTrainer
 from polarguide.progress import Reporter
 from polarguide.raster import Backend
-from polarguide.runs.angles import report_polarizers
 from polarguide.runs.folder import CHECKPOINT, PLY, AnyState
-from polarguide.runs.forecast import Forecast, forecast
-from polarguide.runs.health import Evidence
-from polarguide.runs.memory import MemoryPlan, plan_field_memory, plan_memory
-from polarguide.runs.model import GaussianModel, Model
-from polarguide.runs.point_cloud import write_run_ply
-from polarguide.runs.polarization import Polarization
+from polarguide.runs.forecast import Forecast, MemoryPlan, forecast, plan_field_memory, plan_memory
+from polarguide.runs.health import Evidence, Polarization
+from polarguide.runs.model import GaussianModel, Model, write_run_ply
 from polarguide.shading.model import ShadingModel
 from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
@@ -33,6 +33,95 @@ from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.trainer import warn_of_unused_materials
 from polarguide.training.view_store import ViewStore
+
+ANY = 90.0
+"""Degrees: as far as two angles can be apart."""
+
+
+def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter: Reporter) -> None:
+    """Write ``angles.csv``, which can take the place of the scene's own, and name what is doubtful.
+
+    Args:
+        out: the run folder. scene: the capture. polarizers: as the training leaves them.
+        reporter: told a summary, and warned of pictures that contradict what is said of them.
+    """
+    judgments = polarizers.judgments()
+    if not judgments:
+        return
+    names = picture_names(scene)
+    of = {(judgment.view, judgment.number): judgment for judgment in judgments}
+    lines: list[tuple[str, str, Exposure, float | None, str]] = []
+    for view in scene.views:
+        for number, exposure in enumerate(view.exposures):
+            file, found = names[view.name][number], of.get((view.name, number))
+            if found is None:
+                lines.append((file, view.name, exposure, None, ""))
+                continue
+            note = "doubtful" if found.doubtful and not found.said.known else ""
+            lines.append((file, view.name, found.believed, found.modulation, note))
+    write_text(out / TABLE, table_text(lines))
+
+    def named(chosen: Sequence[Judgment]) -> str:
+        return f"{len(chosen)} of {len(judgments)} pictures ({listed([_name(names, j) for j in chosen])})"
+
+    sought = [judgment for judgment in judgments if not judgment.said.known]
+    if sought:
+        fitted = sum(judgment.believed.angle is not None for judgment in sought)
+        doubtful = sum(judgment.doubtful for judgment in sought)
+        reporter.say(
+            f"angles found for {fitted} of {len(sought)} pictures; {doubtful} of {len(sought)} are doubtful: "
+            f"{out / TABLE}"
+        )
+        if 2 * doubtful > len(sought):
+            reporter.warn(f"Most angles are doubtful, and so are the layers and normals. {REMEDY}")
+    vague = [judgment for judgment in sought if judgment.vague]
+    if guessed := [judgment for judgment in vague if judgment.guesses]:
+        reporter.warn(f"{named(guessed)} hardly tell their angle: the likeliest one is taken.")
+    if lost := [judgment for judgment in vague if not judgment.guesses]:
+        reporter.warn(f"{named(lost)} do not tell their angle and are taken for photographs.")
+    if unsettled := [judgment for judgment in sought if judgment.unsettled]:
+        reporter.warn(
+            f"{named(unsettled)} may be at another angle: the fits of the training do not agree on it."
+        )
+    if poor := [judgment for judgment in sought if judgment.poorly_explained and not judgment.unsettled]:
+        reporter.warn(
+            f"{named(poor)} may be at another angle: the scene explains them worse than the others, and hardly better "
+            "than a filter turned by 90 degrees would."
+        )
+    if plain := [judgment for judgment in judgments if judgment.unfiltered]:
+        reporter.warn(
+            f"{named(plain)} look as if taken without a filter, or through a circular one mounted the wrong way round."
+        )
+    known = [judgment for judgment in judgments if judgment.said.angle is not None]
+    if known and all(judgment.limit >= ANY for judgment in known):
+        reporter.say(
+            f"known angles were not checked: the model predicts polarization too poorly (pictures look "
+            f"{known[0].usual:.0f} degrees off in the median). polarguide inspect {scene.root} checks them by itself."
+        )
+    if wrong := [judgment for judgment in judgments if judgment.contradicts]:
+        first = wrong[0]
+        reporter.warn(
+            f"{named(wrong)} contradict their angles: {_name(names, first)} is specified at "
+            f"{first.said.words} degrees and looks as if at {first.angle:.0f}. Correct angles.csv."
+        )
+
+
+def picture_names(scene: Scene) -> dict[str, list[str]]:
+    """The files of each view's pictures; where the scene was not read from such files, the view and a number."""
+    try:
+        layout = find_layout(scene.root)
+    except PolarguideError:
+        layout = None
+    names = {}
+    for view in scene.views:
+        names[view.name] = [f"{view.name}#{number}" for number in range(len(view.exposures))]
+        if layout is not None and view.name in layout.names and layout.exposures(view.name) == view.exposures:
+            names[view.name] = [path.name for path in layout.files(view.name)]
+    return names
+
+
+def _name(names: dict[str, list[str]], judgment: Judgment) -> str:
+    return names[judgment.view][judgment.number]
 
 
 class AnyTrainer(Protocol):

@@ -1,23 +1,194 @@
-"""What a training will take, measured in a few steps of each of its stages, and what it took in the end."""
+"""Memory and time of a training: planned from headers, estimated from a few steps of each stage, and measured."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 
 from polarguide.angles.polarizers import Polarizers, search_steps
 from polarguide.capture import Scene
+from polarguide.capture.layout import find_layout, select_views
+from polarguide.capture.memory import GIBIBYTE, KEPT, MASKS, READ, SHARE, stated_pixels
+from polarguide.errors import PolarguideError
+from polarguide.neural.recipe import NeuralRecipe
 from polarguide.raster import Backend
-from polarguide.runs.memory import in_gigabytes
-from polarguide.system import MEBIBYTE, peak_memory_mib
+from polarguide.system import MEBIBYTE, free_memory, machine_busy_seconds, peak_memory_mib, resident_memory
 from polarguide.training.feed import coarse_steps
-from polarguide.training.recipe import Recipe
-from polarguide.training.schedule import Schedule
+from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import Trainer
+
+GIGABYTE = 10**9
+# Estimates by the tensors that there are: one training (24 steps, 1224 x 1024 x 60, 4 GB) took 12 % less than they say.
+# benchmarks/speed/memory.py measures.
+PROCESS = 250_000_000
+"""Bytes that a process takes beside what it holds before training: of libraries, and what the allocator splits."""
+STEP = 780
+"""Bytes a pixel of a step: targets, G-buffer, layers, terms, and their gradients."""
+PRIORS = 900
+"""Bytes a pixel while the priors of a view are computed."""
+PRIORS_KEPT, SHOWN_KEPT, UNGUIDED_KEPT = 44, 8, 13
+"""Bytes a pixel of what is kept of a view: targets, photograph with masks, and what of the targets needs no guide."""
+COPIES, WRITTEN = 5, 4
+"""Of a Gaussian's parameters: values, gradients, two moments, frozen; and those in the file that is written."""
+SPLAT = 600
+"""Bytes a Gaussian of what a rasterizer makes of it."""
+FILLED = 0.88
+"""Of a limit, up to which views are kept in memory; the rest is for gaps between what is used."""
+FIELD_COPIES = 5
+"""Of what a field learns: values, gradients, two moments, and those in the file that is written."""
+SAMPLE, READ_VIEW, TARGET_KEPT = 14_000, 60, 10
+"""Bytes a sample of a field's step, a pixel of the view it looks at, and a pixel of what is kept of each view."""
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """How a training stays within its memory.
+
+    Attributes:
+        hold: whether the pictures stay in memory; otherwise views decode theirs again.
+        kept: bytes of what is kept of the views in memory, the rest lies in a file; None: all stays in memory.
+        peak: bytes that the process takes at most.
+    """
+
+    hold: bool
+    kept: int | None
+    peak: int
+
+
+def plan_memory(
+    pixels: Sequence[int], recipe: Recipe, gaussians: int, *, limit: float | None, held: bool = False
+) -> MemoryPlan:
+    """Share out memory among a training's step, its Gaussians and its views.
+
+    Args:
+        pixels: of each view as it is trained on. recipe: the method. gaussians: most that there may be.
+        limit: GiB that the process may take; None: what is free, but a fifth.
+        held: whether the pictures are in memory already.
+
+    Raises:
+        PolarguideError: a limit that was given is too small; the message has the least that suffices.
+    """
+    largest = max(pixels, default=0)
+    floats = sum(math.prod(shape) for shape in recipe.shapes.values())
+    guided = any(stage.weights.priors for stage in recipe.stages)
+    of_view = SHOWN_KEPT + (PRIORS_KEPT + UNGUIDED_KEPT if guided else 0)
+    step = (max(STEP, PRIORS) if guided else STEP) * largest + SPLAT * gaussians
+    own = PROCESS + 4 * floats * COPIES * gaussians + max(step, 4 * floats * WRITTEN * gaussians)
+    what = f" and up to {gaussians:,} Gaussians"
+    return _shared(pixels, own, of_view, limit, held, what, "fewer --gaussians, or ")
+
+
+def plan_field_memory(
+    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, held: bool = False
+) -> MemoryPlan:
+    """The same for a field: ``plan_memory``."""
+    largest = max(pixels, default=0)
+    own = PROCESS + 4 * recipe.numbers * FIELD_COPIES + SAMPLE * recipe.sampling.samples + READ_VIEW * largest
+    return _shared(pixels, own, TARGET_KEPT, limit, held, "", "")
+
+
+def _shared(
+    pixels: Sequence[int], own: int, of_view: int, limit: float | None, held: bool, what: str, less: str
+) -> MemoryPlan:
+    """Share out memory: ``own`` is what a training takes beside its views, ``of_view`` a pixel of what it keeps of
+    them.
+
+    Raises:
+        PolarguideError: a limit that was given is too small; ``what`` it is for beside pictures, ``less`` helps, too.
+    """
+    largest, total = max(pixels, default=0), sum(pixels)
+    now = resident_memory() or 0
+    work = now + own
+    pictures = 0 if held else (KEPT - MASKS) * total
+    masks = 0 if held else (MASKS - 3) * total
+    # The photograph of one view, decoded again, and its targets.
+    least = work + masks + (KEPT + of_view) * largest
+    least = max(least, now + PROCESS + MASKS * total + 4 * READ * largest)
+    whole = work + masks + pictures + of_view * total
+    if limit is not None:
+        allowed = int(limit * GIBIBYTE)
+        if allowed < least:
+            raise too_little(least, allowed, what, less)
+    else:
+        free = free_memory()
+        if free is None:
+            return MemoryPlan(True, None, whole)
+        allowed = now + int(SHARE * free)
+    if whole <= allowed:
+        return MemoryPlan(True, None, whole)
+    filled = int(FILLED * allowed)
+    hold = held or (work + masks + pictures + of_view * largest <= filled and of_view * total <= pictures)
+    room = filled - work - masks - (pictures if hold and not held else KEPT * largest)
+    return MemoryPlan(hold, max(0, room), max(least, min(allowed, whole)))
+
+
+def pixels_of(folder: Path, downscale: int) -> list[int]:
+    """Pixels of each view of a scene at the size that is trained on, as the headers of its files state.
+
+    Raises:
+        PolarguideError: it is no scene.
+    """
+    layout = find_layout(folder)
+    return [count // downscale**2 for count in stated_pixels(layout, select_views(layout, None))]
+
+
+def too_little(least: int, allowed: int, what: str, less: str) -> PolarguideError:
+    """The error that a limit is too small for pictures and ``what``; ``less`` helps, too."""
+    return PolarguideError(
+        "memory",
+        expected=f"at least {in_gigabytes(least)} for pictures of this size{what}",
+        found=in_gigabytes(allowed, up=False),
+        remedy=f"Give --memory {in_gigabytes(least).replace(' ', '')}, {less}--downscale 2.",
+    )
+
+
+def in_gigabytes(count: int, *, up: bool = True) -> str:
+    """Bytes as gigabytes with one digit, rounded so that what is said to suffice does."""
+    tenths = count * 10 / GIGABYTE
+    return f"{(math.ceil(tenths) if up else math.floor(tenths)) / 10:.1f} GB"
+
+
+# Share of one core that others may use before a time is no longer worth quoting.
+FOREIGN_SHARE = 0.10
+
+
+class Stopwatch:
+    """Adds up wall time, and compares the machine's busy time with this process's own.
+
+    Args:
+        seconds: time already spent (before a resume). alone: whether that was spent alone.
+    """
+
+    def __init__(self, seconds: float = 0.0, alone: bool = True) -> None:
+        self._before, self._alone = seconds, alone
+        self._pause = 0.0
+        self._start = time.perf_counter()
+        self._own, self._machine = time.process_time(), machine_busy_seconds()
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Time inside does not count."""
+        begin = time.perf_counter()
+        yield
+        self._pause += time.perf_counter() - begin
+
+    def read(self) -> tuple[float, bool]:
+        """Seconds so far, and whether nothing else of weight ran beside."""
+        wall = time.perf_counter() - self._start
+        machine = machine_busy_seconds()
+        alone = self._alone and machine is not None and self._machine is not None
+        if alone and machine is not None and self._machine is not None:
+            foreign = (machine - self._machine) - (time.process_time() - self._own)
+            alone = foreign <= FOREIGN_SHARE * wall + 0.5
+        return self._before + wall - self._pause, alone
+
 
 LEAST_STEPS = 500
 """A shorter training is over before it has been measured."""

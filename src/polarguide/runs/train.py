@@ -34,15 +34,14 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
+from polarguide.runs.forecast import MemoryPlan, Stopwatch, pixels_of
 from polarguide.runs.health import examine
-from polarguide.runs.memory import MemoryPlan, pixels_of
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.system import MemoryBound, return_freed_memory
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.recipe import Method
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
-from polarguide.training.stopwatch import Stopwatch
 from polarguide.training.view_store import ViewStore
 
 LOG_EVERY = 10

@@ -17,25 +17,25 @@ from polarguide.gaussians.geometry import mirrored_directions
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.native import fits
 from polarguide.optics import reflectances_from_cosine
-from polarguide.shading.conversion import convert, mirror_base, scale_light
-from polarguide.shading.cubemap import cubemap_lookup
+from polarguide.shading.cubemap import cubemap_lookup, mip_lookup
 from polarguide.shading.metal import (
     BLUR,
     FIRST_REFLECTANCE,
     FIRST_ROUGHNESS,
     MINIMUM_SHARE,
-    MetalPixels,
     any_nonzero,
+    convert,
     metal_channels,
     metal_mips,
     metal_pixels,
     metalness_picture,
+    mirror_base,
     reflectance,
     reflectance_logits,
+    scale_light,
     where_metal,
     with_metal,
 )
-from polarguide.shading.mips import mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
     ChannelParameters,
@@ -53,7 +53,7 @@ from polarguide.shading.model import (
     mirrored,
 )
 from polarguide.shading.native import MetalArguments, reflect_native, world_rays_native
-from polarguide.shading.result import LAYERS, DetachedLayers
+from polarguide.shading.result import LAYERS, DetachedLayers, MetalPixels
 from polarguide.vectors import dot, unit
 
 Blend = Literal["lerp", "fresnel"]
@@ -260,7 +260,7 @@ class DeferredShading(ShadingModel):
         reflectance: Tensor,
         gain: Callable[[], float],
     ) -> None:
-        """See ``ShadingModel`` and ``shading.conversion``."""
+        """See ``ShadingModel`` and ``shading.metal``."""
         first = not any_nonzero(gaussians["metalness"])
         fresh = convert(gaussians, metal, reflectance)
         if not any_nonzero(gaussians["metalness"]):

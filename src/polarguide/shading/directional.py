@@ -28,7 +28,7 @@ from torch.nn.functional import relu
 
 from polarguide.camera import Camera
 from polarguide.gaussians.harmonics import SH_C0
-from polarguide.shading.mips import box_mips, mip_lookup
+from polarguide.shading.cubemap import box_mips, mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
     Channels,

@@ -20,9 +20,8 @@ from polarguide.camera import Camera
 from polarguide.errors import PolarguideError
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.harmonics import evaluate_sh
-from polarguide.shading.layout import Layout
-from polarguide.shading.metal import MetalPixels, metal_stokes
-from polarguide.shading.result import DetachedLayers, RenderResult
+from polarguide.shading.metal import metal_stokes
+from polarguide.shading.result import DetachedLayers, Layout, MetalPixels, RenderResult
 from polarguide.vectors import dot
 
 # Brightest light of an environment with the exponential scale: e^5, about 150 times display white.

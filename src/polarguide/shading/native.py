@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from polarguide import _native
 from polarguide.camera import Camera
 from polarguide.native import applied
-from polarguide.shading.mips import mips_backward
+from polarguide.shading.cubemap import mips_backward
 
 
 class MetalArguments(NamedTuple):

@@ -1,14 +1,55 @@
-"""The one render result, the same in every stage and recipe."""
+"""The one render result, the same in every stage and recipe, and the layout of the G-buffer that it is made of."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from polarguide.shading.metal import MetalPixels
+COLOR_CHANNELS = (0, 1, 2)
+NORMAL_CHANNELS = (3, 4, 5)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names of a G-buffer's channels.
+
+    The order is always color, normal (if splatted), the shading model's channels, and depth (if splatted). The native
+    passes rely on it.
+
+    Attributes:
+        widths: number of channels of each name, in the order in which they lie.
+    """
+
+    widths: Mapping[str, int]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.widths
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.widths)
+
+    def first(self, name: str) -> int:
+        """The first channel of a name; -1 if there is none."""
+        begin = 0
+        for other, width in self.widths.items():
+            if other == name:
+                return begin
+            begin += width
+        return -1
+
+    def channels(self, name: str) -> slice:
+        """The channels of a name.
+
+        Raises:
+            KeyError: there are none.
+        """
+        begin = self.first(name)
+        return slice(begin, begin + self.widths[name])
+
 
 LAYERS = (
     "final",
@@ -23,6 +64,22 @@ LAYERS = (
     "alpha",
 )
 """The pictures in a ``RenderResult``, by name."""
+
+
+class MetalPixels(NamedTuple):
+    """What metals add to a picture of P pixels.
+
+    Attributes:
+        pixels: [K] int64, those that show metal, ascending.
+        share: [K] blended metalness in [0, 1], without a gradient.
+        specular: [K, 3] what metals reflect there.
+        slope: [K, 3] its degree of polarization over ``sin^2(zenith)``.
+    """
+
+    pixels: Tensor
+    share: Tensor
+    specular: Tensor
+    slope: Tensor
 
 
 DetachedLayers = tuple[Tensor, Tensor, MetalPixels | None]

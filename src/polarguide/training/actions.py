@@ -1,12 +1,26 @@
-"""What recipes can make happen between steps: resets and the normal propagation of 3DGS-DR."""
+"""What changes Gaussians between steps: density control, resets, normal propagation, and the search for outer sides."""
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-from polarguide.shading.model import ShadingModel
-from polarguide.training.recipe import Propagation
-from polarguide.training.state import TrainingState
+import torch
+from torch import Tensor
+
+from polarguide.camera import Camera, seen_at
+from polarguide.capture import Scene, View
+from polarguide.gaussians.densify import densify, free_space
+from polarguide.gaussians.initialize import scene_extent
+from polarguide.raster import Backend, Rasterize
+from polarguide.shading.gbuffer import RenderRequest, render, splats
+from polarguide.shading.model import Parameters, ShadingModel
+from polarguide.system import MemoryBound
+from polarguide.training.distributed import Ranks
+from polarguide.training.recipe import Propagation, Recipe
+from polarguide.training.settings import ResolvedSettings
+from polarguide.training.state import TrainingState, seeded
+from polarguide.vectors import unit
 
 
 def _logit(value: float) -> float:
@@ -53,3 +67,153 @@ def propagate_normals(
     grow = (strength >= settings.glossy)[:, None] * longer * torch.log(torch.tensor(settings.widen))
     gaussians.overwrite("log_scales", scales + grow)
     state.opacity_frozen_until = state.step + min(settings.rest, steps // settings.rest_part)
+
+
+# A Gaussian at most this much behind the rendered surface, relative to its depth, is seen.
+DEPTH_SLACK = 0.02
+# Pixels that a Gaussian has to fill, counted by its blending weights, to add to a picture.
+LEAST_PIXELS = 0.05
+DEPTH_ALONE = RenderRequest(sh_degree=0, normals=False, depth=True)
+
+
+@torch.no_grad()
+def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: Rasterize) -> Tensor:
+    """Sum of the unit directions to the cameras that see each Gaussian.
+
+    A camera sees it where its center lies in the picture and not behind the rendered depth.
+
+    Args:
+        gaussians: the Gaussians. views: with the cameras. rasterize: of the backend.
+
+    Returns:
+        [N, 3]; zero where no camera sees it.
+    """
+    means = gaussians["means"]
+    total = torch.zeros_like(means)
+    for view in views:
+        camera = view.camera
+        depth = render(gaussians, camera, rasterize, DEPTH_ALONE).depth
+        assert depth is not None
+        center = camera.pose(means.dtype, means.device).center
+        pixel, z, inside = seen_at(means - center, camera)
+        seen = inside & (z < depth[pixel] * (1 + DEPTH_SLACK))
+        total += seen[:, None] * unit(center - means)
+    return total
+
+
+class Touched(NamedTuple):
+    """What training pictures show of each Gaussian.
+
+    Attributes:
+        views: [N] float32, to how many pictures it adds something: its blending weights there add up to
+            ``LEAST_PIXELS``.
+        most: [N] pixels that it fills in the picture to which it adds most, counted by its blending weights.
+    """
+
+    views: Tensor
+    most: Tensor
+
+
+def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> Touched:
+    """What pictures from some cameras show of each Gaussian.
+
+    Args:
+        gaussians: the Gaussians. cameras: of the pictures. rasterize: of the backend.
+    """
+    given = splats(gaussians)
+    views = torch.zeros(len(given.means), device=given.means.device)
+    most = torch.zeros_like(views)
+    for camera in cameras:
+        # The gradient of the summed weights with respect to a feature is the sum of its Gaussian's weights.
+        with torch.enable_grad():
+            features = torch.ones_like(given.features).requires_grad_()
+            fixed = type(given)(*(tensor.detach() for tensor in given))
+            rasterize(fixed._replace(features=features), camera).features.sum().backward()
+        assert features.grad is not None
+        pixels = features.grad[:, 0]
+        views += (pixels >= LEAST_PIXELS).float()
+        most = torch.maximum(most, pixels)
+    return Touched(views, most)
+
+
+class DensityControl:
+    """Adds and removes Gaussians, by what all ranks have seen.
+
+    Args:
+        scene: the capture. recipe: the method. settings: the user's choices.
+        backend: device and rasterizer. ranks: the processes that share the views of each step.
+        memory: gives back what was freed between two views. black: whether nothing is behind the subject.
+
+    Attributes:
+        extent: of the scene, to which distances are relative.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recipe: Recipe,
+        settings: ResolvedSettings,
+        backend: Backend,
+        ranks: Ranks,
+        memory: MemoryBound,
+        *,
+        black: bool,
+    ) -> None:
+        self._settings, self._backend, self._ranks, self._memory = settings, backend, ranks, memory
+        self._densification, self._black = recipe.densification, black
+        self._views: Sequence[View] = scene.train_views
+        centers = torch.stack([view.camera.center for view in self._views])
+        self.extent = scene_extent(centers)
+        self._middle = centers.mean(dim=0).float().to(backend.device)
+        cameras, density = [view.camera for view in self._views], self._densification
+        empty = free_space(scene.points, cameras, density.free_share, density.free_quantile)
+        self._empty = empty.to(backend.device)
+
+    def exchange_statistics(self, state: TrainingState) -> None:
+        """Let every rank know what all have seen since the last densification. All ranks have to call it."""
+        for sums in (state.statistics.gradient, state.statistics.seen):
+            self._ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])
+
+    def after_step(self, state: TrainingState, *, last: bool) -> None:
+        """What is due after a step of a stage with density control.
+
+        Args:
+            last: whether the next step has no density control; Gaussians that show too little are then removed.
+        """
+        settings, densification = self._settings, self._densification
+        if state.step % densification.every == 0:
+            self.exchange_statistics(state)
+            densify(
+                state.gaussians,
+                state.statistics,
+                densification,
+                extent=self.extent,
+                middle=self._middle,
+                prune_large=densification.prunes_large(state.step, settings.steps),
+                empty=self._empty,
+                limit=settings.gaussians,
+                generator=seeded(settings.seed, 2, state.step),
+            )
+        if last:
+            self._prune_untouched(state)
+
+    def _prune_untouched(self, state: TrainingState) -> None:
+        """Remove Gaussians that show too little.
+
+        Before nothing, those that too few training views can tell anything about: in new views they are fog. And those
+        that are faint in all training views, where the recipe says how faint.
+        """
+        faint = self._densification.faint_pixels
+        if not (self._black or faint):
+            return
+        cameras = self._memory.between(view.camera for view in self._views)
+        touched = touched_pixels(state.gaussians, cameras, self._backend.rasterize)
+        for values in touched:
+            self._ranks.broadcast(values)
+        kept = touched.most >= faint
+        if self._black:
+            enough = len(self._views) >= self._densification.enough_views
+            kept &= touched.views >= (2 if enough else 1)
+        if bool(kept.any()):
+            state.gaussians.keep(kept)
+            state.statistics.clear(len(state.gaussians))

@@ -15,22 +15,21 @@ from polarguide.raster import Backend
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.flat import Flat, flat_surfaces
-from polarguide.training.indices import index_picture
 from polarguide.training.losses import Weights
-from polarguide.training.metals.looks import metalness_share
-from polarguide.training.packing import (
+from polarguide.training.metals.observations import index_picture, metalness_share
+from polarguide.training.priors import Unguided, unguided, view_priors
+from polarguide.training.recipe import Recipe
+from polarguide.training.targets import PartialView, StepTargets, ViewPriors
+from polarguide.training.view_store import (
     Entry,
     Packed,
+    ViewStore,
     holds,
     pack_priors,
     packed,
     unpack_priors,
     unpacked,
 )
-from polarguide.training.priors import Unguided, unguided, view_priors
-from polarguide.training.recipe import Recipe
-from polarguide.training.targets import PartialView, StepTargets, ViewPriors
-from polarguide.training.view_store import ViewStore
 
 KINDS = ("photograph", "unguided", "priors")
 """What is kept of a view."""

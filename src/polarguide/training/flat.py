@@ -19,40 +19,8 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
+from polarguide.training.rules import FlatRules
 from polarguide.vectors import dot, unit
-
-
-@dataclass(frozen=True)
-class FlatRules:
-    """Constants of the search for flat surfaces.
-
-    Attributes:
-        tries: pairs of pixels that propose a normal. samples: pixels that judge them, about.
-        close: sine of the angle between a pixel's plane of incidence and the normal, up to which they agree.
-        apart: sine of the angle between the directions of two pixels under which they propose nothing.
-        least: share of a view that a flat surface covers at least: one normal explains up to a sixth of a curved one by
-            chance.
-        faint: DoLP from which on a pixel counts.
-        slack: factor on Fresnel's DoLP, and what is added to it, beyond which a pixel contradicts.
-        grazing: cosine between normal and ray under which a surface is not seen.
-        window, most: side in pixels of the square around a pixel, and the share of it that has to agree.
-        alike: degrees within which flat surfaces of different views are one.
-        fewest, share: views, and share of the views, that have to show it.
-    """
-
-    tries: int = 400
-    samples: int = 12_000
-    close: float = 0.03
-    apart: float = 0.03
-    least: float = 0.25
-    faint: float = 0.05
-    slack: tuple[float, float] = (1.1, 0.02)
-    grazing: float = 0.05
-    window: int = 9
-    most: float = 0.7
-    alike: float = 5.0
-    fewest: int = 3
-    share: float = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)

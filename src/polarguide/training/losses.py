@@ -29,8 +29,7 @@ from polarguide.training.native_terms import (
     Terms,
     pixel_terms,
 )
-from polarguide.training.partial import partial_terms
-from polarguide.training.photometric import photometric_loss, photometric_terms
+from polarguide.training.photometric import partial_terms, photometric_loss, photometric_terms
 from polarguide.training.targets import Step, ViewPriors
 from polarguide.vectors import dot, unit
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,20 +18,16 @@ from polarguide.capture.exposures import Exposure
 from polarguide.gaussians.initialize import orbit
 from polarguide.raster import Backend, ScreenStatistic
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.layout import COLOR_CHANNELS
 from polarguide.shading.model import PLAIN
-from polarguide.shading.visibility import outward_directions
+from polarguide.shading.result import COLOR_CHANNELS, RenderResult
 from polarguide.system import UNBOUNDED, MemoryBound
-from polarguide.training.actions import propagate_normals, reset_opacity
-from polarguide.training.behind import turned_behind
-from polarguide.training.density import DensityControl
+from polarguide.training.actions import DensityControl, outward_directions, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.feed import Feed
-from polarguide.training.indices import index_offsets, numbers_in
 from polarguide.training.losses import step_loss
+from polarguide.training.metals.observations import index_offsets, numbers_in
 from polarguide.training.metals.search import MetalSearch
-from polarguide.training.recipe import Action, Recipe, Stage
-from polarguide.training.schedule import Schedule
+from polarguide.training.recipe import Action, Recipe, Schedule, Stage
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState, first_state, seeded
 from polarguide.training.targets import Step, StepTargets
@@ -278,3 +275,40 @@ def warn_of_unused_materials(
     else:
         return
     warn(f"the refractive indices that scene.json lists under materials are not used: {why}.")
+
+
+def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult:
+    """The same pictures, whose normal and depth move no Gaussian far away.
+
+    Gradients of the normal and the depth reach everything up to ``near``; from there they fade, linearly in inverse
+    depth, and from ``far`` on the depth has none, and the normal one that turns Gaussians alone. A pixel is as far away
+    as the farthest of its 3 x 3 neighbors, since the normals of the depth look at these.
+
+    Args:
+        result: with ``normal``, ``rotation_only_normal`` and ``depth``.
+        near, far: camera depths, 0 < near < far.
+    """
+    assert result.normal is not None
+    assert result.rotation_only_normal is not None
+    assert result.depth is not None
+    held = result.depth.detach()
+    share = shares_before(held, near, far)
+    return replace(
+        result,
+        normal=result.rotation_only_normal.lerp(result.normal, share[..., None]),
+        depth=held.lerp(result.depth, share),
+    )
+
+
+def shares_before(depth: Tensor, near: float, far: float) -> Tensor:
+    """From 1 up to ``near`` to 0 from ``far`` on, of the farthest of the 3 x 3 neighbors; [H, W] like the depth."""
+    farthest = _largest_of_three(_largest_of_three(depth).T).T.clamp(min=near)
+    return ((1 / farthest - 1 / far) / (1 / near - 1 / far)).clamp(min=0)
+
+
+def _largest_of_three(values: Tensor) -> Tensor:
+    """Of each row and its two neighbors, [H, W]; many times as fast as pooling."""
+    largest = values.clone()
+    torch.maximum(values[1:], values[:-1], out=largest[1:])
+    torch.maximum(largest[:-1], values[1:], out=largest[:-1])
+    return largest

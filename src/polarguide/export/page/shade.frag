@@ -62,7 +62,7 @@ vec3 radiance(vec3 direction, float roughness, vec4 feature) {
 const float METAL_BLUR = 4.0, LEAST_METAL = 0.01; // of shading/metal.py
 uniform int mips; // of the radiance, behind the raw texels
 
-// Radiance from a direction, blurred by so many levels; as mips.py.
+// Radiance from a direction, blurred by so many levels; as cubemap.py.
 vec3 blurred(vec3 direction, float level) {
   level = clamp(level, 0.0, float(mips - 1));
   int lower = min(int(level), mips - 2), first = 6 * (resolution + 2) * (resolution + 2), n = resolution;

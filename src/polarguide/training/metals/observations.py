@@ -1,0 +1,212 @@
+"""What views measured of each Gaussian, and what the user's labels in ``materials/`` say of it.
+
+Pixels count by what the Gaussian has in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide._native import MAX_CHANNELS
+from polarguide.camera import Camera
+from polarguide.capture import View
+from polarguide.raster import Rasterize
+from polarguide.shading.gbuffer import RenderRequest, render, splats
+from polarguide.shading.metal import any_nonzero
+from polarguide.shading.model import Parameters
+from polarguide.system import UNBOUNDED, MemoryBound
+from polarguide.training.priors import guide_normals
+from polarguide.training.rules import MetalRules
+from polarguide.vectors import dot
+
+
+class Seen(NamedTuple):
+    """Means over what V views show of each Gaussian: weight [V, N], S0, P, the polarization at 45 degrees to both
+    [V, N, 3], cosine of the zenith [V, N].
+    """
+
+    weight: Tensor
+    s0: Tensor
+    across: Tensor
+    oblique: Tensor
+    cosine: Tensor
+
+
+def seen_by(
+    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, rules: MetalRules
+) -> list[Tensor]:
+    """Sums [N, 11] over the pixels of each view, all of which determine the Stokes vector. ``seen_of`` tells what they
+    say of some of the Gaussians.
+    """
+    return [_look(gaussians, view, rasterize, rules.least_normal) for view in views]
+
+
+def evenly(views: Sequence[View], most: int) -> Sequence[View]:
+    """At most so many of the views, every second, third or so."""
+    return views[:: max(1, -(-len(views) // most))]
+
+
+def shares(gaussians: Parameters, view: View, target: Tensor, rasterize: Rasterize) -> Tensor:
+    """Sums [N, C] over the pixels of a picture [H, W, C], each by what the Gaussian has in it."""
+    with torch.no_grad():
+        fixed = splats(gaussians)
+    features = target.new_zeros(len(fixed.means), target.shape[-1], requires_grad=True)
+    with torch.enable_grad():
+        (rasterize(fixed._replace(features=features), view.camera).features * target).sum().backward()
+    assert features.grad is not None
+    return features.grad
+
+
+def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
+    """Sums [N, 11] over a view's pixels: 1, S0, P, the polarization at 45 degrees to it and the cosine."""
+    device = gaussians["means"].device
+    normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
+    assert normal is not None
+    view = view.to(device)
+    rays = view.camera.rays(device=device)
+    guide, known = guide_normals(view.camera.to_camera(normal), rays, least_normal)
+    s0, s1, s2 = view.stokes()
+    x_ref, up_ref = optics.lens_frame(rays)
+    x, y = dot(guide, x_ref), dot(guide, up_ref)
+    sine2 = (x * x + y * y).clamp(min=1e-6)
+    cosine2, sine = ((x * x - y * y) / sine2)[..., None], (2 * x * y / sine2)[..., None]
+    across, oblique = -(s1 * cosine2 + s2 * sine), s2 * cosine2 - s1 * sine
+    one = torch.ones_like(x)[..., None]
+    good = (known & ~(view.invalid | view.saturated))[..., None]
+    target = torch.cat((one, s0, across, oblique, -dot(guide, rays)[..., None]), dim=-1) * good
+    return shares(gaussians, view, target.contiguous(), rasterize)
+
+
+def seen_of(looks: Sequence[Tensor], which: slice, rules: MetalRules) -> Seen:
+    """Means of the sums of some Gaussians, with the weight of views that count."""
+    sums = torch.stack([look[which] for look in looks])
+    weight = sums[..., 0]
+    means = sums[..., 1:] / weight.clamp(min=1e-6)[..., None]
+    cosine = means[..., 9].clamp(0, 1)
+    counts = weight > rules.least_share * weight.amax(dim=0)
+    counts &= (cosine > rules.cosines[0]) & (cosine < rules.cosines[1])
+    return Seen(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
+
+
+def metalness_share(gaussians: Parameters, camera: Camera, rasterize: Rasterize) -> Tensor | None:
+    """Blended metalness [H, W]; None where no Gaussian is a metal, or none can be."""
+    metalness = gaussians.get("metalness")
+    if metalness is None or not any_nonzero(metalness):
+        return None
+    with torch.no_grad():
+        return rasterize(splats(gaussians, metalness[:, None]), camera).features[..., 0]
+
+
+def with_words(views: Iterable[View]) -> list[View]:
+    """Those of the views in which the user names materials."""
+    return [view for view in views if view.materials is not None]
+
+
+def said_by(
+    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, memory: MemoryBound = UNBOUNDED
+) -> Tensor:
+    """Weight [N, 2] of the pixels that the user calls dielectric and metal, over the views."""
+    means = gaussians["means"].detach()
+    said = means.new_zeros(len(means), 2)
+    for view in memory.between(with_words(views)):
+        said += _said_in(gaussians, view, rasterize)
+    return said
+
+
+def contradicted(
+    gaussians: Parameters,
+    views: Iterable[View],
+    rasterize: Rasterize,
+    said: Tensor,
+    rules: MetalRules,
+    memory: MemoryBound = UNBOUNDED,
+) -> dict[str, float]:
+    """Views whose words the other views contradict, the most contradicted first, with the share of those words of
+    which others say anything.
+
+    Args:
+        said: by all views, as of ``said_by``.
+    """
+    found = {}
+    for view in memory.between(with_words(views)):
+        own = _said_in(gaussians, view, rasterize)
+        others = (said - own).clamp(min=0)
+        own = own * (others.sum(dim=1, keepdim=True) > rules.least_weight)
+        opposed = (own * (others.flip(1) > others)).sum()
+        share = float(opposed / own.sum().clamp(min=1e-6))
+        if share > rules.contradicted:
+            found[view.name] = share
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _said_in(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
+    assert view.materials is not None
+    kinds = view.materials.to(gaussians["means"].device)
+    target = torch.stack(((kinds == 1) | (kinds > 2), kinds == 2), dim=-1).float()
+    return shares(gaussians, view, target, rasterize)
+
+
+# Pixels of a Gaussian in all views from which on what they say counts.
+LEAST_SEEN = 0.05
+
+
+@torch.no_grad()
+def index_offsets(
+    gaussians: Parameters,
+    views: Sequence[View],
+    indices: Mapping[int, float],
+    refractive_index: float,
+    rasterize: Rasterize,
+    memory: MemoryBound = UNBOUNDED,
+) -> Tensor:
+    """What each Gaussian adds to the run's refractive index, [N].
+
+    It is that of the material that most of its pixels in all views have; 0 where these say another one than the table
+    lists, or nothing, and of metals.
+
+    Args:
+        indices: by the number in ``View.materials``. refractive_index: of the run.
+    """
+    means = gaussians["means"].detach()
+    said = {view.name: numbers_in(view) for view in views}
+    numbers = sorted(set().union(*said.values()) & indices.keys())
+    weights = means.new_zeros(len(means), 1 + len(numbers))
+    for view in memory.between(with_words(views)):
+        assert view.materials is not None
+        kinds = view.materials.to(means.device)
+        here = [number for number in numbers if number in said[view.name]]
+        target = torch.stack(((kinds == 1) | (kinds == 2), *(kinds == k for k in here)), dim=-1).float()
+        columns = [0, *(1 + numbers.index(number) for number in here)]
+        for some, part in zip(_batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
+            weights[:, some] += shares(gaussians, view, part.contiguous(), rasterize)
+    offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
+    most, chosen = weights.max(dim=1)
+    given = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
+    metalness = gaussians.get("metalness")
+    return given if metalness is None else given * (metalness == 0)
+
+
+def numbers_in(view: View) -> set[int]:
+    """Numbers of the dielectrics with indices of their own that a view says it shows."""
+    return set() if view.materials is None else set(view.materials.unique().tolist()) - {0, 1, 2}
+
+
+def _batched(columns: list[int]) -> list[list[int]]:
+    """So many at a time as a rasterizer takes channels."""
+    return [columns[k : k + MAX_CHANNELS] for k in range(0, len(columns), MAX_CHANNELS)]
+
+
+@torch.no_grad()
+def index_picture(
+    gaussians: Parameters, camera: Camera, rasterize: Rasterize, refractive_index: float
+) -> Tensor | None:
+    """Refractive indices [H, W] as blended; None where all Gaussians have the run's."""
+    offsets = gaussians.get("index_offset")
+    if offsets is None or not any_nonzero(offsets):
+        return None
+    return refractive_index + rasterize(splats(gaussians, offsets[:, None]), camera).features[..., 0]
